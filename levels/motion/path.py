@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rack.levels.algebra import Array, norm
+from rack.levels.compiled import compiled
 
 COINCIDENT_RAD = 1e-7
 """Waypoints closer than this count as one, and a shorter blend counts as none."""
@@ -80,37 +82,14 @@ class BlendedPath:
         self.length = float(self._corners[-1])  # rad
         self._lay_pieces()
         self.bounds = self._bound_pieces()
-        self._point = PathPoint(np.zeros(self.joints), np.zeros(self.joints), np.zeros(self.joints))
-        self._scratch = np.zeros(self.joints)
+        self._marks, self._table = self._tabulate()
+        self._point = np.zeros((3, self.joints))
 
     def evaluate(self, s: float) -> PathPoint:
         """Return the point at `s`, clamped to the path. The next call overwrites its arrays."""
-        s = min(max(s, 0.0), self.length)
-        line, corner = self._pieces[self.piece_at(s)]
-        q, dq, d2q = self._point
-        d2q.fill(0.0)
-        if corner < 0:
-            if line < 0:
-                q[:] = self.waypoints[0]
-                dq.fill(0.0)
-                return self._point
-            dq[:] = self._directions[line]
-            np.multiply(dq, s - self._starts[line], out=q)
-            q += self.waypoints[line]
-            return self._point
-        b = self._radii[corner]
-        t = (s - self._starts[corner] + b) / (2.0 * b)
-        h = 2.0 * b * t**3 * (1.0 - 0.5 * t)
-        # q = P + u1 sigma + (u2 - u1) h, and its derivatives.
-        before = self._directions[corner - 1]
-        change = self._changes[corner]
-        np.multiply(before, s - self._starts[corner], out=q)
-        q += self.waypoints[corner]
-        q += np.multiply(change, h, out=self._scratch)
-        np.multiply(change, t * t * (3.0 - 2.0 * t), out=dq)
-        dq += before
-        np.multiply(change, 3.0 * t * (1.0 - t) / b, out=d2q)
-        return self._point
+        set_point.load()(self._marks, self._table, min(max(s, 0.0), self.length), self._point)
+        # Not kept: in a path that comes from a checkpoint they would be copies.
+        return PathPoint(*self._point)
 
     def piece_at(self, s: float) -> int:
         """Return the index of the piece that contains `s`; at a break, of the piece that begins
@@ -121,7 +100,7 @@ class BlendedPath:
         """Return points along the path, both ends included, at most `step_rad` of s apart; (n,
         joints)."""
         count = max(int(np.ceil(self.length / step_rad)), 1) + 1 if self.length > 0.0 else 1
-        return np.array([self.evaluate(s).q.copy() for s in np.linspace(0.0, self.length, count)])
+        return points_at.load()(self._marks, self._table, np.linspace(0.0, self.length, count))
 
     def _lay_pieces(self) -> None:
         """Cut the path into lines (line, -1) and corners (line before, corner)."""
@@ -154,6 +133,20 @@ class BlendedPath:
             self._pieces.append(piece)
             self._breaks.append(end)
 
+    def _tabulate(self) -> tuple[Array, Array]:
+        """Return the pieces in the rows of `set_point`."""
+        marks = np.zeros((len(self._pieces), 3))
+        table = np.zeros((len(self._pieces), 3, self.joints))
+        for k, (line, corner) in enumerate(self._pieces):
+            at = max(line if corner < 0 else corner, 0)
+            marks[k] = self._breaks[k], self._starts[at], self._radii[at] if corner >= 0 else 0.0
+            table[k, 0] = self.waypoints[at]
+            if line >= 0:
+                table[k, 1] = self._directions[line]
+            if corner >= 0:
+                table[k, 2] = self._changes[corner]
+        return marks, table
+
     def _bound_pieces(self) -> PathBounds:
         first, second, third = (np.zeros((len(self._pieces), self.joints)) for _ in range(3))
         for k, (line, corner) in enumerate(self._pieces):
@@ -166,6 +159,56 @@ class BlendedPath:
             elif line >= 0:
                 first[k] = np.abs(self._directions[line])
         return PathBounds(first, second, third)
+
+
+@compiled
+def set_point(
+    marks: Array,  # (pieces, 3), rad: s where it begins, s of its waypoint, its blend; 0: a line
+    table: Array,  # (pieces, 3, joints): the waypoint, rad, the direction there, its change
+    s: float,  # rad
+    point: Array,  # (3, joints): set, in the rows of `PathPoint`
+) -> None:
+    """Set the point of a path at `s`: q = P + u1 sigma + (u2 - u1) h, and its derivatives."""
+    piece = len(marks) - 1
+    while piece > 0 and s < marks[piece, 0]:
+        piece -= 1
+    waypoint = table[piece, 0]
+    direction = table[piece, 1]
+    change = table[piece, 2]
+    b = marks[piece, 2]
+    sigma = s - marks[piece, 1]
+    for j in range(len(waypoint)):
+        point[0, j] = direction[j] * sigma + waypoint[j]
+        point[1, j] = direction[j]
+        point[2, j] = 0.0
+    if b > 0.0:
+        t = (sigma + b) / (2.0 * b)
+        h = 2.0 * b * math.pow(t, 3.0) * (1.0 - 0.5 * t)
+        rate = t * t * (3.0 - 2.0 * t)
+        second = 3.0 * t * (1.0 - t) / b
+        for j in range(len(waypoint)):
+            point[0, j] += change[j] * h
+            point[1, j] += change[j] * rate
+            point[2, j] = change[j] * second
+
+
+@compiled
+def points_at(marks: Array, table: Array, places: Array) -> Array:
+    """Return the points of a path at `places` (n,), rad: (n, joints), rad."""
+    points = np.empty((len(places), table.shape[2]))
+    point = np.empty((3, table.shape[2]))
+    for k in range(len(places)):
+        set_point(marks, table, places[k], point)
+        points[k] = point[0]
+    return points
+
+
+def preload() -> None:
+    """Load this module's compiled functions."""
+    marks = np.zeros((1, 3))
+    table = np.zeros((1, 3, 1))
+    set_point.load()(marks, table, 0.0, table[0])
+    points_at.load()(marks, table, marks[0])
 
 
 def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 from rack.levels.algebra import Array, mat_vec, norm
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
+from rack.levels.motion import path as paths
 from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.planning import collision
 from rack.levels.planning.collision import CollisionChecker
@@ -41,6 +42,7 @@ def preload() -> None:
     import numpy.random  # noqa: F401  # numpy imports it at its first use
 
     collision.preload()
+    paths.preload()
 
 
 class MotionPlanner:

@@ -17,6 +17,7 @@ from rack.levels.messages import (
     Error,
     SegmentKind,
 )
+from rack.levels.motion import path as paths
 from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Operation, Orders
 from rack.levels.planning import collision
 from rack.levels.primitive.guard import Guard, Sight
@@ -105,6 +106,7 @@ class PrimitiveExecutor(Executor):
     def preload(cls) -> None:
         """Load the compiled functions of collision checks."""
         collision.preload()
+        paths.preload()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read command, status, plan and world model; write the next set point and this level's
