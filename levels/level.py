@@ -163,6 +163,10 @@ class MadePorts(NamedTuple):
     is_whole: bool = True
 
 
+Misfits = Iterable[tuple[str, Any, str]]
+"""Key, value and reason of each entry of a table that does not suit something else."""
+
+
 class Ports(SimpleNamespace):
     """The ports of one cycle by name: `Reading`s for inputs, `Message`s for outputs."""
 
@@ -179,9 +183,7 @@ class Program(Table):
         """Freeze the lists in tables by names of the user's own, too."""
         return frozen(table)
 
-    def misfits(
-        self, robot: RobotConfig | None, scene: SceneConfig
-    ) -> Iterable[tuple[str, Any, str]]:
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, as in "action[0].object", value and reason of each entry that does not suit
         arm or scene."""
         return ()
@@ -325,7 +327,7 @@ class Executor(LevelSection, ABC):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield key of `[board.<name>]`, value and reason of each disagreement with the neighbours,
         before the launch.
 

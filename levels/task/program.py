@@ -4,11 +4,11 @@ level."""
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rack.levels.level import Program
+from rack.levels.level import Misfits, Program
 from rack.levels.tables import Finite, GoalConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
 ROUNDING_S = 1e-9
@@ -101,9 +101,7 @@ class TaskConfig(Program):
             if isinstance(action, Transfer):
                 yield GoalConfig(object=action.object, position=action.to)
 
-    def misfits(
-        self, robot: RobotConfig | None, scene: SceneConfig
-    ) -> Iterator[tuple[str, Any, str]]:
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
         if robot is None:
             return
@@ -140,9 +138,7 @@ class TaskParams(Table):
 read_program = TaskConfig.read
 
 
-def misfits(
-    action: Action, robot: RobotConfig, scene: SceneConfig
-) -> Iterator[tuple[str, Any, str]]:
+def misfits(action: Action, robot: RobotConfig, scene: SceneConfig) -> Misfits:
     """Yield key, value and reason of everything that the arm or the scene lacks for an action."""
     if isinstance(action, Transfer):
         if action.object not in scene.objects:

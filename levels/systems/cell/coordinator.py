@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import Field, ValidationError
 
 from rack.backplane.message import Message, MessageType, State, fill_counts
-from rack.levels.level import Executor, Input, LevelContext, MadePorts, Output, Ports, Reading
+from rack.levels.level import (
+    Executor,
+    Input,
+    LevelContext,
+    MadePorts,
+    Misfits,
+    Output,
+    Ports,
+    Reading,
+)
 from rack.levels.messages import TASK_STATUS, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.systems.cell.actions import write_action
@@ -94,7 +103,7 @@ class Coordinator(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterator[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield arms of the program that the parameters lack."""
         known = read_params(CoordinatorParams, context.params).arms
         for k, step in enumerate(CellProgram.model_validate(context.task).step):

@@ -4,12 +4,11 @@ same time."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field, StringConstraints
 
-from rack.levels.level import Program
+from rack.levels.level import Misfits, Program
 from rack.levels.operator import MAX_JOINTS
 from rack.levels.systems.cell.messages import OBJECT_BYTES
 from rack.levels.tables import RobotConfig, SceneConfig, Table
@@ -67,9 +66,7 @@ class CellProgram(Program):
         """A number that two different programs hardly share, above 0."""
         return zlib.crc32(self.model_dump_json().encode()) or 1
 
-    def misfits(
-        self, robot: RobotConfig | None, scene: SceneConfig
-    ) -> Iterator[tuple[str, Any, str]]:
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of steps without actions or with two for an arm, times that
         do not rise, and what is too long for an order.
         """
@@ -97,9 +94,7 @@ class CellProgram(Program):
             latest = max([latest, *(action.by or 0.0 for action in step.do)])
 
 
-def _too_long(
-    place: str, action: ArmTransfer | ArmGoto | ArmHome
-) -> Iterator[tuple[str, Any, str]]:
+def _too_long(place: str, action: ArmTransfer | ArmGoto | ArmHome) -> Misfits:
     """Yield what does not fit into an order."""
     if isinstance(action, ArmTransfer) and not (
         action.object.isascii() and len(action.object) <= OBJECT_BYTES

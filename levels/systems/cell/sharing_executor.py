@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, cast
+from collections.abc import Sequence
+from typing import cast
 
 from pydantic import Field, field_validator
 
 from rack.levels.arm.arm import find_arm
-from rack.levels.level import Input, LevelContext, Output, Ports
+from rack.levels.level import Input, LevelContext, Misfits, Output, Ports
 from rack.levels.servo.control import ServoParams
 from rack.levels.servo.executor import ServoExecutor
 from rack.levels.systems.cell.shared_bodies import (
@@ -74,7 +74,7 @@ class SharingServoExecutor(ServoExecutor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield shared bodies that are no objects or named twice, besides what any servo level
         finds."""
         names = context.params["shared"]

@@ -15,7 +15,7 @@ lost to it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -25,7 +25,7 @@ from pydantic import Field, ValidationError
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
-from rack.levels.level import Input, LevelContext, Program
+from rack.levels.level import Input, LevelContext, Misfits, Program
 from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
 from rack.levels.systems.force.messages import SERVER_REQUEST, SERVER_STATUS, Mode
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
@@ -87,9 +87,7 @@ class ForceProgram(Program):
     frame: dict[str, FrameConfig] = Field({}, description="task frames, by name")
     contact: dict[str, ContactConfig] = Field({}, description="contacts, by name")
 
-    def misfits(
-        self, robot: RobotConfig | None, scene: SceneConfig
-    ) -> Iterable[tuple[str, Any, str]]:
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and
         sensor."""
         bent = {name: reason for name, frame in self.frame.items() if (reason := frame.objection())}

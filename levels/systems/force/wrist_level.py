@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from rack.levels.level import Executor, LevelContext
+from rack.levels.level import Executor, LevelContext, Misfits
 
 
 class WristLevel(Executor):
@@ -14,7 +13,7 @@ class WristLevel(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield an arm without a wrist sensor, besides what any level of the kind finds."""
         yield from super().misfits(context, above, below)
         if context.robot.wrist is None:

@@ -3,7 +3,7 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from rack.levels.algebra import Array
 from rack.levels.arm import poses, substeps
 from rack.levels.arm.above import CommandsAbove
 from rack.levels.faults import TendonStep
-from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Ports, Reading
+from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import ARM_STATE, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.robot.cell import build_cell
@@ -79,7 +79,7 @@ class HandExecutor(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield every joint that not exactly one board above drives: the one of its finger, or the
         one of all."""
         hand = context.robot.hand

@@ -3,8 +3,7 @@ again."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
+from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Ports, Reading
 from rack.levels.messages import WORLD_MODEL, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.planning.pose import Pose
@@ -103,7 +102,7 @@ class GraspExecutor(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield a robot without a hand, and every finger that not exactly one board below
         drives."""
         hand = context.robot.hand

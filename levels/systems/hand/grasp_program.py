@@ -3,12 +3,12 @@ the open hand."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from rack.levels.level import Program
+from rack.levels.level import Misfits, Program
 from rack.levels.tables import Finite, HandConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
 MAX_STEPS = 100
@@ -97,9 +97,7 @@ class GraspProgram(Program):
         (), max_length=MAX_STEPS, description="steps, done in their order"
     )
 
-    def misfits(
-        self, robot: RobotConfig | None, scene: SceneConfig
-    ) -> Iterator[tuple[str, Any, str]]:
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of everything that the hand or the scene lacks, and of steps
         out of order."""
         if robot is None or robot.hand is None:
@@ -139,9 +137,7 @@ class GraspProgram(Program):
             gripped = isinstance(step, CloseStep) or (gripped and not isinstance(step, ReleaseStep))
 
 
-def _misfits_of_posture(
-    key: str, posture: Posture, hand: HandConfig
-) -> Iterator[tuple[str, Any, str]]:
+def _misfits_of_posture(key: str, posture: Posture, hand: HandConfig) -> Misfits:
     names = {finger.name: len(finger.joints) for finger in hand.finger}
     for name, values in posture.items():
         if name not in names:
@@ -162,7 +158,7 @@ def _misfits_of_posture(
 
 def _misfits_of_close(
     key: str, step: CloseStep, opposing: str, names: list[str], scene: SceneConfig
-) -> Iterator[tuple[str, Any, str]]:
+) -> Misfits:
     if step.object not in scene.objects:
         yield f"{key}.object", step.object, f"not in the scene; objects: {_listed(scene.objects)}"
     for name in step.points:

@@ -4,14 +4,14 @@ what they report."""
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, LevelContext, Ports, Reading
+from rack.levels.level import Executor, LevelContext, Misfits, Ports, Reading
 from rack.levels.operator import BELOW_LOST, Operation, Orders
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.hand import Hand
@@ -58,7 +58,7 @@ class HandLoop(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield a robot that has no hand, and a lack of neighbours."""
         if context.robot.hand is None:
             yield "executor", cls.__name__, "it drives a hand; there is no [robot.hand]"

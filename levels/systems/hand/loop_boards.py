@@ -7,14 +7,13 @@ the joint loop these into torques, and the tendon loop these into tensions.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.level import Input, LevelContext, Ports
+from rack.levels.level import Input, LevelContext, Misfits, Ports
 from rack.levels.operator import OPERATOR_COMMAND
 from rack.levels.robot import dynamics
 from rack.levels.systems.hand import joint_law, tendon_law
@@ -195,7 +194,7 @@ class FingerExecutor(HandLoop):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield a finger that the hand does not have, in addition to a lack of a hand or of
         neighbours."""
         yield from super().misfits(context, above, below)

@@ -3,15 +3,15 @@ brakes it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.level import Input, LevelContext, Ports, Reading
+from rack.levels.level import Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import ARM_STATE
 from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Operation, Orders
 from rack.levels.robot.dynamics import Terms
@@ -70,7 +70,7 @@ class ArmExecutor(ArmDriver):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield every joint, and the gripper, that not exactly one board above drives, and what
         `ArmDriver` yields."""
         yield from super().misfits(context, above, below)

@@ -3,7 +3,7 @@ its own."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ from pydantic import Field
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports
 from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
@@ -119,7 +119,7 @@ class JointServo(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield joints that the arm lacks or that are named twice, an idle board, and modifications
         that do not fit."""
         params = read_params(JointServoParams, context.params)

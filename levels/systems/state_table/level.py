@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 from pydantic import Field as Key
 
 from rack.backplane.message import Field, Message, State, command, status
-from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
+from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
@@ -195,7 +195,7 @@ class StateTableExecutor(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterator[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield every mistake in every table, and commands that one of them does not know."""
         files = read_params(StateTableParams, context.params).tables
         tables = {}

@@ -3,13 +3,13 @@ goes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from pydantic import Field as Key
 
 from rack.backplane.message import Field, Message, status
-from rack.levels.level import Input, LevelContext, Ports
+from rack.levels.level import Input, LevelContext, Misfits, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Operation
 from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS, MoveTable
 from rack.levels.systems.state_table.level import (
@@ -98,7 +98,7 @@ class TaskTable(StateTableExecutor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterator[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield every mistake in every table, and steps that the level below does not know."""
         found = [*super().misfits(context, above, below)]
         yield from found

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rack.levels.level import Program
+from rack.levels.level import Misfits, Program
 from rack.levels.tables import (
     Finite,
     NotNegative,
@@ -120,9 +119,7 @@ class MotionProgram(Program):
         (), max_length=MAX_REQUESTS, description="steps, done in their order"
     )
 
-    def misfits(
-        self, robot: RobotConfig | None, scene: SceneConfig
-    ) -> Iterator[tuple[str, Any, str]]:
+    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
         if robot is None:
             return
