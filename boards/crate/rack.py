@@ -31,12 +31,10 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
-from rack.boards.crate.hosts import HostBoards
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.lost_boards import LostBoards
 from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.patience import Patience, RackAwaited, await_opened
-from rack.boards.crate.recovery import Recovery, Supervision
+from rack.boards.crate.recovery import HostBoards, LostBoards, Recovery, Supervision
 from rack.boards.crate.requests import (
     CellConfig,
     Ended,

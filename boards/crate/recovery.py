@@ -1,19 +1,27 @@
-"""Recovery of lost boards: the limit and the order of restarts, and the restart itself."""
+"""What follows when a process of a rack ends: it is recorded, and restarted or given up.
+
+The limit and the order of restarts, and the restarts themselves: of boards, on the clock's grid; of
+host boards, which are started with the run and in real time never waited for. The loss of a host
+board demands nothing of the arm. The clock admits its return, as it does that of other boards.
+"""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout
+from rack.backplane.process import STOPPED, how_ended, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.requests import PowerOff, PowerOn
-from rack.boards.wiring import ClockWiring, TaskWiring
+from rack.boards.crate.requests import Ended, PowerOff, PowerOn
+from rack.boards.errors import CANNOT_GO_ON, CANNOT_KEEP
+from rack.boards.events import Journal
+from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 
 
 class Restart(NamedTuple):
@@ -131,3 +139,123 @@ class Recovery:
         if board == CLOCK:
             return False
         return self._segment.block(board)[Block.STATE] not in (TaskState.READY, TaskState.RUNNING)
+
+
+class HostBoards:
+    """Starts and watches the host boards that are not external."""
+
+    def __init__(
+        self,
+        segment: Segment,
+        wirings: Sequence[HostWiring],
+        supervision: Supervision,
+        crate: CrateLine,
+        journal: Journal,
+    ) -> None:
+        self._segment = segment
+        self._supervision = supervision
+        self._crate = crate
+        self._journal = journal
+        self._wirings = {wiring.board: wiring for wiring in wirings if not wiring.is_external}
+        self._stopped: set[str] = set()
+
+    def start(self) -> None:
+        """Start all of them."""
+        for name, wiring in self._wirings.items():
+            self._crate.ask(PowerOn(name, wiring))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._wirings
+
+    def lose(self, end: Ended, why: str) -> bool:
+        """Record the end of a host board, and restart it unless its program is done; return False
+        if it is given up."""
+        block = self._segment.block(end.name)
+        self._stopped.discard(end.name)
+        if block[Block.STATE] == TaskState.ENDED:
+            self._journal.add(
+                "done", end.name, f"host board '{end.name}': its program is done", "done"
+            )
+            return True
+        text = f"host board '{end.name}' ended: {why}"
+        self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
+        restart = self._supervision.admit(end.name, end.tick)
+        if restart is None:
+            block[Block.STATE] = TaskState.GIVEN_UP
+            self._journal.add("reaction", end.name, f"gave up on '{end.name}'", "given_up")
+            return False
+        self._crate.ask(PowerOn(end.name, self._wirings[end.name]))
+        self._journal.add("reaction", end.name, str(restart), "restart")
+        return True
+
+    def look(self) -> None:
+        """End host boards that a signal has stopped: nothing else shows that one hangs."""
+        for name in self._wirings:
+            block = self._segment.block(name)
+            if name not in self._stopped and state_of(block[Block.PID]) in STOPPED:
+                self._stopped.add(name)
+                text = f"'{name}' is not responding: stopped by a signal"
+                self._journal.add("detection", "rack", text, "hang", subject=name)
+                self._crate.ask(PowerOff(name))
+
+
+class LostBoards:
+    """The boards that a rack has lost, and what became of them. `record_printed` records what they
+    have printed."""
+
+    def __init__(self, journal: Journal, record_printed: Callable[[], None]) -> None:
+        self.faults: list[str] = []  # a line for each that was given up
+        self.given_up = False  # a board, or all of them with the crate
+        self.is_beyond_help = False  # the run cannot go on
+        self.cannot_keep = False  # a board ended because it has no checkpoint to give
+        self._journal = journal
+        self._record_printed = record_printed
+        self._recovery: Recovery | None = None  # None: the run has not begun
+        self._hosts: HostBoards | None = None
+
+    def begin(self, recovery: Recovery, hosts: HostBoards) -> None:
+        """Restart boards from now on."""
+        self._recovery = recovery
+        self._hosts = hosts
+
+    def lose(self, end: Ended, is_over: bool) -> None:
+        """Record the end of a board, and restart it or give it up; `is_over`: so is the run."""
+        if self._hosts is not None and end.name in self._hosts:
+            if not self._hosts.lose(end, how_ended(end.status)):
+                self.faults.append(
+                    f"host board '{end.name}' ended: {how_ended(end.status)}; no restarts left"
+                )
+            return
+        text = f"board '{end.name}' ended: {how_ended(end.status)}"
+        self.cannot_keep |= end.status == CANNOT_KEEP
+        self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
+        if self._recovery is None or is_over:
+            self._give_up(end.name, text)
+            return
+        is_final = end.status in (CANNOT_GO_ON, CANNOT_KEEP)
+        if is_final:
+            text = self._reason(end.name) or text
+        restart = self._recovery.lose(end.name, end.tick, is_final)
+        if restart is None:
+            self.is_beyond_help = end.name == CLOCK
+            self._give_up(end.name, text if is_final else f"{text}; no restarts left")
+        else:
+            self._journal.add("reaction", end.name, str(restart), "restart")
+
+    def lose_crate(self) -> None:
+        """Record the end of the crate."""
+        self.is_beyond_help = True
+        text = "the crate ended, and all boards with it"
+        self._journal.add("died", "crate", text, "died")
+        self._give_up("crate", text)
+
+    def _reason(self, board: str) -> str:
+        """Return the reason that a board printed last; empty: none."""
+        self._record_printed()
+        printed = (event.text for event in reversed(self._journal.events))
+        return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
+
+    def _give_up(self, board: str, text: str) -> None:
+        self.faults.append(text)
+        self.given_up = True
+        self._journal.add("reaction", board, f"gave up on '{board}'", "given_up")

@@ -13,9 +13,8 @@ from rack.backplane.process import STOPPED, state_of
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, TaskState
 from rack.boards.config import resolve
-from rack.boards.crate.hosts import HostBoards
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.recovery import Supervision
+from rack.boards.crate.recovery import HostBoards, Supervision
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
 from rack.boards.events import Event, Journal
 from tests.boards.conftest import MakeConfig
