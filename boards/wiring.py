@@ -75,14 +75,14 @@ class TaskWiring:
     inputs: Mapping[str, Source]
     outputs: Mapping[str, str]
     context: LevelContext
-    critical_priority: int = 0
-    guards_clock: bool = False
-    sent: tuple[str, ...] = ()
-    fails_self_test: bool = False
-    entries: Entries | None = None
-    transfer: BusTimes = field(default_factory=BusTimes)
-    exchange: Mapping[str, ExchangeSpec] = field(default_factory=dict)
-    reservation: Reservation | None = None
+    critical_priority: int
+    guards_clock: bool
+    sent: tuple[str, ...]
+    fails_self_test: bool
+    entries: Entries | None
+    transfer: BusTimes
+    exchange: Mapping[str, ExchangeSpec]
+    reservation: Reservation | None
     # Of one run, no part of how a rack is wired.
     keeping: Keeping | None = field(default=None, repr=False)
 
@@ -128,5 +128,5 @@ class ClockWiring:
     keeps_awake: bool
     restart_ticks: int
     on_loss: Mapping[str, Demand]
-    reservation: Reservation | None = None
+    reservation: Reservation | None
     keeping: Keeping | None = field(default=None, repr=False)

@@ -23,7 +23,7 @@ EXTENDS = "configs that this file extends, by name or path, in order; its own ke
 
 
 def assembled(
-    name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None
+    name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
 ) -> Tables:
     """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults
     of a script.
@@ -56,15 +56,13 @@ def read(name_or_path: str | Path) -> Tables:
     return _read(_path(name_or_path, "config", CONFIGS), (), {})
 
 
-def with_faults(tables: Tables, name_or_path: str | Path, own: Path | None = None) -> Tables:
+def with_faults(tables: Tables, name_or_path: str | Path, own: Path) -> Tables:
     """Return config tables with the faults of a script appended.
 
     A script contains `[[fault]]` tables and nothing else. A name means a script in the folder of
     the rack, `own`, if it has one of its own, else a bundled script. Raises `ConfigError`.
     """
-    folders = [FAULTS]
-    if own is not None and own != CONFIGS:
-        folders = [own, FAULTS]
+    folders = [FAULTS] if own == CONFIGS else [own, FAULTS]
     path = _path(name_or_path, "--faults", *folders)
     script = _tables(path)
     wrong = [

@@ -378,6 +378,7 @@ class _Examined:
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
             guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
+            entries=None,
             exchange=exchanges(self._wiring, ports),
             reservation=reservation(self._config, busy_ms, spec.every),
             transfer=BusTimes(

@@ -185,9 +185,9 @@ class AlarmEvents:
         self,
         segment: Segment,
         joints: Sequence[str],
-        geom: Callable[[int], str] = str,
-        name: Callable[[str, int], str] = lambda board, number: str(number),
-        param: Callable[[str, str], object] = lambda board, key: None,
+        geom: Callable[[int], str],
+        name: Callable[[str, int], str],
+        param: Callable[[str, str], object],
     ) -> None:
         self._layout = segment.layout
         self._faults = FaultTable(segment)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from rack.backplane.layout import TickGrid
@@ -40,10 +40,10 @@ class BoardTiming:
     has_planner: bool
     is_critical: bool
     budget: Budget | None
-    plan_within_ns: int | None = None
-    queues: tuple[str, ...] = ()
-    phase: int = 0
-    reads: Mapping[str, TickGrid] = field(default_factory=dict)
+    plan_within_ns: int | None
+    queues: tuple[str, ...]
+    phase: int
+    reads: Mapping[str, TickGrid]
 
     @property
     def releases(self) -> TickGrid:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from math import prod
@@ -43,9 +43,9 @@ class RackTiming:
     boards: Mapping[str, BoardTiming]
     context_switch_ns: int
     small_share: float
-    response_goal_ns: float | None = None
-    inboxes: Mapping[str, InboxTiming] = field(default_factory=dict)
-    schedule: CyclicSchedule | None = None  # a static one, if the rack has it
+    response_goal_ns: float | None
+    inboxes: Mapping[str, InboxTiming]
+    schedule: CyclicSchedule | None  # a static one, if the rack has it
 
     @property
     def tick_ns(self) -> int:

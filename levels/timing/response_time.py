@@ -47,12 +47,11 @@ deadline."""
 def response_time(
     cost: int,
     above: Sequence[Load],
-    blocking: int = 0,
-    jitter: int = 0,
+    blocking: int,
+    jitter: int,
     *,
-    sharing: Sequence[Load] = (),
-    turn: int = TURN_NS,
-    horizon: int | None = None,
+    sharing: Sequence[Load],
+    horizon: int,
 ) -> int | None:
     """Return the longest time from a job's release to its end; None: no bound, or none within the
     `horizon`.
@@ -64,18 +63,15 @@ def response_time(
     finds its task free, and a response longer than the task's period is a miss.
 
     `sharing` are tasks under ordinary scheduling that take turns with this one: while it waits,
-    none of them computes more than it does, plus one `turn`. That bound assumes fair turns, which
-    Linux does not guarantee. The default `horizon` is 100 times the longest time given.
+    none of them computes more than it does, plus one turn. That bound assumes fair turns, which
+    Linux does not guarantee.
     """
     # Below full load a bound exists; near full load the search for it may take too long.
     if cost and sum(Fraction(c, t) for c, t, _ in above) >= 1:
         return None
-    periods = (period for _, period, _ in (*above, *sharing))
-    if horizon is None:
-        horizon = 100 * max([cost, blocking, jitter, *periods])
 
     def work(until: int) -> int:
-        turns = sum(min(_released(until, load), cost + turn) for load in sharing)
+        turns = sum(min(_released(until, load), cost + TURN_NS) for load in sharing)
         return blocking + cost + turns + sum(_released(until, load) for load in above)
 
     end = _fixed_point(work, blocking + cost, horizon)

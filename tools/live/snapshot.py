@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -63,8 +63,8 @@ class TaskRow:
     exec_ms: float | None
     lateness_ms: float | None
     reason: str
-    row: str = ""
-    mode: str = ""
+    row: str
+    mode: str
 
 
 @dataclass(frozen=True)
@@ -101,15 +101,15 @@ class Snapshot:
     faults: tuple[str, ...]
     tasks: tuple[TaskRow, ...]
     progress: TaskProgress | None
-    holds: tuple[Hold, ...] = ()
-    hosts: tuple[HostRow, ...] = ()
-    entries: tuple[EntryRow, ...] = ()
-    queues: tuple[QueueFill, ...] = ()
-    inboxes: tuple[InboxFill, ...] = ()
-    exchanges: Mapping[str, Mapping[str, PortAge]] = field(default_factory=dict)
-    peers: tuple[PeerRow, ...] = ()
-    imports: tuple[ImportRow, ...] = ()
-    exports: tuple[ExportRow, ...] = ()
+    holds: tuple[Hold, ...]
+    hosts: tuple[HostRow, ...]
+    entries: tuple[EntryRow, ...]
+    queues: tuple[QueueFill, ...]
+    inboxes: tuple[InboxFill, ...]
+    exchanges: Mapping[str, Mapping[str, PortAge]]
+    peers: tuple[PeerRow, ...]
+    imports: tuple[ImportRow, ...]
+    exports: tuple[ExportRow, ...]
 
 
 class RackMonitor:

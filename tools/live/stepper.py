@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from rack.backplane.layout import TaskSpec
@@ -25,12 +25,7 @@ class Stepped:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data."""
-        return {
-            "rack": self.rack,
-            "tick": self.tick,
-            "time_s": self.time_s,
-            "levels": list(self.levels),
-        }
+        return asdict(self)
 
     def text(self) -> str:
         """Return the same as readable text."""

@@ -40,7 +40,7 @@ class Events:
     """Follows events.jsonl, which the launcher writes line by line."""
 
     def __init__(
-        self, stream: Stream, path: Path, hierarchy: Hierarchy, marks: Marks | None = None
+        self, stream: Stream, path: Path, hierarchy: Hierarchy, marks: Marks | None
     ) -> None:
         """Show faults in the hierarchy and, where there is an arm, in 3D by `marks`."""
         self._stream = stream

@@ -15,9 +15,7 @@ from rack.tools.viewer.sink import RackWriter, Ran, block_of
 from rack.tools.viewer.stream import Moment, Stream, Timelines, new_recording
 
 
-def write_merged(
-    placed: Sequence[RackPlace], file: Path, show: Callable[[float], None] = lambda part: None
-) -> None:
+def write_merged(placed: Sequence[RackPlace], file: Path, show: Callable[[float], None]) -> None:
     """Write one recording of all these racks; `show` gets the part that is done, 0 to 1.
 
     The notes on the times of racks are in its log. Of a single rack it is that rack's run.rrd.

@@ -290,9 +290,9 @@ def test_every_impossible_override_is_reported(small: Path) -> None:
 
 def test_a_fault_script_by_name_is_the_racks_own_before_a_bundled_one(write: Write) -> None:
     rack = write("mine.toml", 'name = "mine"')
-    bundled = assembled(rack, faults="overload")["fault"]
+    bundled = assembled(rack, (), "overload")["fault"]
     write("overload.toml", "[[fault]]\nkind = 'kill'\nboard = 'lower'\ntick = 5")
-    own = assembled(rack, faults="overload")["fault"]
+    own = assembled(rack, (), "overload")["fault"]
     assert (len(own), own[0]["board"]) == (1, "lower")
     assert bundled != own
 
@@ -306,7 +306,7 @@ def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
 
 def test_the_classes_that_a_config_names_are_those_that_are_preloaded() -> None:
     for name in names():
-        assert named_classes(assembled(name)) == classes(load(name))
+        assert named_classes(assembled(name, (), None)) == classes(load(name))
 
 
 def test_every_export_exists_once() -> None:
@@ -326,5 +326,5 @@ def test_a_name_may_be_that_of_a_config_in_the_current_folder(
     (tmp_path / "mine" / "mine.toml").write_text('format = 2\nname = "mine"\nextends = ["fig2"]\n')
     (tmp_path / "fig2.toml").write_text('format = 2\nname = "other"\n')
     monkeypatch.chdir(tmp_path)
-    assert assembled("mine")["name"] == "mine"
-    assert assembled("fig2")["name"] == "fig2"
+    assert assembled("mine", (), None)["name"] == "mine"
+    assert assembled("fig2", (), None)["name"] == "fig2"

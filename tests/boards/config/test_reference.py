@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rack.boards.config import FAULTS, load, names
+from rack.boards.config import CONFIGS, FAULTS, load, names
 from rack.boards.config.files import read, with_faults
 from rack.boards.config.reference import Key, find_tables, key_tables
 from rack.boards.errors import ConfigError
@@ -93,7 +93,7 @@ def test_the_reference_has_every_key_of_every_shipped_config(name: str) -> None:
 
 def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
     known = reference("nasrem")["fault"]
-    scripts = [with_faults({}, name)["fault"] for name in names(FAULTS)]
+    scripts = [with_faults({}, name, CONFIGS)["fault"] for name in names(FAULTS)]
     assert {key for script in scripts for fault in script for key in fault} <= set(known)
 
 

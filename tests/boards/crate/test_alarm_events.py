@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import pytest
@@ -61,6 +61,14 @@ def segment(config: MakeConfig, rack_name: str) -> Iterator[Segment]:
     unlink(rack_name)
 
 
+def alarm_events(
+    segment: Segment,
+    geom: Callable[[int], str] = str,
+    name: Callable[[str, int], str] = lambda board, number: str(number),
+) -> AlarmEvents:
+    return AlarmEvents(segment, JOINTS, geom, name, lambda board, key: None)
+
+
 def heard(
     segment: Segment,
     owner: str,
@@ -72,7 +80,7 @@ def heard(
     """Ring an alarm at tick 400 and return the event that it makes."""
     AlarmWriter(segment, owner).ring(400, alarm, subject, value, since)
     row = alarm_ring(segment, owner).drain().rows[-1]
-    return AlarmEvents(segment, JOINTS).of(row, owner)
+    return alarm_events(segment).of(row, owner)
 
 
 # Operator commands come from the operator table: see test_operator.py and test_desk.py.
@@ -240,9 +248,7 @@ def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
 def test_a_modification_that_failed_is_named_by_its_board(segment: Segment) -> None:
     AlarmWriter(segment, "wave").ring(400, Alarm.MODIFICATION, 1)
     row = alarm_ring(segment, "wave").drain().rows[-1]
-    event = AlarmEvents(segment, JOINTS, str, lambda board, number: f"{board} {number}").of(
-        row, "wave"
-    )
+    event = alarm_events(segment, name=lambda board, number: f"{board} {number}").of(row, "wave")
     assert (event.kind, event.code, event.subject) == ("detection", "modification", "wave 1")
     assert event.text == "control modification 'wave 1' failed and was taken out"
 
@@ -254,6 +260,6 @@ def test_a_collision_names_both_geoms(segment: Segment) -> None:
     post, palm = (cell.model.geom(name).id for name in ("post", "palm"))
     AlarmWriter(segment, "wave").ring(400, Alarm.COLLISION, post, palm)
     row = alarm_ring(segment, "wave").drain().rows[-1]
-    event = AlarmEvents(segment, JOINTS, partial(geom_name, config)).of(row, "wave")
+    event = alarm_events(segment, partial(geom_name, config)).of(row, "wave")
     assert (event.code, event.subject) == ("collision", "post")
     assert event.text == "unintended contact: 'post' touches 'palm'"

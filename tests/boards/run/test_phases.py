@@ -135,7 +135,10 @@ def test_gantt_draws_the_cyclic_schedule_without_preemption(
 ) -> None:
     found = config(text=cyclic())
     gantt = gantt_of(
-        Subject(found, wire(found), None, tmp_path), WindowOptions(), {}, lambda part: None
+        Subject(found, wire(found), None, tmp_path),
+        WindowOptions(None, None, None, None),
+        {},
+        lambda part: None,
     )
     text = gantt.text()
     rows = [line.split()[-1] for line in text.splitlines() if line.startswith("core 0 ")]

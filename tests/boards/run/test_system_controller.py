@@ -63,6 +63,7 @@ def wiring(**changed: object) -> ClockWiring:
         "keeps_awake": False,
         "restart_ticks": 20,
         "on_loss": {"left": Demand.STOP, "right": Demand.BRAKE},
+        "reservation": None,
     }
     return ClockWiring(**{**plain, **changed})  # type: ignore[arg-type]  # by name, as above
 

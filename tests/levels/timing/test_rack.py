@@ -27,12 +27,25 @@ FIGURE_3 = BoardTiming(
     has_planner=True,
     is_critical=True,
     budget=Budget(read_ns=MS, process_ns=2 * MS, write_ns=MS, plan_ns=6 * MS, update_ns=MS),
+    plan_within_ns=None,
+    queues=(),
+    phase=0,
+    reads={},
 )
 
 
 def rack(*boards: BoardTiming, goal_ns: float | None = None) -> RackTiming:
     return RackTiming(
-        False, 1.0, 2 * MS, CLOCK, {board.name: board for board in boards}, 0, 0.2, goal_ns
+        False,
+        1.0,
+        2 * MS,
+        CLOCK,
+        {board.name: board for board in boards},
+        0,
+        0.2,
+        goal_ns,
+        {},
+        None,
     )
 
 

@@ -4,12 +4,20 @@ unit."""
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
 
-from rack.levels.timing.response_time import blocking_ns, load_of, response_time, response_times
+from rack.levels.timing.response_time import (
+    TURN_NS,
+    Load,
+    blocking_ns,
+    load_of,
+    response_time,
+    response_times,
+)
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
@@ -51,8 +59,19 @@ def seen(tasks: list[Plain], blocked: int = 0) -> list[int]:
     return worst
 
 
+def response(
+    cost: int,
+    above: Sequence[Load],
+    blocking: int = 0,
+    jitter: int = 0,
+    sharing: Sequence[Load] = (),
+    horizon: int = 10**5,
+) -> int | None:
+    return response_time(cost, above, blocking, jitter, sharing=sharing, horizon=horizon)
+
+
 def analysed(tasks: list[Plain], blocked: int = 0) -> list[int | None]:
-    return [response_time(t.cost, tasks[:at], blocked, t.jitter) for at, t in enumerate(tasks)]
+    return [response(t.cost, tasks[:at], blocked, t.jitter) for at, t in enumerate(tasks)]
 
 
 def check_against_schedule(tasks: list[Plain], blocked: int = 0) -> None:
@@ -130,24 +149,24 @@ def test_blocking_delays_the_whole_busy_time_once() -> None:
     ids=["full above", "overloaded above"],
 )
 def test_overload_has_no_bound(above: list[tuple[int, int, int]]) -> None:
-    assert response_time(2, above) is None
+    assert response(2, above) is None
 
 
 def test_a_search_that_creeps_is_given_up() -> None:
     # A billionth of the core is left: the end lies 10^10 jobs ahead, and before the horizon.
-    assert response_time(500_000, [(9_999, 10_000, 0), (99_999, 10**9, 0)], horizon=10**15) is None
+    assert response(500_000, [(9_999, 10_000, 0), (99_999, 10**9, 0)], horizon=10**15) is None
 
 
 def test_the_search_ends_at_its_horizon() -> None:
     above = [(5, 10, 0), (49_999, 100_000, 0)]
-    assert response_time(7, above, horizon=100_000) is None
-    found = response_time(7, above, horizon=10_000_000)
+    assert response(7, above, horizon=100_000) is None
+    found = response(7, above, horizon=10_000_000)
     assert found is not None
     assert found > 100_000
 
 
 def test_what_takes_no_time_responds_at_once() -> None:
-    assert response_time(0, []) == 0
+    assert response(0, []) == 0
 
 
 def test_two_context_switches_come_with_every_job() -> None:
@@ -169,8 +188,10 @@ def test_tasks_of_equal_priority_delay_each_other() -> None:
 
 def test_ordinary_tasks_share_time_by_turns() -> None:
     tasks = [timed("brief", 0, 0, 100, computing(3)), timed("long", 0, 0, 1000, computing(200))]
-    assert response_time(3, [], sharing=[(200, 1000, 0)], turn=4) == 3 + 3 + 4
-    assert response_time(200, [], sharing=[(3, 100, 0)], turn=4) == 200 + 3 * 3
+    long, seldom = 50 * TURN_NS, 1000 * TURN_NS
+    assert response(3, [], sharing=[(long, seldom, 0)], horizon=seldom) == 3 + 3 + TURN_NS
+    often = 25 * TURN_NS
+    assert response(long, [], sharing=[(3, often, 0)], horizon=seldom) == long + 3 * 3
     # A turn of the kernel's, 4 ms, is longer than all of it.
     assert response_times(tasks) == {"brief": 203, "long": 209}
 

@@ -12,10 +12,30 @@ from rack.tools.live.display import COLUMNS, PlainDisplay, RackView, line_of
 from rack.tools.live.holds import Hold
 from rack.tools.live.snapshot import Snapshot, TaskProgress, TaskRow
 
-ROW = TaskRow("servo", 2, 1, 80, 400.0, "executing", 1200, 1201, 0, 3, 4, 1, 0.25, None, "")
+ROW = TaskRow("servo", 2, 1, 80, 400.0, "executing", 1200, 1201, 0, 3, 4, 1, 0.25, None, "", "", "")
 PLANNER = replace(ROW, task="servo.planner", priority=0, missed=0, skipped=0, lateness_ms=1.5)
 PROGRESS = TaskProgress(5, 25, 1, 4, "executing", "")
-SNAPSHOT = Snapshot("demo", "running", 1200, 3.0, 0, (), "none", (), (ROW, PLANNER), PROGRESS)
+SNAPSHOT = Snapshot(
+    "demo",
+    "running",
+    1200,
+    3.0,
+    0,
+    (),
+    "none",
+    (),
+    (ROW, PLANNER),
+    PROGRESS,
+    holds=(),
+    hosts=(),
+    entries=(),
+    queues=(),
+    inboxes=(),
+    exchanges={},
+    peers=(),
+    imports=(),
+    exports=(),
+)
 
 
 MOVE = replace(

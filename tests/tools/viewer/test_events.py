@@ -27,7 +27,7 @@ def test_what_a_launch_waits_for_is_not_in_the_log(tmp_path: Path) -> None:
     events = [Event(time.time_ns(), at, "waiting", "", text) for text, at in texts.items()]
     (tmp_path / "events.jsonl").write_text("".join(json.dumps(asdict(e)) + "\n" for e in events))
     hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
-    Events(stream, tmp_path / "events.jsonl", hierarchy).advance()
+    Events(stream, tmp_path / "events.jsonl", hierarchy, None).advance()
     stream.flush()
     stream.close()
     log = read(tmp_path / "run.rrd", "/log/events", "TextLog:text")

@@ -57,7 +57,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def test_one_rack_from_its_files_is_what_its_recorder_made_of_its_rings(
     run: Recording, tmp_path: Path
 ) -> None:
-    write_merged(on_one_time_line([run]), tmp_path / "again.rrd")
+    write_merged(on_one_time_line([run]), tmp_path / "again.rrd", lambda part: None)
     again, live = contents(tmp_path / "again.rrd"), contents(run.folder / "run.rrd")
     # Rows of losses come with each block, and blocks are cut elsewhere; so are the ends of lines of
     # limits.

@@ -52,11 +52,11 @@ class LanRuns:
     """What to measure: numbers of racks, rates, the time at each, rounds, and the share of packets
     that get lost."""
 
-    counts: Sequence[int] = COUNTS
-    rates_hz: Sequence[float] = RATES_HZ
-    seconds: float = 3.0
-    rounds: int = 1
-    loss: float = 0.0
+    counts: Sequence[int]
+    rates_hz: Sequence[float]
+    seconds: float
+    rounds: int
+    loss: float
 
 
 def measure(runs: LanRuns, progress: Progress) -> LanFigures:

@@ -58,8 +58,8 @@ class OtherRun:
     any; and whether both may be repeated."""
 
     folder: Path
-    of: str = ""
-    repeats: bool = True
+    of: str
+    repeats: bool
 
 
 def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Report, str]:
@@ -206,9 +206,9 @@ def task_times(
     task: TaskSpec,
     cycles: np.ndarray,
     period_ns: int,
-    is_lockstep: bool = False,
+    is_lockstep: bool,
     *,
-    stretches: np.ndarray | None = None,
+    stretches: np.ndarray,
 ) -> Report:
     """Return the times of a task's traced cycles, ms of the wall clock (eq. 3.5: R = t_exec +
     t_comm + t_residual).

@@ -23,10 +23,10 @@ class WindowOptions:
     """The window that the user asks for, ns; None: not given. `cycles` are the first and the last
     cycle, of `level`."""
 
-    from_ns: int | None = None
-    to_ns: int | None = None
-    cycles: tuple[int, int] | None = None
-    level: str | None = None
+    from_ns: int | None
+    to_ns: int | None
+    cycles: tuple[int, int] | None
+    level: str | None
 
     def window(
         self, level: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None

@@ -40,7 +40,7 @@ def test_racks_are_measured_next_to_others_and_who_fails_is_named(
     monkeypatch.setattr(lan, "ENDS", {TLS: ENDS[TLS], "UDP": ENDS["UDP"], "nobody": "none"})
     monkeypatch.setattr(lan, "DEATHS", 1)
     monkeypatch.setattr(lan, "IDLE_S", 0.3)
-    found = measure(LanRuns((1,), (RATE_HZ,), CYCLES / RATE_HZ), Progress())
+    found = measure(LanRuns((1,), (RATE_HZ,), CYCLES / RATE_HZ, 1, 0.0), Progress())
     for who in (TLS, "UDP"):
         assert len(found.values[Point("round trip", 1, RATE_HZ, who, "us")]) == CYCLES
         # Both machines, but for what comes after their last cycle.

@@ -56,7 +56,7 @@ def test_times_of_a_task_are_those_of_equation_3_5() -> None:
     cycles = np.array(
         [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD
     )
-    times = task_times(TASK, cycles, 10 * MS)
+    times = task_times(TASK, cycles, 10 * MS, False, stretches=np.zeros(3))
     assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
     assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
     assert times["communication_ms"]["max"] == 2.0
@@ -67,7 +67,7 @@ def test_times_of_a_task_are_those_of_equation_3_5() -> None:
 
 
 def test_a_task_that_never_ran_has_no_times() -> None:
-    times = task_times(TASK, np.empty(0, RECORD), 10 * MS)
+    times = task_times(TASK, np.empty(0, RECORD), 10 * MS, False, stretches=np.zeros(0))
     assert times["execution_ms"] is None
     assert times["alpha_ms"] is None
 

@@ -72,7 +72,7 @@ def test_it_is_made_anew_if_it_is_damaged(folder: Path) -> None:
 
 
 def test_it_is_made_anew_in_another_folder_and_after_a_comparison(folder: Path) -> None:
-    write_report(folder, OtherRun(folder))
+    write_report(folder, OtherRun(folder, "", True))
     assert stored_report(folder) is None
     write_report(folder)
     moved = folder.with_name(f"{folder.name}-moved")
