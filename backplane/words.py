@@ -102,7 +102,7 @@ class Block(IntEnum):
     `rack.boards.host.bus_adapter`.
     """
 
-    RELEASED = 0  # newest release, as a tick; -1: none yet
+    RELEASED = 0  # newest release, as a tick; -1: none yet. Of a batch: its last
     DEADLINE = 1  # tick before which that cycle, or plan, must be finished
     DONE = 2  # newest release that is finished; -1: none yet
     PID = 3
@@ -137,6 +137,7 @@ class Block(IntEnum):
     # 1 + tick before which the task is to save its state; 0: it is not, or has. Set by the clock
     SAVE = 27
     TRACE_FIRST = 28  # trace records before this run, which continues another; written by the Rack
+    FIRST = 29  # in lockstep, first of the releases given together with RELEASED; by the clock
 
 
 class TaskState(IntEnum):

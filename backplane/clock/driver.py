@@ -53,6 +53,9 @@ class Controller(Protocol):
     def released(self, tick: int) -> None:
         """Do the work due after the release."""
 
+    def rests_until(self, tick: int) -> int:
+        """Return the first tick after `tick` that needs `begin`, as far as is known."""
+
 
 class ClockDriver(ABC):
     """The part common to both modes: the tick, the releases, the end of the run.

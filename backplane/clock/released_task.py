@@ -18,8 +18,8 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, TaskState
 
 # Plain integers for the hot path.
-_RELEASED, _DEADLINE, _DONE, _LOST = (
-    int(Block[name]) for name in ("RELEASED", "DEADLINE", "DONE", "LOST")
+_RELEASED, _FIRST, _DEADLINE, _DONE, _LOST = (
+    int(Block[name]) for name in ("RELEASED", "FIRST", "DEADLINE", "DONE", "LOST")
 )
 
 
@@ -64,8 +64,8 @@ class ReleasedTask:
         block = self.block
         return block[_DEADLINE] <= release and not self.is_lost
 
-    def release(self, tick: int) -> None:
-        """Give the task its newest release."""
+    def release(self, tick: int, more: int = 0) -> None:
+        """Give the task its newest release and, in lockstep, so many `more` after it."""
         block = self.block
         every = self._every
         release = tick - (tick - self._phase) % every
@@ -79,9 +79,17 @@ class ReleasedTask:
         else:
             self.missed += 1
         self._done = done
-        block[_DEADLINE] = release + every
-        self.deadline = release + every - self._early
-        block[_RELEASED] = release
+        newest = release + more * every
+        block[_DEADLINE] = newest + every
+        self.deadline = newest + every - self._early
+        block[_FIRST] = release
+        block[_RELEASED] = newest
+
+    def next_event(self, tick: int) -> int:
+        """Return the first tick after `tick` that must wait for the task, or releases it."""
+        if self.deadline > tick:
+            return self.deadline
+        return tick + 1 + (self._phase - tick - 1) % self._every
 
     def is_settled(self) -> bool:
         """Say whether it has finished, or will not: there is nothing to wait for."""

@@ -30,6 +30,7 @@ from rack.backplane.words import Block, Head, Run, System
 
 # Plain integers for the hot path.
 _RELEASED = int(Block.RELEASED)
+_FIRST = int(Block.FIRST)
 _SAVE = int(Block.SAVE)
 _STATE = int(System.STATE)
 _STOPPED = int(Run.STOPPED)
@@ -47,9 +48,9 @@ class NextCycle:
     """The releases of one task, on the grid. A late task skips the releases that passed, and counts
     them.
 
-    An executor's release has passed at the next one. A planner's has passed at the end of its
-    plan's time slice: until then it is taken late, as of its own tick, since its result depends on
-    ticks alone.
+    An executor's release has passed at the next one; those that the clock gives at once in lockstep
+    are taken one after the other. A planner's has passed at the end of its plan's time slice: until
+    then it is taken late, as of its own tick, since its result depends on ticks alone.
     """
 
     def __init__(
@@ -72,6 +73,8 @@ class NextCycle:
             self._pause = self._spin
         elif is_lockstep:
             self._pause = self._await_post
+        self._takes_batches = is_lockstep and spec.role == "executor"
+        self._newest = -1
         self._silent_clock = (
             None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
         )
@@ -104,10 +107,11 @@ class NextCycle:
                 # still to be taken.
                 newest -= self._spec.every
             if newest >= self._due:
-                if is_posted:
+                if is_posted and newest != self._newest:
                     # Its post, which nobody waited for: else the semaphore would overflow within
-                    # weeks.
+                    # weeks. A batch has one.
                     self._semaphore.take()
+                self._newest = newest
                 return self._take(newest)
             if block[_SAVE] and self.save is not None:
                 self.save()
@@ -119,7 +123,8 @@ class NextCycle:
         """Take the oldest release that has not passed."""
         every = self._spec.every
         expected = self._due
-        release = max(expected, newest - self._slack)
+        oldest = self._block[_FIRST] if self._takes_batches else newest - self._slack
+        release = max(expected, oldest)
         self.skipped = (release - expected) // every
         self._due = release + every
         self._slack = every * (self._spec.within_cycles - 1)

@@ -130,18 +130,22 @@ class ClockKeeper(Keeper):
         self._due: int | None = None
         self._writing: Thread | None = None
 
-    def __call__(self, tick: int) -> None:
-        """Take a checkpoint before `tick`, if one is due and every process is there."""
+    def __call__(self, tick: int) -> int:
+        """Take a checkpoint before `tick`, if one is due and every process is there; return the
+        next tick before which one is."""
         if self._due is None:
             self._due = _next(tick, self._every) if self._at is None else self._at
             if any(task.block[Block.SAVE] == REFUSED for task in self._driver.tasks):
                 self._due = sys.maxsize
-        if tick < self._due or any(task.is_lost or task.is_stopped for task in self._driver.tasks):
-            return
+        if tick < self._due:
+            return self._due
+        if any(task.is_lost or task.is_stopped for task in self._driver.tasks):
+            return tick + 1
         self._due = _next(tick, self._every)
         self._driver.settle()
         if all(task.is_settled() for task in self._driver.tasks):
             self._take(tick)
+        return self._due
 
     def _take(self, tick: int) -> None:
         driver = self._driver

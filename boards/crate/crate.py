@@ -236,6 +236,8 @@ class Crate:
         tick = words[System.TICK]
         if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
             block = self._segment.block(name)
+            # In lockstep it may have done part of a batch.
+            tick = max(tick, min(block[Block.DONE] + 1, block[Block.RELEASED]))
             if self._is_host(name) and block[Block.STATE] == TaskState.ENDED:
                 # Its program is done; a task ends with the run alone.
                 block[Block.PID] = 0

@@ -56,8 +56,10 @@ class Heartbeat:
                 self._seen[name] = block[Block.DONE], now
                 self._reported.discard(name)
         awaits = any(block[Block.AWAITS] for block in self._blocks.values())
-        if self._words[System.TICK] != self._seen[CLOCK][0] or self._words[System.HELD] or awaits:
-            self._seen[CLOCK] = self._words[System.TICK], now
+        # In lockstep several cycles may be one tick of the clock: it runs while they do.
+        ticks = self._words[System.TICK] + sum(b[Block.DONE] for b in self._blocks.values())
+        if ticks != self._seen[CLOCK][0] or self._words[System.HELD] or awaits:
+            self._seen[CLOCK] = ticks, now
             self._reported.discard(CLOCK)
         late = [
             n

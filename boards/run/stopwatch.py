@@ -19,10 +19,11 @@ from rack.boards.run.ports import InputPorts, OutputPorts
 
 # Plain integers for the hot path.
 _EPOCH = int(System.EPOCH_NS)
-_DONE, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (
+_DONE, _RELEASED, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (
     int(Block[name])
     for name in (
         "DONE",
+        "RELEASED",
         "CYCLES",
         "MISSED",
         "SKIPPED",
@@ -139,7 +140,8 @@ class Stopwatch:
         )
         self._cycles = block[_CYCLES] = self._cycles + 1
         block[_DONE] = done
-        if lockstep_done is not None:
+        if lockstep_done is not None and done >= block[_RELEASED]:
+            # The last one of a batch.
             lockstep_done.release()
         if not self._cycles % BUS_COUNT_CYCLES:
             self.count_bus()

@@ -56,7 +56,10 @@ class SystemController:
     """The clock's duties at every tick besides releasing tasks; see
     `rack.backplane.clock.driver.Controller`."""
 
-    def __init__(self, segment: Segment, wiring: ClockWiring, driver: ClockDriver) -> None:
+    def __init__(
+        self, segment: Segment, wiring: ClockWiring, driver: ClockDriver, end_of_run: EndOfRun
+    ) -> None:
+        self._end_of_run = end_of_run
         self._words = segment.words
         self._wiring = wiring
         self._driver = driver
@@ -85,6 +88,15 @@ class SystemController:
     def released(self, tick: int) -> None:
         """Do the work due after the release."""
         self._faults.within(tick)
+
+    def rests_until(self, tick: int) -> int:
+        """Return the first tick after `tick` that needs `begin`, or may end the run, as far as is
+        known."""
+        faults = self._faults
+        desk = self._desk
+        if faults.open or faults.awaited or desk.waiting or desk.leased or self._settled is None:
+            return tick + 1
+        return self._end_of_run.next_tick
 
     def _handle_losses(self, tick: int) -> None:
         """Let restarted boards rejoin, latch for those given up, and set the demand for all other
@@ -270,6 +282,13 @@ class EndOfRun:
             self._phase = self._reader.spec.phase
         self._next = 0
 
+    @property
+    def next_tick(self) -> int:
+        """The next tick at which the answer may be another one."""
+        if self._reader is None or self._task_ends is not None:
+            return sys.maxsize
+        return self._next + 1
+
     def __call__(self, tick: int) -> int | None:
         """Return the tick at which the run stops, by the messages as of the tick before; None until
         it is known."""
@@ -302,8 +321,9 @@ def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:
         now = SystemClock(segment).now()
         newest = words[System.TICK]
         alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
-    driver = driver_of_run(segment, wiring, EndOfRun(segment, wiring), alarms)
-    driver.controller = SystemController(segment, wiring, driver)
+    end_of_run = EndOfRun(segment, wiring)
+    driver = driver_of_run(segment, wiring, end_of_run, alarms)
+    driver.controller = SystemController(segment, wiring, driver, end_of_run)
     if wiring.keeping is None:
         driver.run()
         return

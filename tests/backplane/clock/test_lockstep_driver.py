@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from typing import get_args
 import pytest
 
 from rack.backplane import process
-from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.clock.lockstep import BATCH, LockstepDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
 from rack.backplane.segment import Segment
@@ -293,3 +294,124 @@ def test_the_host_holds_the_clock_before_a_tick_and_lets_it_go(make_bus: MakeBus
     words[System.STOP_REQUEST] = 0
     driver._launcher = driver._launcher[0], driver._launcher[1] + 1
     assert not driver._wait_for_step(7)
+
+
+class Idle:
+    """A system controller without work before a tick."""
+
+    def __init__(self, until: int = sys.maxsize) -> None:
+        self.begun: list[int] = []
+        self._until = until
+
+    def begin(self, tick: int) -> None:
+        """Note that the clock works at a tick."""
+        self.begun.append(tick)
+
+    def released(self, tick: int) -> None:
+        """Do nothing."""
+
+    def rests_until(self, tick: int) -> int:
+        """Return the tick with work."""
+        return self._until
+
+
+def test_an_executor_that_alone_is_due_gets_its_ticks_at_once(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast", slot=2), task("slow", every=6, slot=3))
+    segment.words[System.LOCKSTEP] = 1
+    log: list[tuple[str, str, int]] = []
+    cycles = {name: NextCycle(segment, name) for name in ("fast", "slow")}
+    driver = LockstepDriver(segment, lambda tick: 15, False, HISTORY)
+    controller = driver.controller = Idle()
+    with (
+        in_thread(lambda: serve(segment, "fast", cycles["fast"], log, 0.0)),
+        in_thread(lambda: serve(segment, "slow", cycles["slow"], log, 0.02)),
+    ):
+        driver.run()
+    assert controller.begun == [0, 1, 6, 7, 12, 13]
+    begun = {
+        name: [at for what, who, at in log if (what, who) == ("begin", name)] for name in cycles
+    }
+    assert begun == {"fast": list(range(15)), "slow": [0, 6, 12]}
+    for tick in (6, 12):
+        assert log.index(("end", "slow", tick - 6)) < log.index(("begin", "fast", tick))
+        assert log.index(("end", "fast", tick - 1)) < log.index(("begin", "slow", tick))
+    assert segment.words[System.TICK] == 14
+
+
+@pytest.mark.parametrize(
+    ("word", "value", "end"),
+    [
+        (System.STOP_TICK, 0, 1 + BATCH),
+        (System.STOP_TICK, 4, 4),
+        # It holds before tick 5.
+        (System.HOLD_AT, 6, 5),
+        (System.HOLD_AT, 1, 2),
+    ],
+)
+def test_a_batch_ends_where_the_run_ends_or_is_held(
+    make_bus: MakeBus, word: System, value: int, end: int
+) -> None:
+    segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    driver.controller = Idle()
+    driver._begins(0)
+    segment.words[word] = value
+    assert driver._batch_end(driver.due(1, 0), 1) == end
+
+
+def test_a_batch_ends_before_what_the_clock_must_do(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    driver.controller = Idle(until=7)
+    driver._begins(1)
+    due = driver.due(1, 0)
+    assert driver._batch_end(due, 1) == 7
+    driver.keep = lambda tick: 4
+    driver._begins(1)
+    assert driver._batch_end(due, 1) == 4
+    driver.keep = lambda tick: tick
+    driver._begins(1)
+    assert driver._batch_end(due, 1) == 2
+
+
+def test_a_planner_several_tasks_and_one_that_is_stopped_get_one_tick_each(
+    make_bus: MakeBus,
+) -> None:
+    planner = task("planner", slot=4, role="planner")
+    segment = make_bus(task("fast", slot=2), task("also", every=2, slot=3), planner)
+    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
+    driver.controller = Idle()
+    driver._begins(0)
+    assert driver._batch_end(driver.due(2, 1), 2) == 3
+    assert driver._batch_end([], 1) == 2
+    fast, also, thinking = driver.tasks
+    assert [driver._batch_end([one], 2) for one in (fast, also, thinking)] == [3, 3, 3]
+    also.deadline = thinking.deadline = 20
+    assert driver._batch_end([fast], 1) == 1 + BATCH
+    fast.deadline = 20
+    assert [driver._batch_end([one], 1) for one in (also, thinking)] == [2, 2]
+    fast.is_stopped = True
+    assert driver._batch_end([fast], 1) == 2
+
+
+def test_a_restarted_clock_waits_for_the_batch_of_its_predecessor(make_bus: MakeBus) -> None:
+    segment = make_bus(task("fast"))
+    words, block = segment.words, segment.block("fast")
+    words[System.LOCKSTEP] = 1
+    words[System.STATE] = Run.RUNNING
+    words[System.TICK] = 3
+    block[Block.RELEASED] = 6
+    block[Block.DEADLINE] = 7
+    block[Block.DONE] = 3
+    asked: list[int] = []
+
+    def ended(tick: int) -> int:
+        asked.append(block[Block.DONE])
+        return tick
+
+    driver = LockstepDriver(segment, ended, False, HISTORY)
+    with in_thread(driver.run):
+        block[Block.DONE] = 6
+        done_semaphore(segment.rack, "fast").release()
+    assert asked
+    assert set(asked) == {6}

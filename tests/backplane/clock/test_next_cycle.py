@@ -352,3 +352,20 @@ def test_in_lockstep_a_sleeping_task_waits_for_its_signal(bus: Segment) -> None:
     for tick in (0, 4, 8):
         release(bus, tick)
         assert (cycle.wait(), cycle.skipped) == (tick, 0)
+
+
+def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: Segment) -> None:
+    bus.words[System.LOCKSTEP] = 1
+    block = bus.block("level")
+    cycle = NextCycle(bus, "level")
+    release(bus, 0)
+    seen = [(cycle.wait(), cycle.skipped)]
+    block[Block.FIRST] = 4
+    release(bus, 12)
+    seen += [(cycle.wait(), cycle.skipped) for _ in range(3)]
+    assert seen == [(0, 0), (4, 0), (8, 0), (12, 0)]
+    # Continued late: what has passed is skipped.
+    block[Block.FIRST] = 24
+    release(bus, 28)
+    assert [(cycle.wait(), cycle.skipped) for _ in range(2)] == [(24, 2), (28, 0)]
+    assert wake_semaphore(bus.rack, "level").value == 0

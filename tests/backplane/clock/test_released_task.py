@@ -116,3 +116,21 @@ def test_executors_come_first_then_the_faster_then_the_earlier() -> None:
     fast = task("fast", every=2)
     found = by_priority(layout("r", (), [planner, slow, late, fast]))
     assert [spec.name for spec in found] == ["fast", "late", "slow", "plan"]
+
+
+def test_several_releases_at_once_have_the_deadline_of_the_last(released: ReleasedTask) -> None:
+    released.release(6, 2)
+    assert words(released)[:2] == (13, 13 + EVERY)
+    assert (released.block[Block.FIRST], released.deadline) == (5, 17)
+    released.release(17)
+    assert (released.block[Block.FIRST], released.block[Block.RELEASED]) == (17, 17)
+
+
+def test_the_next_event_of_a_task_is_its_deadline_or_its_release(released: ReleasedTask) -> None:
+    released.release(5)
+    assert released.next_event(6) == 9
+    # Its plan is due later, or it is not released any more.
+    released.deadline = 21
+    assert released.next_event(6) == 21
+    released.deadline = 0
+    assert [released.next_event(tick) for tick in (4, 5, 8)] == [5, 9, 9]

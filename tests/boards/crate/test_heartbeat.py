@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.process import state_of
+from rack.backplane.process import WAITING, state_of
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Run, System
 from rack.boards.crate import heartbeat
@@ -115,6 +115,20 @@ def test_an_idle_task_does_not_hang(bus: Segment, clock: Clock) -> None:
         clock.now_s += 1.0
         bus.words[System.TICK] += 1
         assert beat.hanging() == []
+
+
+def test_a_clock_that_waits_for_several_cycles_at_once_does_not_hang(
+    bus: Segment, clock: Clock
+) -> None:
+    beat = Heartbeat(bus)
+    bus.block(FAST)[Block.RELEASED] = 8
+    with forked(signal.pause) as pid:
+        wait_until(lambda: state_of(pid) in WAITING)
+        bus.words[System.CLOCK_PID] = pid
+        for tick in range(8):
+            bus.block(FAST)[Block.DONE] = tick
+            clock.now_s += LOCKSTEP_S / 2
+            assert beat.hanging() == []
 
 
 def test_a_clock_without_ticks_hangs(bus: Segment, clock: Clock) -> None:

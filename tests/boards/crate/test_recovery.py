@@ -16,7 +16,7 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
-from tests.boards.conftest import LOOSE, NEVER, MakeConfig
+from tests.boards.conftest import LOOSE, NEVER, PLAIN, MakeConfig
 from tests.boards.messages import Written
 
 TASKS = ("wave", "wave.planner", "watch")
@@ -251,3 +251,12 @@ def test_alarms_are_read_by_whoever_attaches(config: MakeConfig) -> None:
         rack.run(1.0)
         codes = alarm_ring(rack.segment, "clock").drain().rows["code"].tolist()
     assert codes == [1, 2, 4]
+
+
+@pytest.mark.slow
+def test_a_board_that_fails_within_a_batch_fails_at_the_tick_of_its_cycle(
+    config: MakeConfig,
+) -> None:
+    _, events = run(config("board.wave.params={ trouble = 'raise', at = 101 }", text=PLAIN))
+    assert [event.tick for event in of(events, "died")] == [101]
+    assert [event.tick for event in of(events, "recovery", "rejoined")] == [101 + RESTART_TICKS]

@@ -163,6 +163,14 @@ def test_in_lockstep_a_cycle_has_no_deadline_and_is_reported(stepped: Site) -> N
     assert done.value == 3
 
 
+def test_several_releases_given_at_once_are_reported_once(stepped: Site) -> None:
+    stepped.block[Block.RELEASED] = 7
+    done = done_semaphore(stepped.segment.rack, "level")
+    for tick, reports in ((5, 0), (6, 0), (7, 1)):
+        stepped.cycle(tick)
+        assert (stepped.counts(Block.DONE), done.value) == ([tick], reports)
+
+
 def test_in_real_time_nobody_waits_for_a_report(site: Site) -> None:
     site.cycle(5)
     site.watch.idle()
