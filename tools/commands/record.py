@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -29,6 +29,9 @@ from rack.tools.recording.run_files import save as save_run
 from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import ViewerWindow, free_port, url
+
+LOOK_S = 0.1
+"""Longest time until a signal is handled that came to another thread than the first."""
 
 Out = Annotated[
     Path | None,
@@ -223,4 +226,9 @@ def _follow(recorders: Sequence[Recorder], unfinished: str) -> None:
 
     # A thread each: a rack on another machine, slow to answer, keeps none of the others waiting.
     with INTERRUPT.orderly(stop, unfinished), ThreadPoolExecutor(len(recorders)) as pool:
-        list(pool.map(follow, recorders))
+        following = [pool.submit(follow, recorder) for recorder in recorders]
+        # A signal that the kernel gives to another thread does not wake this one to handle it.
+        while wait(following, LOOK_S).not_done:
+            continue
+        for ended in following:
+            ended.result()

@@ -4,11 +4,14 @@ recording."""
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
+from ctypes import CDLL
 from pathlib import Path
 
 import numpy as np
@@ -202,11 +205,25 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
     assert len(read(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0
 
 
+def kill_thread(pid: int, number: int) -> None:
+    """Send a signal to another thread than the first, as the kernel may do by itself."""
+    threads = Path(f"/proc/{pid}/task").iterdir()
+    others = (int(t.name) for t in threads if (t / "comm").read_text() == "python\n")
+    assert CDLL(None).tgkill(pid, max(others), number) == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(
+    ("count", "send"), [(1, os.kill), (2, os.kill), (2, kill_thread)], ids=["1", "2", "a thread"]
+)
 def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
-    small: Path, rack_name: str, tmp_path: Path, number: signal.Signals, count: int
+    small: Path,
+    rack_name: str,
+    tmp_path: Path,
+    number: signal.Signals,
+    count: int,
+    send: Callable[[int, int], None],
 ) -> None:
     names, folder = [f"{rack_name}-{nth}" for nth in range(count)], tmp_path / "run"
     folders = [folder / name for name in names] if count > 1 else [folder]
@@ -223,7 +240,7 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
         recorder = stack.enter_context(subprocess.Popen(command, cwd=ROOT, **pipes))
         stack.callback(recorder.kill)
         wait_until(lambda: all((each / "run.rrd").is_file() for each in folders), WATCHDOG_S)
-        recorder.send_signal(number)
+        send(recorder.pid, number)
         out, said = recorder.communicate(timeout=WATCHDOG_S)
     assert recorder.returncode == 128 + number, said
     notes = [f"{folder}/run.rrd is missing; 'rack replay {folder}' makes it"] if count > 1 else []
