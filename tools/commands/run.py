@@ -118,6 +118,7 @@ def run(
     In lockstep the folder of a run holds checkpoints, each record.checkpoint_s of simulated time.
     With --from, the rack first goes on unchanged from the one before to TIME. What operators
     commanded in that run, before TIME and after it, is repeated; stops and faults by hand are not.
+    Host boards are not started then: what they sent enters again at the same ticks.
     --seconds counts from the beginning of the run that is continued, as there.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
