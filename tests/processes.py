@@ -115,6 +115,11 @@ def own_can_channel() -> str:
 def descriptors() -> int:
     """Return how many files this process has open and in use."""
     gc.collect()
+    return open_files()
+
+
+def open_files() -> int:
+    """Return how many files this process has open, used or not."""
     return len(list(Path("/proc/self/fd").iterdir()))
 
 

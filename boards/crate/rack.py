@@ -109,7 +109,7 @@ class Rack:
         self._journal = Journal(on_event)
         self._crate = crate
         self._pids: dict[str, int] = {}
-        self._losses = LostBoards(self._journal, self._record_printed)
+        self._losses = LostBoards(self._journal)
         self._is_armed = False
         self._why_stopped = ""
         self._stop_by: float | None = None
@@ -384,7 +384,7 @@ class Rack:
                 is_board = name == CLOCK or name in self.segment.map.blocks
                 is_over = self._is_stopped or self.outcome is not None
                 if is_board and not (is_over and status == 0):
-                    self._losses.lose(end, self._is_stopped)
+                    self._losses.lose(end, self._is_stopped, self._record_printed)
             case None:
                 self._losses.lose_crate()
 

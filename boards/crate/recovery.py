@@ -200,16 +200,14 @@ class HostBoards:
 
 
 class LostBoards:
-    """The boards that a rack has lost, and what became of them. `record_printed` records what they
-    have printed."""
+    """The boards that a rack has lost, and what became of them."""
 
-    def __init__(self, journal: Journal, record_printed: Callable[[], None]) -> None:
+    def __init__(self, journal: Journal) -> None:
         self.faults: list[str] = []  # a line for each that was given up
         self.given_up = False  # a board, or all of them with the crate
         self.is_beyond_help = False  # the run cannot go on
         self.cannot_keep = False  # a board ended because it has no checkpoint to give
         self._journal = journal
-        self._record_printed = record_printed
         self._recovery: Recovery | None = None  # None: the run has not begun
         self._hosts: HostBoards | None = None
 
@@ -218,8 +216,11 @@ class LostBoards:
         self._recovery = recovery
         self._hosts = hosts
 
-    def lose(self, end: Ended, is_over: bool) -> None:
-        """Record the end of a board, and restart it or give it up; `is_over`: so is the run."""
+    def lose(self, end: Ended, is_over: bool, record_printed: Callable[[], None]) -> None:
+        """Record the end of a board, and restart it or give it up; `is_over`: so is the run.
+
+        `record_printed` records what boards have printed.
+        """
         if self._hosts is not None and end.name in self._hosts:
             if not self._hosts.lose(end, how_ended(end.status)):
                 self.faults.append(
@@ -234,6 +235,7 @@ class LostBoards:
             return
         is_final = end.status in (CANNOT_GO_ON, CANNOT_KEEP)
         if is_final:
+            record_printed()
             text = self._reason(end.name) or text
         restart = self._recovery.lose(end.name, end.tick, is_final)
         if restart is None:
@@ -251,7 +253,6 @@ class LostBoards:
 
     def _reason(self, board: str) -> str:
         """Return the reason that a board printed last; empty: none."""
-        self._record_printed()
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import re
 import signal
@@ -17,7 +18,7 @@ from rack.boards.crate.line import CrateLine
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event
 from tests.boards.conftest import PLAIN, MakeConfig
-from tests.processes import children_of, descriptors, runs, wait_until
+from tests.processes import children_of, descriptors, open_files, runs, wait_until
 from tests.warm import programs
 
 
@@ -156,6 +157,18 @@ def test_failed_launches_leave_no_file_open_and_no_process_running(
         refusal(Rack(config(f"board.wave.params.trouble='{trouble}'")))
     wait_until(lambda: children_of(os.getpid()) == children)
     assert descriptors() == before
+
+
+def test_a_rack_that_has_run_keeps_no_file_open_until_a_collection(config: MakeConfig) -> None:
+    before = descriptors()
+    gc.disable()
+    try:
+        with Rack(config()) as rack:
+            rack.run(0.1)
+        del rack
+        assert open_files() == before
+    finally:
+        gc.enable()
 
 
 def test_a_config_that_cannot_be_wired_starts_no_process(

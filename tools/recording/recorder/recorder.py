@@ -255,8 +255,10 @@ class Recorder:
         """Record until the run is over; with a descriptor `until`, until that is readable or
         closed."""
         period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
-        watched = [] if until is None else [until]
-        while not select.select(watched, [], [], period_s)[0]:
+        watched = select.poll()
+        if until is not None:
+            watched.register(until, select.POLLIN)
+        while not watched.poll(period_s * 1e3):
             self.drain()
             over = self._segment.run_is_over
             if self._is_stopped or (until is None and over):
