@@ -105,8 +105,8 @@ def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     for key, position in (("home", cell.home), ("start", cell.begin)):
         cell.model.key_qpos[0] = start_qpos(cell, position)
         check_start(cell, robot, key, position)
-    if robot.gripper is not None and cell.gripper is not None and cell.gripper.linkage.yields:
-        check_fingers(cell, cell.gripper, robot.gripper)
+    if robot.gripper is not None:
+        check_fingers(cell, robot.gripper)
     return cell
 
 
@@ -348,9 +348,12 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: NDArray[np.f
         )
 
 
-def check_fingers(cell: Cell, gripper: Gripper, config: GripperConfig) -> None:
+def check_fingers(cell: Cell, config: GripperConfig) -> None:
     """Raise `RobotError` when couplings yield so far that open or closing fingers settle beyond
     `config.residual` of where planning poses them, or the gripper does not close."""
+    gripper = cell.gripper
+    if gripper is None or not gripper.linkage.yields:
+        return
     model = cell.model
     stiffness, damping = config.gains
     for wanted, start in ((config.open, config.open), (config.closed, half_open(config))):

@@ -6,7 +6,8 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -19,14 +20,15 @@ from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import pointing, pose
 from rack.levels.robot.abilities import Statics
-from rack.levels.robot.cell import Cell, check_start
+from rack.levels.robot.cell import Cell, build_cell, check_start
 from rack.levels.tables import SceneConfig
 from rack.levels.task.actions import LEANING_RESTARTS, rehearse
 from rack.levels.task.grasps import FULL_ORIENTATION, QUARTERS
 from rack.levels.task.program import DOWN, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
-from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, poses
+from rack.tools.robot.draft import CLOCK_NS, LEAST_PART, NOTHING, Draft, Wishes, draft, poses
 from rack.tools.robot.fingertips import Fingertips
+from rack.tools.robot.source import Source
 
 SEED = 1990
 """That of `nasrem`."""
@@ -70,6 +72,22 @@ class Assignment:
     scene: SceneConfig
     actions: list[dict[str, Any]]
     kind: str
+
+
+def drafted(source: Source, wanted: Wishes, folder: Path, name: str) -> tuple[Draft, Assignment]:
+    """Return the arm of a model and something for it to do, which `rack run` takes; a gripper that
+    it would refuse is held. Raises `RobotError`."""
+    made = draft(source, wanted, folder, name)
+    layout = lay_out(made)
+    try:
+        build_cell(made.robot, layout.scene, CLOCK_NS)
+    except RobotError as error:
+        if made.jaws is None:
+            raise
+        made = draft(source, replace(wanted, gripper="none"), folder, name)
+        made.notes.append(f"no gripper: {error}")
+        layout = lay_out(made)
+    return made, layout
 
 
 def lay_out(made: Draft) -> Assignment:

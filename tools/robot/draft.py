@@ -50,12 +50,6 @@ ALWAYS = 0.95
 """Bodies in contact in so many poses are neighbours, whose shapes overlap."""
 TOOLS = ("tcp", "tool", "grip_site", "attachment", "eef", "ee_", "pinch", "hand", "flange")
 """Parts of the names of frames at the end of an arm, the best first."""
-SLACK_S = 0.02
-"""MuJoCo's time constant of dry friction, which makes it a damper: a light link with the friction
-of a large gear, as models for position servos have it, hardly ever meets all of it."""
-DRY_SOLREF = (0.001, 1.0)
-DRY_SOLIMP = (0.99, 0.99)
-"""Of dry friction that is about what the equation of motion says."""
 NOTHING = SceneConfig()
 
 
@@ -136,13 +130,6 @@ def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     fingers = () if wanted.gripper == "none" else arm.fingers
     path = folder / f"{name}.xml"
     made = Draft(path, source.spec, wanted, arm, starts, notes=list(source.notes))
-    dry = [joint for joint in source.spec.joints if joint.frictionloss > 0.0]
-    slack = [joint for joint in dry if joint.solref_friction[0] == SLACK_S]
-    if slack:
-        made.notes.append(f"dry friction acts within {1e3 * DRY_SOLREF[0]:g} ms")
-    for joint in slack:
-        joint.solref_friction[:] = DRY_SOLREF
-        joint.solimp_friction[:2] = DRY_SOLIMP
     copy_model(source, path)
     if left := made.hold((*arm.joints, *fingers)):
         made.notes.append(f"left out, as nothing holds it: {listed(left)}")
@@ -223,12 +210,11 @@ def _add_gripper(made: Draft) -> None:
         config = config.model_copy(update={"open": round(jaws.opening, 5)})
         made.table["gripper"] = config
         cell = made.cell()
-        if cell.gripper is not None and cell.gripper.linkage.yields:
-            # Where home is, is not known yet: the fingers settle as if they were alone.
-            alone = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
-            cell.model.geom_contype *= alone
-            cell.model.geom_conaffinity *= alone
-            check_fingers(cell, cell.gripper, config)
+        # Where home is, is not known yet: the fingers settle as if they were alone.
+        alone = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
+        cell.model.geom_contype *= alone
+        cell.model.geom_conaffinity *= alone
+        check_fingers(cell, config)
     except RobotError as error:
         made.notes.append(f"no gripper: {error}")
         made.table.pop("gripper", None)

@@ -132,8 +132,7 @@ def _facing(cell: Cell, scene: SceneConfig) -> str:
 def _elsewhere(cell: Cell, config: GripperConfig) -> str:
     """Return why the fingers do not settle where planning poses them; empty: they do."""
     try:
-        if cell.gripper is not None and cell.gripper.linkage.yields:
-            check_fingers(cell, cell.gripper, config)
+        check_fingers(cell, config)
     except RobotError as error:
         return str(error)
     return ""

@@ -20,6 +20,12 @@ READ = (".stl", ".obj", ".msh")
 COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "true"}
 """Of a URDF: paths are absolute here, and a fixed frame, such as the tool's, stays a body."""
 UNBALANCED = "balanceinertia"
+SLACK_S = 0.02
+"""MuJoCo's time constant of dry friction, which makes it a damper: a light link with the friction
+of a large gear, as models for position servos have it, hardly ever meets all of it."""
+DRY_SOLREF = (0.001, 1.0)
+DRY_SOLIMP = (0.99, 0.99)
+"""Of dry friction that is about what the equation of motion says."""
 
 
 @dataclass
@@ -48,6 +54,7 @@ def read_source(path: Path) -> Source:
     else:
         raise RobotError(f"model '{path}': <{root.tag}>; valid: <mujoco> (MJCF), <robot> (URDF)")
     _name_all(source.spec)
+    _stiffen(source)
     try:
         source.compiled()
     except RobotError as error:
@@ -126,6 +133,17 @@ def _name_all(spec: mujoco.MjSpec) -> None:
         elements = {"body": spec.bodies[1:], "joint": spec.joints, "actuator": spec.actuators}[kind]
         for number, element in enumerate(elements):
             element.name = element.name or f"{kind} {number}"
+
+
+def _stiffen(source: Source) -> None:
+    """Make dry friction what it says, unless the model says how soon it acts."""
+    dry = [joint for joint in source.spec.joints if joint.frictionloss > 0.0]
+    slack = [joint for joint in dry if joint.solref_friction[0] == SLACK_S]
+    for joint in slack:
+        joint.solref_friction[:] = DRY_SOLREF
+        joint.solimp_friction[:2] = DRY_SOLIMP
+    if slack:
+        source.notes.append(f"dry friction acts within {1e3 * DRY_SOLREF[0]:g} ms")
 
 
 def copy_model(source: Source, path: Path) -> None:

@@ -44,6 +44,7 @@ def test_what_a_model_says_of_its_friction_stays(tmp_path: Path) -> None:
     source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
     for joint in source.spec.joints:
         joint.solref_friction[:] = [0.005, 1.0]
-    made = draft(source, Wishes(), tmp_path, "drafted")
+    said = written(tmp_path, source.spec.to_xml(), "said.xml")
+    made = draft(read_source(said), Wishes(), tmp_path, "drafted")
     assert made.cell().model.dof_solref[:, 0].tolist() == [0.005] * 6
     assert not made.notes
