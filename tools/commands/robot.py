@@ -212,7 +212,8 @@ def _numbers(text: str, option: str) -> tuple[float, ...]:
 def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> dict[str, Any]:
     """Write the folder of an arm, asking for more if `asks`; return what it is. Raises
     `Failure`."""
-    from rack.tools.robot.assignment import drafted
+    from rack.tools.robot.assignment import lay_out
+    from rack.tools.robot.draft import draft
     from rack.tools.robot.folder import config_text, document
     from rack.tools.robot.picture import NO_PICTURE, draw
     from rack.tools.robot.source import read_source
@@ -222,7 +223,8 @@ def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> d
         source = read_source(model)
         if asks:
             wanted = _completed(source, wanted)
-        made, layout = drafted(source, wanted, folder, name)
+        made = draft(source, wanted, folder, name)
+        layout = lay_out(made)
     except RobotError as error:
         raise Failure(str(error), 2) from None
     (folder / f"{name}.toml").write_text(config_text(made, layout, name, model), encoding="utf-8")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from rack.levels.errors import RobotError
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import sampling_range
 from rack.levels.robot.abilities import Statics
-from rack.levels.robot.cell import Cell, check_fingers, unchecked_cell
+from rack.levels.robot.cell import Cell, build_cell, check_fingers, unchecked_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -120,7 +120,20 @@ class Draft:
 
 
 def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
-    """Return the arm of a model. Raises `RobotError`, one line."""
+    """Return the arm of a model, as `rack run` takes it: a gripper that it would refuse is held.
+    Raises `RobotError`, one line."""
+    made = _draft(source, wanted, folder, name)
+    try:
+        build_cell(made.robot, NOTHING, CLOCK_NS)
+    except RobotError as error:
+        if made.jaws is None:
+            raise
+        made = _draft(source, replace(wanted, gripper="none"), folder, name)
+        made.notes.append(f"no gripper: {error}")
+    return made
+
+
+def _draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     model = source.compiled()
     arm = find_arm(model, wanted.tip, wanted.joints)
     addresses = [model.joint(joint).qposadr[0] for joint in arm.joints]

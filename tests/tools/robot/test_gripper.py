@@ -8,8 +8,7 @@ import pytest
 
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import FollowConfig, GripperConfig
-from rack.tools.robot import assignment
-from rack.tools.robot.draft import CLOCK_NS, Draft, Wishes, draft
+from rack.tools.robot.draft import CLOCK_NS, NOTHING, Draft, Wishes, draft
 from rack.tools.robot.source import read_source
 from tests.levels.robot import grippers
 from tests.tools.robot.models import urdf, written
@@ -96,11 +95,7 @@ def test_a_gripper_that_its_own_arm_keeps_from_closing_is_held(tmp_path: Path) -
     # Of the link before the last: MuJoCo lets fingers and the hand that carries them overlap.
     stop = '<geom class="link" type="cylinder" size=".06 .01" pos="0 .171 0" zaxis="0 1 0"/>'
     model.write_text(model.read_text().replace('<body name="link6"', f'{stop}<body name="link6"'))
-    source = read_source(robot.model)
-    # Alone its fingers close: only the arm as a whole shows it.
-    assert gripper_of(draft(source, Wishes(), tmp_path, "alone"))
-    made, layout = assignment.drafted(source, Wishes(), tmp_path, "whole")
+    made = drafted(tmp_path, robot.model)
     assert made.robot.gripper is None
     assert made.notes[-1].startswith("no gripper: robot.gripper.force: 2.918 does not bring")
-    assert layout.kind == "a tour of poses"
-    build_cell(made.robot, layout.scene, CLOCK_NS)
+    build_cell(made.robot, NOTHING, CLOCK_NS)
