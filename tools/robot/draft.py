@@ -21,6 +21,7 @@ from rack.levels.robot.abilities import Statics
 from rack.levels.robot.cell import Cell, build_cell, check_fingers, unchecked_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
+from rack.levels.servo.control import LoopGains
 from rack.levels.tables import RobotConfig, SceneConfig
 from rack.tools.robot.arm import ArmParts, find_arm, hold
 from rack.tools.robot.fingertips import Fingertips, find_fingertips, tool_outward
@@ -41,6 +42,10 @@ ROOM = 2.0
 """A guessed torque in the weights and inertia that it moves."""
 DRAG_PART = 0.4
 """Of the torque that gravity leaves, for friction at a guessed velocity."""
+REST_RAD = 0.002
+"""Where dry friction may hold a joint at rest, from where it should be; tasks permit 0.003."""
+MOST_BANDWIDTH = 100.0
+"""Of the joint loop, rad/s."""
 POSES = 400
 SKIN_M = 1e-4
 """What is closer counts as in contact: planning would find no way there."""
@@ -78,6 +83,7 @@ class Draft:
     notes: list[str] = field(default_factory=list)
     table: dict[str, Any] = field(default_factory=dict)
     jaws: Fingertips | None = None  # None: nothing can be taken
+    bandwidth: float | None = None  # of the joint loop, rad/s; None: that of `nasrem`
 
     @property
     def robot(self) -> RobotConfig:
@@ -280,18 +286,21 @@ def touching(
 
 
 def _dimension(made: Draft, unknown: list[bool], guessed: list[bool]) -> None:
-    """Set the torques that are unknown, the velocities that are guessed, and accelerations that the
-    motors can give."""
+    """Set the torques that are unknown, the velocities that are guessed, accelerations that the
+    motors can give, and a loop that is stiff against dry friction."""
     cell = made.cell()
     dynamics = Dynamics(cell)
     velocity = np.array(made.table["velocity"])
     weight, drag, inertia = np.zeros((3, len(velocity)))
+    least = np.full(len(velocity), np.inf)
     for q in poses(cell):
         # The terms are views of one array.
         bias, still = (dynamics.terms(q, v).bias.copy() for v in (velocity, 0.0 * velocity))
         weight = np.maximum(weight, np.abs(still))
         drag = np.maximum(drag, np.abs(bias - still))
-        inertia = np.maximum(inertia, np.diag(dynamics.terms(q, velocity).inertia))
+        own = np.diag(dynamics.terms(q, velocity).inertia)
+        inertia = np.maximum(inertia, own)
+        least = np.minimum(least, own)
     weight = weight + np.abs(dynamics.friction(velocity))
     wanted = velocity / SPEED_UP_S
     torque = np.array(made.table["torque"])
@@ -308,6 +317,15 @@ def _dimension(made: Draft, unknown: list[bool], guessed: list[bool]) -> None:
     made.table["torque"] = _rounded(torque)
     made.table["acceleration"] = _rounded(acceleration)
     made.table["jerk"] = _rounded(10.0 * acceleration)
+    held = float(np.max(dynamics.dry / least))  # rad/s2
+    needed = min(np.sqrt(held / REST_RAD), MOST_BANDWIDTH)
+    if needed > (usual := LoopGains().bandwidth):
+        made.bandwidth = round(float(needed), 1)
+        away = f"{1e3 * held / usual**2:.1f} mrad"
+        made.notes.append(
+            f"a joint loop of {made.bandwidth:g} rad/s: at {usual:g} dry friction may hold a joint"
+            f" {away} from its goal"
+        )
 
 
 def _rounded(values: Array) -> list[float]:

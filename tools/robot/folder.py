@@ -20,6 +20,7 @@ extends = ["nasrem"]
 # What follows is a guess, as the comments say. A simulated arm runs on it; any other is not enabled
 # until you have confirmed each key, and taken it from this list.
 """
+STIFF = "stiff enough against dry friction"
 
 
 def config_text(made: Draft, layout: Assignment, name: str, model: Path) -> str:
@@ -41,6 +42,8 @@ def _lines(made: Draft, layout: Assignment, name: str) -> Iterator[str]:
         for one in follow:
             yield f"[[robot.{key}.follow]]"
             yield from _keys(one, {})
+    if made.bandwidth is not None:
+        yield f"\n[board.servo.params]\nbandwidth = {made.bandwidth:g}" + _comment(STIFF)
     yield "\n[scene]"
     yield from _keys({"objects": layout.scene.objects, "supports": layout.scene.supports}, {})
     yield f"\n[task]  # {layout.kind}"

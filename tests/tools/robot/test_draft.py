@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import mujoco
@@ -9,12 +10,16 @@ import numpy as np
 import pytest
 
 from rack.levels.robot.dynamics import Dynamics
-from rack.tools.robot.draft import Wishes, draft
+from rack.tools.robot.assignment import Assignment
+from rack.tools.robot.draft import NOTHING, Wishes, draft
+from rack.tools.robot.folder import config_text
 from rack.tools.robot.source import read_source
 from tests.tools.robot.models import urdf, written
 
 DRY_N_M = 30.0
 SPEED = 0.3  # rad/s
+STIFF = round((1.0 / (0.002 * (0.05 + 0.01))) ** 0.5, 1)
+"""rad/s: 1 N m holds the last link, of 0.01 kg m2 and the least armature, 2 mrad from its goal."""
 
 
 def with_friction(text: str) -> str:
@@ -47,4 +52,18 @@ def test_what_a_model_says_of_its_friction_stays(tmp_path: Path) -> None:
     said = written(tmp_path, source.spec.to_xml(), "said.xml")
     made = draft(read_source(said), Wishes(), tmp_path, "drafted")
     assert made.cell().model.dof_solref[:, 0].tolist() == [0.005] * 6
-    assert not made.notes
+    assert "dry friction acts within 1 ms" not in made.notes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "bandwidth"), [(0.2, None), (1.0, STIFF), (30.0, 100.0)])
+def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
+    friction: float, bandwidth: float | None, tmp_path: Path
+) -> None:
+    model = with_friction(urdf(gripper=False)).replace(str(DRY_N_M), str(friction))
+    made = draft(read_source(written(tmp_path, model)), Wishes(), tmp_path, "drafted")
+    assert made.bandwidth == bandwidth
+    text = config_text(made, Assignment(NOTHING, [], "nothing"), "drafted", made.model)
+    assert tomllib.loads(text).get("board", {}) == (
+        {"servo": {"params": {"bandwidth": bandwidth}}} if bandwidth else {}
+    )
