@@ -17,8 +17,11 @@ Source = str | Mapping[str, str]
 """What a port reads: a mailbox, or mailboxes by board."""
 
 
-Entries = Mapping[str, Sequence[tuple[int, bytes]]]
-"""What a bus adapter wrote in a recorded run, by port: ticks and messages, oldest first."""
+Rows = Sequence[tuple[int, int, bytes]]
+"""Messages of a recorded run, oldest first: the tick at which each was written, that of the
+information on which it rests, and its bytes. Of a mailbox that repeats itself only the changes."""
+Entries = Mapping[str, Rows]
+"""What an adapter wrote in a recorded run, by port."""
 
 
 def mailboxes_of(source: Source) -> tuple[str, ...]:
@@ -65,7 +68,7 @@ class TaskWiring:
 
     `critical_priority`: SCHED_FIFO priority of a tightly coupled planner during its plan update.
     `guards_clock`: the task is one of the fastest and watches the clock. `sent`: the ports whose
-    messages the level sends itself. `fails_self_test`: a fault in the config. `entries`: for a bus
+    messages the level sends itself. `fails_self_test`: a fault in the config. `entries`: for an
     adapter in a replay. `exchange`: the ports that are not simply read in every cycle; it makes the
     task write its mailbox `<board>.exchange`. `reservation`: asked for in place of a priority.
     """

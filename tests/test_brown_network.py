@@ -40,6 +40,9 @@ at = 1.5
 for = 0.5
 """
 """Twenty-five references of the general machine do not come."""
+LOSS = ("peer_lost", "demand")
+"""Codes of the events of a loss, and of the stop that it demands."""
+REFUSED = "in real time, on a network: only a run in lockstep is repeated"
 HELD = "no reference from 'lan': held after 5 extrapolated"
 MOVING_RAD_S = 0.05
 MOST_S = 120.0
@@ -239,6 +242,79 @@ def test_a_rack_that_cannot_be_launched_ends_the_other_with_status_1(
     assert status == 1
     assert 'config = "none/none.toml": no such file' in said
     assert said.splitlines()[-1].endswith("stopped; none/none.toml: exit status 2")
+
+
+def repeated(run: Path, out: Path) -> tuple[str, str]:
+    """Continue a run from 1.3 s, in the middle of a modification, to 3 s; return digest and
+    stderr."""
+    command = [*RACK, "run", "--from", f"{run}@1.3", "--seconds", "3", "--json", "--out", out]
+    done = subprocess.run(command, timeout=MOST_S, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)["digest"], done.stderr
+
+
+def found_lost(run: Path) -> list[tuple[int, str]]:
+    """Return when a run found another rack lost, and when the arm was to stop, with the texts;
+    they come from two processes."""
+    events = map(json.loads, (run / "events.jsonl").read_text().splitlines())
+    return sorted((event["tick"], event["text"]) for event in events if event.get("code") in LOSS)
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+def test_a_run_of_either_rack_is_continued_without_the_other(
+    rack_name: str, tmp_path: Path
+) -> None:
+    general = configs(rack_name, tmp_path, LINK_OUT)[1]
+    command = [*RACK, "run", general, "--lockstep", "--seconds", "3", "--json"]
+    done = subprocess.run(
+        command, cwd=tmp_path, timeout=MOST_S, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    for own, other in ((report, f"{rack_name}-servo"), (report["others"][0], rack_name)):
+        digest, said = repeated(tmp_path / own["folder"], tmp_path / f"without {other}")
+        assert f"not started: '{other}'; what they sent enters again" in said
+        assert digest == own["digest"]
+        assert "are not as recorded" not in said
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+def test_a_run_in_real_time_is_not_continued(rack_name: str, tmp_path: Path) -> None:
+    general = configs(rack_name, tmp_path)[1]
+    run = tmp_path / "run"
+    for command, status in (
+        (["run", general, "--seconds", "0.2", "--out", run], None),
+        (["run", "--from", f"{run}@0.1"], 2),
+    ):
+        done = subprocess.run(
+            [*RACK, *command], timeout=MOST_S, capture_output=True, text=True, check=False
+        )
+        assert status in (None, done.returncode)
+    assert done.stderr == f"--from {run}@0.1: {REFUSED}\n"
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+def test_a_rack_that_was_lost_is_lost_again(rack_name: str, tmp_path: Path) -> None:
+    servo, general = configs(rack_name, tmp_path)
+    alone = [*RACK, "run", general, "--lockstep", "--share", "--no-record", "--seconds", "1.6"]
+    other = subprocess.Popen([*alone, "--set", "adapter.lan.launch=[]"], stdout=subprocess.DEVNULL)
+    try:
+        run = tmp_path / "run"
+        words = ["--lockstep", "--share", "--seconds", "3", "--json", "--out", run]
+        command = [*RACK, "run", servo, *words, "--set", 'adapter.lan.on_peer_loss="stop"']
+        done = subprocess.run(command, timeout=MOST_S, capture_output=True, text=True, check=False)
+    finally:
+        other.kill()
+        other.wait()
+    found = json.loads(done.stdout)
+    assert found["outcome"]["ticks"] == 3000, done.stderr
+    assert repeated(run, tmp_path / "again")[0] == found["digest"]
+    lost = [found_lost(folder) for folder in (run, tmp_path / "again")]
+    assert len(lost[0]) == len(LOSS)
+    assert lost[1] == lost[0]
 
 
 class OnMachine:

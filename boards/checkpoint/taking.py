@@ -15,10 +15,9 @@ def are_wanted(config: RackConfig) -> bool:
     return config.record.checkpoint_s > 0 and config.clock.mode == "lockstep"
 
 
-def outside(config: RackConfig, runs_hosts: bool = True) -> str:
-    """Return whose state is not the rack's, so that it has no checkpoints; empty: nobody's. Without
-    host boards what they sent in a recorded run enters."""
-    hosts = ", ".join(map(repr, config.host)) if runs_hosts else ""
+def outside(config: RackConfig) -> str:
+    """Return whose state is not the rack's, so that it has no checkpoints; empty: nobody's."""
+    hosts = ", ".join(map(repr, config.host))
     found = [f"{hosts}: a host program's state"] if hosts else []
     found += [f"'{LAN}': what comes from the network"] if config.adapter.lan is not None else []
     return "; ".join(found)

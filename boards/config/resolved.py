@@ -125,11 +125,21 @@ class Resolved:
     commands: tuple[Request, ...]
     goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
+    def with_name(self, rack: str) -> Resolved:
+        """Return the rack whose levels see another name, which may stand in their messages."""
+        tasks = (replace(task, context=replace(task.context, rack=rack)) for task in self.tasks)
+        return replace(self, tasks=tuple(tasks))
+
     def with_entries(self, entries: Mapping[str, Entries]) -> Resolved:
-        """Return the rack for a replay: no host boards, but what each bus adapter wrote in the
-        recorded run."""
+        """Return the rack for a replay: no host boards and other racks, but what each adapter wrote
+        in the recorded run."""
         tasks = tuple(replace(task, entries=entries.get(task.task)) for task in self.tasks)
         return replace(self, tasks=tasks, hosts=())
+
+    @property
+    def is_replay(self) -> bool:
+        """Whether what came from outside in a recorded run comes again."""
+        return any(task.entries is not None for task in self.tasks)
 
     def with_keeping(self, keeping: Keeping) -> Resolved:
         """Return the rack with checkpoints, or continuing from one."""

@@ -80,12 +80,13 @@ class Rack:
     rack.run(seconds=10)`.
 
     `on_event` is called with every `Event`, in the caller's process; of a run in the background, in
-    its thread. Without `share`, a launch is
-    refused if another rack's real-time boards occupy a core that this one requests. A `crate` that
-    was started earlier saves time. With `entries`, by bus adapter and port, host boards are not
-    started: what a recorded run wrote there enters instead. `keeping`: the checkpoints that it
-    takes in lockstep, and the one that it continues from. `requests`: an operator's commands
-    besides the config's, and those that wait in the checkpoint, by their ticks.
+    its thread. Without `share`, a launch is refused if another rack's real-time boards occupy a
+    core that this one requests. A `crate` that was started earlier saves time. With `entries`, by
+    adapter and port, host boards are not started, and other racks not met: what a recorded run
+    wrote there enters instead. `keeping`: the checkpoints that it takes in lockstep, and the one
+    that it continues from. `requests`: an operator's commands besides the config's, and those that
+    wait in the checkpoint, by their ticks. `repeats`: the rack whose run this repeats under a name
+    of its own; levels see the name of that.
     """
 
     def __init__(
@@ -97,8 +98,10 @@ class Rack:
         entries: Mapping[str, Entries] | None = None,
         keeping: Keeping | None = None,
         requests: Sequence[Request] = (),
+        repeats: str = "",
     ) -> None:
         self.config = config
+        self._repeats = repeats
         self._requests = requests
         self._entries = entries
         self._keeping = keeping
@@ -160,6 +163,7 @@ class Rack:
         # A level's module may have ended it: then resolving says which.
         crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
         plan = resolve(self.config)
+        plan = plan.with_name(self._repeats) if self._repeats else plan
         self._plan = plan = plan if self._entries is None else plan.with_entries(self._entries)
         if self._keeping is not None:
             self._plan = plan = plan.with_keeping(self._keeping)

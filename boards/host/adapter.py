@@ -3,8 +3,10 @@ rack."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
+from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.boards.wiring import Entries
 from rack.levels.level import Executor
@@ -19,6 +21,12 @@ class Adapter(Executor):
     """Key of its board under which its ports are listed."""
     joins_sides: ClassVar[bool] = False
     """Whether what is not on the backplane are host boards: it reads on both sides."""
+
+    @classmethod
+    def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
+        """Return the ports that a replay gives out as they were recorded, and whether it sends
+        their messages one by one."""
+        raise NotImplementedError
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
         """Take the segment, before the self-test; in a replay with what was recorded in place of

@@ -34,7 +34,7 @@ from typing import Any
 
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.wake import CHECK_S
-from rack.backplane.layout import TaskSpec
+from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Field, Message, MessageType, State, status
@@ -51,8 +51,8 @@ from rack.boards.host.entries import (
     Inward,
     Outward,
     Replayed,
-    Rows,
 )
+from rack.boards.wiring import Entries
 from rack.levels.errors import CannotGoOn
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.tables import read_params
@@ -98,7 +98,18 @@ class BusAdapter(Adapter):
         is_whole = bool(entries) and known == entries
         return MadePorts(inputs, {**outputs, STATUS: Output(status_of(entries))}, is_whole)
 
-    def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
+    @classmethod
+    def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
+        """Return the ports of what host boards send, and the status."""
+        hosts = {host.name for host in layout.hosts}
+        sent = {
+            port: entry.asynchronous
+            for port, entry in AdapterParams.entries_of(params).items()
+            if layout.mailbox(entry.source).writer in hosts
+        }
+        return {**sent, STATUS: False}
+
+    def attach(self, segment: Segment, entries: Entries | None) -> None:
         """Open the host side; in a replay, take over what the recorded run wrote, by port,
         instead."""
         layout = segment.layout
@@ -128,7 +139,7 @@ class BusAdapter(Adapter):
                 HostTurn(segment, host) for host in layout.hosts if board in layout.pacers(host)
             ]
         if entries is not None:
-            self._statuses = Replayed(entries[STATUS], STATUS, is_queued=False)
+            self._statuses = Replayed(entries[STATUS], STATUS, is_sent=False)
 
     def _resume_counts(self, status: Reader) -> None:
         before = status.peek()

@@ -4,7 +4,7 @@ it."""
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
@@ -18,6 +18,7 @@ from rack.backplane.message import Field, MessageType, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block
+from rack.boards.wiring import Rows
 from rack.levels.level import Ports
 from rack.levels.tables import LAST_TICK, Table
 
@@ -156,7 +157,7 @@ class EntryCount:
 class Crossing(Protocol):
     """One entry, at work."""
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+    def exchange(self, read: Ports, write: Ports, tick: int) -> object:
         """Exchange, in a cycle in which that is due."""
 
 
@@ -231,30 +232,28 @@ class Outward:
                 semaphore.release()
 
 
-Rows = Sequence[tuple[int, bytes]]
-"""Messages of a recorded run with their ticks, oldest first; of a mailbox that repeats itself only
-the changes."""
-
-
 class Replayed:
-    """A mailbox of the bridge in a replay: what the recorded run wrote to it, at the same ticks.
+    """A mailbox of an adapter in a replay: what the recorded run wrote to it, at the same ticks.
 
-    Of messages that are each read once, a bridge that was restarted gives out those after tick
-    `since`.
+    Of messages that are sent one by one (`is_sent`), an adapter that was restarted gives out those
+    after tick `since`.
     """
 
-    def __init__(self, rows: Rows, port: str, is_queued: bool, since: int = NEVER) -> None:
+    def __init__(self, rows: Rows, port: str, is_sent: bool, since: int = NEVER) -> None:
         self._rows = rows
         self._port = port
-        self._is_queued = is_queued
-        self._at = sum(tick <= since for tick, _ in rows) if is_queued else 0
+        self._is_sent = is_sent
+        self._at = sum(tick <= since for tick, _, _ in rows) if is_sent else 0
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
-        """Give out what the recorded run wrote up to this cycle."""
+    def exchange(self, read: Ports, write: Ports, tick: int) -> bool:
+        """Give out what the recorded run wrote up to this cycle; return whether there was some."""
         out = getattr(write, self._port)
         rows = self._rows
+        before = self._at
         while self._at < len(rows) and rows[self._at][0] <= tick:
-            out.raw[:] = rows[self._at][1]
+            _, basis, content = rows[self._at]
+            out.raw[:] = content
             self._at += 1
-            if self._is_queued:
-                out.send()
+            if self._is_sent:
+                out.send(basis)
+        return self._at > before

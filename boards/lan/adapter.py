@@ -16,12 +16,12 @@ from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
 
+from rack.backplane.layout import Layout
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
-from rack.boards.host.entries import Rows
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
 from rack.boards.lan.desk import Desk, Permit
@@ -32,6 +32,8 @@ from rack.boards.lan.link import RETRY_MS, Carrier, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
+from rack.boards.lan.replayed import ReplayedNetwork
+from rack.boards.wiring import Entries
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.peer import PEER, peer_port
 from rack.levels.tables import read_params
@@ -57,6 +59,7 @@ class LanAdapter(Adapter):
         self._link: LanLink | None = None
         self._flaws: Sequence[int] = ()
         self._barrier: Barrier | None = None
+        self._replayed: ReplayedNetwork | None = None
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
@@ -83,8 +86,15 @@ class LanAdapter(Adapter):
         outputs |= {peer_port(rack): Output(PEER) for rack in table.racks}
         return MadePorts(inputs, outputs, is_whole)
 
-    def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
-        """Take the segment: its grid, and the mailboxes to exchange, continued where they stand."""
+    @classmethod
+    def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
+        """Return all that it writes: imports, racks, status."""
+        imports = read_params(LanParams, params).imports
+        return {port: port in imports for port in cls.made_ports(params, {}).outputs}
+
+    def attach(self, segment: Segment, entries: Entries | None) -> None:
+        """Take the segment: its grid, and the mailboxes to exchange, continued where they stand; in
+        a replay, take over what the recorded run wrote."""
         words = segment.words
         board = self.context.board
         table = self._table
@@ -93,7 +103,6 @@ class LanAdapter(Adapter):
         self._rack = segment.rack
         self._launch = launch
         self._grid = OwnGrid(segment, self.context.every)
-        self._clocks = Clocks(segment, self._peers, launch, self._grid)
         # In the time of a lease and a connection the token of every rack that is still there has
         # come.
         seen_by = words[System.TICK] + self._grid.ticks_in((table.lease_ms + RETRY_MS[1]) * 1e6)
@@ -102,12 +111,18 @@ class LanAdapter(Adapter):
                 before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()
             ).is_there:
                 peer.resume(before.value, seen_by)
-        self._exports = {
-            port: Export(segment, entry, launch) for port, entry in table.exports.items()
-        }
         self._imports = {
-            port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack])
+            port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack], self._grid)
             for port, entry in table.imports.items()
+        }
+        if entries is not None:
+            self._replayed = ReplayedNetwork(segment, board, entries, self._peers, self._imports)
+            self._peers.watch(self._replayed.changes, is_lockstep=True)
+            return
+        self._clocks = Clocks(segment, self._peers, launch, self._grid)
+        self._exports = {
+            port: Export(segment, entry, launch, self._grid)
+            for port, entry in table.exports.items()
         }
         permit = Permit(table.permit, self.names(self.context.params))
         self._desk = Desk(segment, self._grid, permit, self.findings)
@@ -123,8 +138,10 @@ class LanAdapter(Adapter):
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
     def open(self) -> None:
-        """Open the session: its threads inherit core and priority of the board. Raises
-        `LevelError`."""
+        """Open the session, but for a replay: its threads inherit core and priority of the board.
+        Raises `LevelError`."""
+        if self._replayed is not None:
+            return
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
         barrier = self._barrier
@@ -132,9 +149,9 @@ class LanAdapter(Adapter):
         # A step has one seal for all that is in it.
         sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
         for entry in self._imports.values():
-            entry.open(carrier, sealer, self._grid)
+            entry.open(carrier, sealer)
         for export in self._exports.values():
-            export.open(carrier, sealer, self._grid)
+            export.open(carrier, sealer)
         self._clocks.open(link, link.sealer)
         self._desk.open(link, self._launch)
         if barrier is not None:
@@ -156,6 +173,11 @@ class LanAdapter(Adapter):
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Exchange what is due."""
+        if self._replayed is not None:
+            self._replayed.begin(tick)
+            self._look(tick)
+            self._replayed.give(read, write, tick)
+            return
         cycle = tick // self.context.every
         if self._barrier is None:
             self._look(tick)

@@ -31,14 +31,14 @@ class Export:
     `is_asked`: somebody has come who needs the newest message even if it is not new.
     """
 
-    def __init__(self, segment: Segment, table: ExportConfig, launch: int) -> None:
+    def __init__(self, segment: Segment, table: ExportConfig, launch: int, grid: OwnGrid) -> None:
         self._source = open_observer(segment, table.source)
         spec = self._source.spec
         self._kind = kind_of(spec.message, spec.version, message_dtype(spec.fields, spec.size))
         self._launch = launch
         self._key = out_key(segment.rack, table.source)
-        self._rate_hz = table.rate_hz
-        self.every = 1
+        self._grid = grid
+        self.every = grid.cycles(table.rate_hz)
         self.is_asked = False
         self.sent = self.serial = 0
         self._put: Callable[[bytes, bytes], None]
@@ -48,12 +48,10 @@ class Export:
         self.sent = int(record["sent"])
         self.serial = int(record["serial"])
 
-    def open(self, carrier: Carrier, sealer: Sealer, grid: OwnGrid) -> None:
+    def open(self, carrier: Carrier, sealer: Sealer) -> None:
         """Publish it."""
         self._put = carrier.publish(self._key)
         self._sealer = sealer
-        self._grid = grid
-        self.every = grid.cycles(self._rate_hz)
 
     def recall(self, tick: int, ticks: int) -> None:
         """Send what an adapter before this one sent at `tick`, if it did; `ticks` are those of its
@@ -102,7 +100,9 @@ class Import:
     go on, the last message not too old.
     """
 
-    def __init__(self, segment: Segment, own: str, table: ImportConfig, peer: PeerRack) -> None:
+    def __init__(
+        self, segment: Segment, own: str, table: ImportConfig, peer: PeerRack, grid: OwnGrid
+    ) -> None:
         spec = segment.layout.mailbox(own)
         dtype = message_dtype(spec.fields, spec.size)
         self._kind = kind_of(spec.message, spec.version, dtype)
@@ -116,8 +116,8 @@ class Import:
         self._word = int(Box.KEPT if peer.goes_on else Box.VOID)
         self._is_away = bool(self._box[self._word] & 1)
         self._losses = peer.losses
-        self._rate_hz = table.rate_hz
-        self.every: int
+        self._grid = grid
+        self.every = grid.cycles(table.rate_hz)
         self._basis: int | None = None
         # What came before its time, with the tick at which it came.
         self._early: list[tuple[int, Arrived]] = []
@@ -131,12 +131,10 @@ class Import:
         self._order.resume(*(int(record[name]) for name in ("launch", "number", "serial")))
         self._basis = None if record["age"] == NEVER else tick - int(record["age"])
 
-    def open(self, carrier: Carrier, sealer: Sealer, grid: OwnGrid) -> None:
+    def open(self, carrier: Carrier, sealer: Sealer) -> None:
         """Subscribe to it."""
         self._arrived = carrier.subscribe(self._key)
         self._sealer = sealer
-        self._grid = grid
-        self.every = grid.cycles(self._rate_hz)
 
     def is_old(self, tick: int) -> bool:
         """Say whether its information is older than permitted."""
@@ -148,6 +146,11 @@ class Import:
             self._losses = self._peer.losses
             if not self._is_away:
                 self._switch(True, tick + self._delay if self._grid.is_lockstep else tick)
+
+    def comes(self, tick: int) -> None:
+        """Let readers find it again, if it was away, with the message of this cycle."""
+        if self._is_away:
+            self._switch(False, tick + self._delay)
 
     def _switch(self, is_away: bool, tick: int) -> None:
         self._is_away = is_away
@@ -178,8 +181,7 @@ class Import:
         out.raw[:] = self._buffer.raw
         # Ticks of mailboxes are not negative; what was written before this rack's first one is.
         out.send(max(0, basis))
-        if self._is_away:
-            self._switch(False, tick + self._delay)
+        self.comes(tick)
 
     def _opened(self, arrived: Arrived) -> Envelope | None:
         """Return the head of what came, if it may be a message of this mailbox; else count that it

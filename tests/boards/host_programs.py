@@ -6,14 +6,13 @@ import os
 import random
 import signal
 import time
-from collections.abc import Mapping
 from enum import IntEnum
 
 from rack.backplane.message import Field, State, command, status
 from rack.backplane.segment import Segment
 from rack.boards.host import bus_adapter
 from rack.boards.host.bus_adapter import BusAdapter
-from rack.boards.host.entries import Rows
+from rack.boards.wiring import Entries
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Executor, Input, Ports
 
@@ -191,7 +190,7 @@ class Lingering(Host):
 class HastyAdapter(BusAdapter):
     """A bus adapter that waits for a program for a second at most."""
 
-    def attach(self, segment: Segment, entries: Mapping[str, Rows] | None) -> None:
+    def attach(self, segment: Segment, entries: Entries | None) -> None:
         """Shorten the bound."""
         bus_adapter.LONGEST_S = 1.0
         super().attach(segment, entries)

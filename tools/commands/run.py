@@ -68,9 +68,9 @@ FromRun = Annotated[
         "--entries",
         metavar="RUN",
         help=(
-            "start no host boards: what they sent in this recorded run enters again, at the same"
-            " ticks; for runs in real time, or with a prompt: other runs repeat in lockstep by"
-            " themselves"
+            "start no host boards and no other racks: what they sent in this recorded run enters"
+            " again, at the same ticks; for host boards in real time, or with a prompt: other runs"
+            " repeat in lockstep by themselves"
         ),
     ),
 ]
@@ -118,7 +118,7 @@ def run(
     In lockstep the folder of a run holds checkpoints, each record.checkpoint_s of simulated time.
     With --from, the rack first goes on unchanged from the one before to TIME. What operators
     commanded in that run, before TIME and after it, is repeated; stops and faults by hand are not.
-    Host boards are not started then: what they sent enters again at the same ticks.
+    Host boards and other racks are not started then: what they sent enters again at the same ticks.
     --seconds counts from the beginning of the run that is continued, as there.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no

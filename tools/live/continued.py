@@ -24,6 +24,7 @@ from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.checkpoint.format import ATTRIBUTES, NAME, checkpoints
+from rack.boards.checkpoint.taking import outside
 from rack.boards.config.files import assembled
 from rack.boards.config.resolved import validated
 from rack.boards.config.schema import RackConfig
@@ -73,11 +74,10 @@ def beginning(config: RackConfig, origin: str) -> Iterator[Beginning]:
     tick = tick_in(recording, origin.rpartition("@")[2], f"{asked}: ")
     with state_at(recording, tick, asked=asked) as state:
         if state.begins.entries is not None:
-            hosts = ", ".join(map(repr, config.host))
-            print(
-                f"{asked}: host boards are not started: what {hosts} sent enters again",
-                file=sys.stderr,
-            )
+            lan = config.adapter.lan
+            senders = ", ".join(map(repr, (*config.host, *(() if lan is None else lan.racks))))
+            why = f"not started: {senders}; what they sent enters again"
+            print(f"{asked}: {why}", file=sys.stderr)
         checkpoint = state.begins.checkpoint
         if checkpoint is not None:
             checkpoint = replace(checkpoint, packages=config.python_path)
@@ -163,6 +163,7 @@ def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Begi
         first = min(kept) * recording.layout.clock_ns * 1e-9
         raise Failure(f"{asked}: permitted: from its first checkpoint, {first:g} s, on", 2)
     commands = recorded_commands(recording)
+    entries = _entered(recording, asked)
     if not kept:
         injected = len(recording.ended.get("faults", ())) - len(recording.rack_config.fault)
         without = f", without {injected} faults injected meanwhile" if injected > 0 else ""
@@ -171,13 +172,18 @@ def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Begi
             f" beginning, with {len(commands)} commands of its operators{without}",
             file=sys.stderr,
         )
-    return 0, Beginning(requests=commands, entries=_entered(recording, asked))
+    return 0, Beginning(requests=commands, entries=entries)
 
 
 def _entered(recording: Recording, asked: str) -> Mapping[str, Entries] | None:
-    """Return what host boards sent in a run; None: its rack has none."""
+    """Return what host boards and other racks sent in a run; None: its rack has none. Raises
+    `Failure`."""
     config = recording.rack_config
-    return recorded_entries(config, recording.folder, asked) if config.host else None
+    if not outside(config):
+        return None
+    if config.adapter.lan is not None and config.clock.mode != "lockstep":
+        raise Failure(f"{asked}: in real time, on a network: only a run in lockstep is repeated", 2)
+    return recorded_entries(config, recording.folder, asked)
 
 
 def _commanded(recording: Recording, begins: int, asked: str) -> tuple[Request, ...]:
@@ -224,10 +230,15 @@ def gone_on(
     `Failure` if its state was to be kept on the way, and is not."""
     keeping = begins.checkpoint
     ran = branched(recording, (), None)
-    # The run's own name may be in use, by a branch.
+    # The run's own name may be in use.
     config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{until}-{os.getpid()}"})
     with Rack(
-        config, crate=crate, entries=begins.entries, keeping=keeping, requests=begins.requests
+        config,
+        crate=crate,
+        entries=begins.entries,
+        keeping=keeping,
+        requests=begins.requests,
+        repeats=ran.name,
     ) as rack:
         rack.run(until * config.clock_ns * 1e-9)
         if keeping is not None and not _is_kept(keeping):

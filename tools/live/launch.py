@@ -149,7 +149,10 @@ def run_rack(
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to keep.
         with INTERRUPT.at_once():
-            others = stack.enter_context(OtherRacks(config, seconds, folder is not None))
+            lan = config.adapter.lan
+            # In a replay what they sent enters again.
+            launches = lan.launch if lan is not None and begins.entries is None else ()
+            others = stack.enter_context(OtherRacks(launches, config, seconds, folder is not None))
             recorder = None if folder is None else RecorderProcess()
             if recorder is not None:
                 stack.callback(recorder.finish)

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Self
@@ -43,9 +44,10 @@ class Launched(NamedTuple):
 class OtherRacks:
     """Other racks while this one runs. Whoever leaves the context leaves none of them."""
 
-    def __init__(self, config: RackConfig, seconds: float | None, is_recorded: bool) -> None:
-        """Launch those that a config names, with its clock, and for as long."""
-        lan = config.adapter.lan
+    def __init__(
+        self, configs: Sequence[str], config: RackConfig, seconds: float | None, is_recorded: bool
+    ) -> None:
+        """Launch racks by their `configs`, with the clock of `config`, and for as long."""
         options = ["--json", "--share", f"--speed={config.clock.speed}"]
         options += ["--lockstep"] if config.clock.mode == "lockstep" else []
         options += [] if seconds is None else [f"--seconds={seconds}"]
@@ -53,7 +55,7 @@ class OtherRacks:
         self._is_stopped = False
         self._failed = ""
         self._racks: list[Launched] = []
-        for other in () if lan is None else lan.launch:
+        for other in configs:
             report = os.memfd_create("report")
             # A group of its own: Ctrl-C would reach it twice, from the terminal and from here.
             process = subprocess.Popen(

@@ -1,5 +1,5 @@
-"""What entered a recorded run from outside, so that it can be repeated: through its bus adapters,
-for a replay without host boards, and from its operators."""
+"""What entered a recorded run from outside, so that it can be repeated: through its adapters, for a
+replay without host boards and other racks, and from its operators."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from rack.backplane.operator_table import Request
 from rack.boards.classes import find_class
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
-from rack.boards.host.adapter import STATUS, Adapter
-from rack.boards.wiring import Entries
+from rack.boards.host.adapter import Adapter
+from rack.boards.wiring import Entries, Rows
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 
 
 def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Entries]:
-    """Return what each bus adapter of a config wrote in the run in folder `run`, by adapter and
-    port.
+    """Return what each adapter of a config wrote in the run in folder `run`, by adapter and port.
 
     Raises `ConfigError` for mistakes in the config, and `Failure`, which begins with what was
     `asked`, if the run has other entries, or lost some.
@@ -31,24 +30,18 @@ def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str
     layout = plan.layout
     recording = Recording(run)
     ran = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
-    hosts = {host.name for host in layout.hosts}
     found: dict[str, Entries] = {}
     for task in plan.tasks:
         kind = find_class(task.target, object)
-        if not (issubclass(kind, Adapter) and kind.joins_sides):
+        if not issubclass(kind, Adapter):
             continue
-        entries = kind.made_ports(task.context.params, {}).inputs
-        inward = [
-            port for port, entry in entries.items() if layout.mailbox(entry.source).writer in hosts
-        ]
-        boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in (*inward, STATUS)}
+        ports = kind.replayed(task.context.params, layout)
+        boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in ports}
         for box in boxes.values():
             _check(box, ran.get(box.name), recording, asked)
-        found[task.task] = {
-            port: _rows(recording, box, is_queued=port in task.sent) for port, box in boxes.items()
-        }
+        found[task.task] = {port: _rows(recording, box, ports[port]) for port, box in boxes.items()}
     if not found:
-        raise Failure(f"{asked}: '{config.name}' has no bus adapter", 2)
+        raise Failure(f"{asked}: '{config.name}' has no adapter", 2)
     return found
 
 
@@ -126,11 +119,12 @@ def _check_whole(box: MailboxSpec, recording: Recording, asked: str) -> None:
         raise Failure(f"{asked}: {box.name}: its recorder lost {lost} messages", 2)
 
 
-def _rows(recording: Recording, box: MailboxSpec, is_queued: bool) -> list[tuple[int, bytes]]:
-    """Return ticks and messages of a mailbox; of one that repeats itself only the changes."""
+def _rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> Rows:
+    """Return the messages of a mailbox as `rack.boards.wiring` has them."""
     if box.name not in recording.mailboxes:
         return []
-    ticks = recording.signal(box.name, "tick")
-    messages = recording.messages(box)
-    rows = [(int(tick), message.tobytes()) for tick, message in zip(ticks, messages, strict=True)]
-    return [row for at, row in enumerate(rows) if is_queued or not at or row[1] != rows[at - 1][1]]
+    ticks = recording.signal(box.name, "tick").tolist()
+    bases = recording.signal(box.name, "basis").tolist()
+    contents = [message.tobytes() for message in recording.messages(box)]
+    rows = list(zip(ticks, bases, contents, strict=True))
+    return [row for at, row in enumerate(rows) if is_sent or not at or row[2] != rows[at - 1][2]]

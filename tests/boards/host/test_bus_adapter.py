@@ -282,31 +282,31 @@ class Out:
 
     def __init__(self) -> None:
         self.raw = bytearray(1)
-        self.sent: list[int] = []
+        self.sent: list[tuple[int, int]] = []
 
-    def send(self) -> None:
+    def send(self, basis: int) -> None:
         """Note it."""
-        self.sent.append(self.raw[0])
+        self.sent.append((self.raw[0], basis))
 
 
 @pytest.mark.parametrize(
-    ("is_queued", "since", "expected"),
+    ("is_sent", "since", "expected"),
     [
-        (True, NEVER, [[1], [1, 2, 3], [1, 2, 3]]),
-        (True, 4, [[], [3], [3]]),
+        (True, NEVER, [[(1, 0)], [(1, 0), (2, 3), (3, 7)], [(1, 0), (2, 3), (3, 7)]]),
+        (True, 4, [[], [(3, 7)], [(3, 7)]]),
         (False, 4, [1, 3, 3]),
     ],
 )
 def test_a_replay_gives_out_what_was_written_at_its_ticks(
-    is_queued: bool, since: int, expected: list[object]
+    is_sent: bool, since: int, expected: list[object]
 ) -> None:
-    rows = [(0, b"\1"), (4, b"\2"), (8, b"\3"), (12, b"\4")]
-    replayed = Replayed(rows, "port", is_queued, since)
+    rows = [(0, 0, b"\1"), (4, 3, b"\2"), (8, 7, b"\3"), (12, 11, b"\4")]
+    replayed = Replayed(rows, "port", is_sent, since)
     out = Out()
     seen: list[object] = []
     for tick in (3, 8, 11):
         replayed.exchange(Ports(), Ports(port=out), tick)
-        seen.append(list(out.sent) if is_queued else out.raw[0])
+        seen.append(list(out.sent) if is_sent else out.raw[0])
     assert seen == expected
 
 

@@ -55,8 +55,8 @@ class Importing:
 
     def open(self) -> None:
         """Open the import, as an adapter does when it begins."""
-        self.entry = Import(self.segment, "lan.other", self.table, self.peer)
-        self.entry.open(self.network, self.sealer, self.grid)  # type: ignore[arg-type]
+        self.entry = Import(self.segment, "lan.other", self.table, self.peer, self.grid)
+        self.entry.open(self.network, self.sealer)  # type: ignore[arg-type]
         self.writer = open_writer(self.segment, "lan.other")
         self.port = DemandPort(self.writer)
 

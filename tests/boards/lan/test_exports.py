@@ -32,8 +32,8 @@ class Exporting:
 
     def open(self) -> None:
         """Open the export."""
-        self.entry = Export(self.segment, self.table, LAUNCH)
-        self.entry.open(self.network, Sealer(), OwnGrid(self.segment, EVERY))  # type: ignore[arg-type]
+        self.entry = Export(self.segment, self.table, LAUNCH, OwnGrid(self.segment, EVERY))
+        self.entry.open(self.network, Sealer())  # type: ignore[arg-type]
 
     def heads(self) -> list[Envelope]:
         """Return the heads of what was sent since the last call."""

@@ -69,7 +69,7 @@ def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
     assert done.stderr.splitlines() == [
         f"{asked}: {run} has no checkpoints: it is repeated in lockstep from its beginning, with 0"
         " commands of its operators",
-        f"{asked}: host boards are not started: what 'program' sent enters again",
+        f"{asked}: not started: 'program'; what they sent enters again",
     ]
     two = Recording(tmp_path / "two")
     assert two.signal("bridge.numbers", "tick").min() >= tick
@@ -113,7 +113,7 @@ def test_entries_of_another_rack_are_refused_in_one_line(
     none = rack("run", "k1607", "--set", f"name={rack_name}", "--entries", run, "--no-record")
     assert (none.returncode, none.stderr) == (
         2,
-        f"--entries {run}: '{rack_name}' has no bus adapter\n",
+        f"--entries {run}: '{rack_name}' has no adapter\n",
     )
 
 

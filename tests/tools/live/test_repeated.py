@@ -255,3 +255,17 @@ def test_commands_that_do_not_fit_into_the_table_are_noted(
     options = ("--seconds", SECONDS, "--no-record", "--json")
     done = rack("run", "--from", f"{by_hand.folder}@0.4", *options)
     assert "commands from 0.65 s on are not repeated: the operator table holds 2" in done.stderr
+
+
+@pytest.mark.slow
+def test_levels_that_write_the_name_of_their_rack_write_that_of_the_run(
+    rack_name: str, tmp_path: Path
+) -> None:
+    # A servo level that waits to be enabled says by which command, with the rack's name.
+    settings = ("--set", f"name={rack_name}", "--set", "robot.enable=by-command")
+    run = tmp_path / "run"
+    words = ("--lockstep", "--seconds", "0.5", "--json", "--out", run)
+    done = rack("run", "nasrem", *words, *settings)
+    again = rack("run", "--from", f"{run}@0.3", "--seconds", "0.5", "--no-record", "--json")
+    assert "are not as recorded" not in again.stderr
+    assert json.loads(again.stdout)["digest"] == json.loads(done.stdout)["digest"]
