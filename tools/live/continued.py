@@ -10,11 +10,11 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -39,6 +39,8 @@ from rack.tools.recording.origin import Origin
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
+MOST_STATES = 64
+NO_STATES: Mapping[int, Path] = {}
 WHY_NOT = (
     "the code of a level has changed since, it missed cycles in real time, or somebody injected a"
     " fault or stopped it while it ran"
@@ -63,6 +65,36 @@ class RunState:
 
     begins: Beginning
     attributes: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+
+class KeptStates:
+    """States of a run that were found on the way, to go on from. Their files have no names: however
+    this process ends, nothing is left. Boards open them by this process's descriptors."""
+
+    def __init__(self) -> None:
+        self._files: dict[int, BinaryIO] = {}
+
+    def keep(self, tick: int, path: Path) -> Path:
+        """Take the file of a checkpoint, in a folder that will be removed; return where it is now.
+        The oldest of too many goes."""
+        if (before := self._files.pop(tick, None)) is not None:
+            before.close()
+        if len(self._files) == MOST_STATES:
+            self._files.pop(next(iter(self._files))).close()
+        self._files[tick] = path.open("rb")
+        return self.found[tick]
+
+    @property
+    def found(self) -> dict[int, Path]:
+        """Those that are here, by tick."""
+        pid = os.getpid()
+        return {tick: Path(f"/proc/{pid}/fd/{f.fileno()}") for tick, f in self._files.items()}
+
+    def close(self) -> None:
+        """Let go of all."""
+        for file in self._files.values():
+            file.close()
+        self._files.clear()
 
 
 @contextmanager
@@ -92,20 +124,25 @@ def state_at(
     asked: str = "",
     shows: bool = False,
     crate: CrateLine | None = None,
+    states: KeptStates | None = None,
 ) -> Iterator[RunState]:
     """Yield the state of a run before `tick`, for as long as a rack runs that continues from it;
     with `shows`, with the attributes of its levels.
 
-    A `crate` that was started earlier saves time. A state that is not that of the recording is
-    noted on stderr. Raises `Failure`, which begins with what was `asked`.
+    A `crate` that was started earlier saves time, as do `states` found before; this one joins them.
+    A state that is not that of the recording is noted on stderr. Raises `Failure`, which begins
+    with what was `asked`.
     """
     asked = asked or f"{recording.folder}@{tick * recording.layout.clock_ns * 1e-9:g}"
-    begins, before = begun_before(recording, tick, asked)
+    found = {} if states is None else states.found
+    begins, before = begun_before(recording, tick, asked, found)
     this = Origin.at(recording, tick)
     if begins == tick and not shows:
         yield RunState(replace(before, origin=this))
         return
     with ExitStack() as stack:
+        if states is None:
+            states = stack.enter_context(closing(KeptStates()))
         with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-") as folder:
             path = Path(folder)
             kept = replace(before.checkpoint or Keeping(), folder=path, at=tick, shows=shows)
@@ -113,11 +150,8 @@ def state_at(
                 if differing := unlike_in(recording, rack.segment, tick):
                     names = ", ".join(differing)
                     print(f"{asked}: {names} are not as recorded: {WHY_NOT}", file=sys.stderr)
-            file = stack.enter_context((path / NAME.format(tick)).open("rb"))
+            origin = states.keep(tick, path / NAME.format(tick))
             attributes = attributes_in(path)
-        # The file has no name any more: however this process ends, nothing is left. Boards open it
-        # by this process's descriptor.
-        origin = Path(f"/proc/{os.getpid()}/fd/{file.fileno()}")
         kept_there = _kept_in(recording, origin, tick)
         yield RunState(Beginning(kept_there, entries=before.entries, origin=this), attributes)
 
@@ -149,13 +183,16 @@ def branched(recording: Recording, settings: Sequence[str], faults: str | None) 
     return validated(assembled(str(recording.folder / CONFIG), overrides, faults))
 
 
-def begun_before(recording: Recording, tick: int, asked: str) -> tuple[int, Beginning]:
-    """Return the last checkpoint at `tick` or before, or tick 0 without one, and what goes on from
-    there, with what operators commanded later. Raises `Failure`."""
-    kept = checkpoints(recording.folder)
-    if begins := max((at for at in kept if at <= tick), default=0):
-        keeping = _kept_in(recording, kept[begins].resolve(), begins)
-        return begins, Beginning(keeping, _commanded(recording, begins, asked))
+def begun_before(
+    recording: Recording, tick: int, asked: str, found: Mapping[int, Path] = NO_STATES
+) -> tuple[int, Beginning]:
+    """Return the last checkpoint at `tick` or before, of the run or else `found`, or tick 0 without
+    one, and what goes on from there, with what operators commanded later. Raises `Failure`."""
+    kept = {at: path.resolve() for at, path in checkpoints(recording.folder).items()}
+    if begins := max((at for at in (*kept, *found) if at <= tick), default=0):
+        keeping = _kept_in(recording, kept.get(begins) or found[begins], begins)
+        entries = _entered(recording, asked)
+        return begins, Beginning(keeping, _commanded(recording, begins, asked), entries)
     if ticks_of(recording)[0] > max(task.every for task in recording.layout.tasks):
         # Of a run that goes on from another the beginning is that other's.
         if not kept:

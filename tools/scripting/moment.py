@@ -12,7 +12,7 @@ from rack.boards import Rack
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.rack import LAUNCH_S
 from rack.tools.console.answer import Failure, as_failure
-from rack.tools.live.continued import branched, state_at
+from rack.tools.live.continued import KeptStates, branched, state_at
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, mailbox_of
@@ -63,10 +63,16 @@ class RecordedMoment:
             if self._in_force.row(name, self.tick) is not None
         }
 
-    def levels(self, crate: CrateLine | None = None) -> dict[str, dict[str, Any]]:
+    def levels(
+        self, crate: CrateLine | None = None, states: KeptStates | None = None
+    ) -> dict[str, dict[str, Any]]:
         """Return the attributes of the levels' own objects, by task, in plain data. A `crate` that
-        was started earlier saves time."""
-        with as_failure(), state_at(self._recording, self.tick, shows=True, crate=crate) as state:
+        was started earlier saves time, as do `states` found before."""
+        run = self._recording
+        with (
+            as_failure(),
+            state_at(run, self.tick, shows=True, crate=crate, states=states) as state,
+        ):
             return dict(state.attributes)
 
     def resume(

@@ -21,7 +21,7 @@ from rack.boards.crate.requests import Preload
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import table, terminal_width
-from rack.tools.live.continued import branched, state_at, tick_in
+from rack.tools.live.continued import KeptStates, branched, state_at, tick_in
 from rack.tools.live.display import Display, event_line
 from rack.tools.live.folder import folder_of
 from rack.tools.live.launch import run_rack
@@ -58,12 +58,14 @@ class RewoundRun:
         self._tasks = [task.name for task in self._layout.tasks]
         self._levels: tuple[int, Mapping[str, dict[str, Any]]] = -1, {}
         self._crate: WarmCrate | None = None
+        self._states = KeptStates()
 
     def __enter__(self) -> Self:
         self._ready()
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._states.close()
         if self._crate is not None:
             self._crate.end()
 
@@ -146,7 +148,7 @@ class RewoundRun:
         tick, levels = self._levels
         if tick != self.tick:
             moment = RecordedMoment(self.recording, self._in_force, self.tick)
-            levels = moment.levels(self._ready())
+            levels = moment.levels(self._ready(), self._states)
             self._levels = self.tick, levels
         rows = [[name, cell(value)] for name, value in _flat(levels[task])]
         return self._shown(
@@ -177,7 +179,7 @@ class RewoundRun:
         if seconds is None and ended.get("cause") == "time over":
             seconds = self.time_s(self._end)
         folder = folder_of(out, config.name)
-        with state_at(self.recording, self.tick) as state:
+        with state_at(self.recording, self.tick, states=self._states) as state:
             result = run_rack(config, seconds, folder, display, begins=state.begins)
         write_report(folder)
         differs = first_difference(self.recording, Recording(folder))

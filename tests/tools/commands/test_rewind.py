@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import closing
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rack.boards.checkpoint.format import FOLDER, NAME
 from rack.boards.config import load
+from rack.tools.live import continued
 from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.live.launch import Beginning, run_rack
 from rack.tools.recording.recording import Recording
 from tests.boards.checkpoint.test_keeping import REMEMBERING
+from tests.processes import descriptors
 from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
@@ -100,6 +104,34 @@ def test_a_level_is_shown_as_it_was_at_that_tick(asked: Asked) -> None:
     # At a checkpoint, and before the first.
     assert found[3]["value"]["_recent"] == [tick % 7 for tick in range(395, 400)]
     assert found[5]["value"]["_recent"] == [tick % 7 for tick in range(115, 120)]
+
+
+def test_a_state_that_was_found_is_where_later_ones_go_on_from(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    origins: list[Path | None] = []
+    gone_on = continued.gone_on
+
+    def noted(recording: Recording, begins: Beginning, *others: Any) -> Any:
+        assert begins.checkpoint is not None
+        origins.append(begins.checkpoint.origin)
+        return gone_on(recording, begins, *others)
+
+    monkeypatch.setattr(continued, "gone_on", noted)
+    monkeypatch.setattr(continued, "MOST_STATES", 1)
+    recording = Recording(run)
+    before = descriptors()
+    with closing(continued.KeptStates()) as states:
+        found = []
+        for tick in (450, 470):
+            with continued.state_at(recording, tick, shows=True, states=states) as state:
+                found += states.found.items()
+                attributes = state.attributes
+    assert [tick for tick, _ in found] == [450, 470]
+    assert origins == [(run / FOLDER / NAME.format(400)).resolve(), found[0][1]]
+    assert descriptors() == before
+    with continued.state_at(recording, 470, shows=True) as alone:
+        assert alone.attributes == attributes
 
 
 def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(
