@@ -43,8 +43,9 @@ PAUSE_S = 0.02
 """Time until a question is asked again that was dropped."""
 REFUSAL_S = 0.2
 """Longest wait for the refusal of a certificate."""
-DENIED = 10
-"""Times that a question comes back at once without an answer until it counts as not permitted."""
+DENIED_S = 1.0
+"""Time for which all questions come back at once without an answer until that counts as not
+permitted: the way to a rack that has just shown itself may not be there yet."""
 MOST_BYTES = 1 << 17
 
 
@@ -174,27 +175,27 @@ class Questioner:
         """Return the answer to a question. Raises `Failure` when there is none within the
         patience."""
         asked = question.asked
-        deadline = time.monotonic() + PATIENCE_S
-        returned = 0
-        timed_out = False
+        began = first = time.monotonic()
+        is_taken = False  # by the rack, at least once: it is busy, or dropped the question
         while True:
-            began = time.monotonic()
             for reply in question.replies:
                 answer = self._opened(question, reply)
                 if answer is not None and answer.code is not Code.BUSY:
                     return answer
-            timed_out = timed_out or time.monotonic() - began > ANSWER_S / 2
-            returned += 1
+                is_taken = is_taken or answer is not None
+            now = time.monotonic()
+            is_taken = is_taken or now - began > ANSWER_S / 2
             rack = f"rack '{asked.rack}' at {self._at}"
             if self._launches.get(asked.rack) != asked.launch:
                 raise Failure(f"{rack} has ended, or is out of reach")
-            if returned >= DENIED and not timed_out:
+            if not is_taken and now - first > DENIED_S:
                 why = not_permitted(self._asker, NEEDED[question.what])
                 raise Failure(f"rack '{asked.rack}' {why}")
-            if time.monotonic() > deadline:
+            if now - first > PATIENCE_S:
                 why = "its adapter does not cycle; does `rack step` hold it?"
                 raise Failure(f"{rack} has not answered for {PATIENCE_S:g} s: {why}")
             time.sleep(PAUSE_S)
+            began = time.monotonic()
             question = self._question(asked, question.what, question.payload, question.first)
 
     def _opened(self, question: _Question, reply: Any) -> DeskAnswer | None:

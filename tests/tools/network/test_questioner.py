@@ -8,14 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import pytest
 
 from rack.boards.lan.credentials import Credentials
+from rack.boards.lan.questions import Code, DeskAnswer, What
 from rack.tools.console.address import Asker, HostAddress
 from rack.tools.console.answer import Failure
+from rack.tools.network import questioner
 from rack.tools.network.certificates import make_credentials
-from rack.tools.network.questioner import check_reach
+from rack.tools.network.questioner import FarLaunch, Questioner, _Question, check_reach
 
 HERE = "127.0.0.1"
 
@@ -100,3 +103,47 @@ def test_another_machine_is_not_asked_without_certificates(monkeypatch: pytest.M
         assert (
             refusal(at, Asker()) == "not this machine, so it needs certificates; see --certificates"
         )
+
+
+class Line(Questioner):
+    """A session in which each question gets the next of these answers; None: it comes back without
+    one. The last is repeated."""
+
+    def __init__(self, *answers: Code | None) -> None:
+        self._at, self._asker = HostAddress(HERE, 7447), Asker()
+        self._launches = {"cell": 1}
+        self._answers = [*answers]
+
+    def _question(
+        self, asked: FarLaunch, what: What, payload: bytes, first: int | None = None
+    ) -> Any:
+        code = self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
+        replies = [] if code is None else [DeskAnswer(code, 0, 0, 0)]
+        return _Question(asked, what, payload, 1, 1, "", replies)
+
+    def _opened(self, question: Any, reply: Any) -> Any:
+        return reply
+
+    def stop(self) -> list[DeskAnswer]:
+        """Ask for an emergency stop."""
+        return list(self.ask(FarLaunch("cell", 1), "stop", [b""]))
+
+
+@pytest.mark.parametrize("before", [None, Code.BUSY])
+def test_a_question_is_asked_on_while_the_way_to_the_rack_is_not_there_yet(
+    before: Code | None,
+) -> None:
+    (answer,) = Line(*[before] * 15, Code.GRANTED).stop()
+    assert answer.code is Code.GRANTED
+
+
+def test_a_rack_that_never_takes_a_question_does_not_permit_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(questioner, "DENIED_S", 0.1)
+    with pytest.raises(Failure, match="rack 'cell' does not permit"):
+        Line(None).stop()
+    # One that is busy does take it.
+    monkeypatch.setattr(questioner, "PATIENCE_S", 0.3)
+    with pytest.raises(Failure, match=r"has not answered for 0\.3 s"):
+        Line(Code.BUSY).stop()
