@@ -284,15 +284,14 @@ def test_a_run_of_either_rack_is_continued_without_the_other(
 def test_a_run_in_real_time_is_not_continued(rack_name: str, tmp_path: Path) -> None:
     general = configs(rack_name, tmp_path)[1]
     run = tmp_path / "run"
-    for command, status in (
-        (["run", general, "--seconds", "0.2", "--out", run], None),
-        (["run", "--from", f"{run}@0.1"], 2),
-    ):
+    first = [*RACK, "run", general, "--seconds", "0.2", "--out", run]
+    subprocess.run(first, timeout=MOST_S, capture_output=True, check=False)
+    for asked in (["--from", f"{run}@0.1"], [general, "--lockstep", "--entries", run]):
         done = subprocess.run(
-            [*RACK, *command], timeout=MOST_S, capture_output=True, text=True, check=False
+            [*RACK, "run", *asked], timeout=MOST_S, capture_output=True, text=True, check=False
         )
-        assert status in (None, done.returncode)
-    assert done.stderr == f"--from {run}@0.1: {REFUSED}\n"
+        words = " ".join(map(str, asked[-2:]))
+        assert (done.returncode, done.stderr) == (2, f"{words}: {REFUSED}\n")
 
 
 @pytest.mark.thorough
@@ -311,6 +310,7 @@ def test_a_rack_that_was_lost_is_lost_again(rack_name: str, tmp_path: Path) -> N
         other.wait()
     found = json.loads(done.stdout)
     assert found["outcome"]["ticks"] == 3000, done.stderr
+    assert found["outcome"]["reason"] == "the other rack is lost"
     assert repeated(run, tmp_path / "again")[0] == found["digest"]
     lost = [found_lost(folder) for folder in (run, tmp_path / "again")]
     assert len(lost[0]) == len(LOSS)

@@ -29,6 +29,9 @@ def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str
     plan = resolve(config)
     layout = plan.layout
     recording = Recording(run)
+    ran_with = recording.rack_config
+    if ran_with.adapter.lan is not None and ran_with.clock.mode != "lockstep":
+        raise Failure(f"{asked}: in real time, on a network: only a run in lockstep is repeated", 2)
     ran = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
     found: dict[str, Entries] = {}
     for task in plan.tasks:

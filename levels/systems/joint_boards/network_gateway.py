@@ -18,6 +18,8 @@ from rack.levels.systems.joint_boards.gateway import (
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.tables import Positive, read_params
 
+LOST = "the other rack is lost"
+NOT_COMPARED = "the clocks of both racks are not compared yet"
 STATUS_CYCLES = 10
 """Cycles of this board from status to status: at 500 Hz no more often than a network permits."""
 SLACK_S = 0.002
@@ -75,7 +77,8 @@ class NetworkGateway(JointGateway):
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
             # Its references would not be followed, and its motion would begin without the arm.
             write.status.stopped = True
-            write.status.reason = "the clocks of both racks are not compared yet"
+            is_lost = peer.presence == Presence.LOST
+            write.status.reason = LOST if is_lost else NOT_COMPARED
         elif self._refused:
             write.status.state = State.HOLDING
             write.status.reason = self._refused
