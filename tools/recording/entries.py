@@ -36,9 +36,9 @@ def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str
     found: dict[str, Entries] = {}
     for task in plan.tasks:
         kind = find_class(task.target, object)
-        if not issubclass(kind, Adapter):
+        ports = kind.replayed(task.context.params, layout) if issubclass(kind, Adapter) else {}
+        if not ports:
             continue
-        ports = kind.replayed(task.context.params, layout)
         boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in ports}
         for box in boxes.values():
             _check(box, ran.get(box.name), recording, asked)
