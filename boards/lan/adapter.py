@@ -7,6 +7,8 @@ but in lockstep, where time stands still meanwhile.
 
 A restarted adapter continues from its own mailboxes. The status is written before the messages that
 it counts: an adapter killed in between has lost a message, but none is passed twice.
+
+In a replay there is no network: see `rack.boards.lan.replayed`.
 """
 
 from __future__ import annotations

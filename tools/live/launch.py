@@ -49,8 +49,8 @@ News = Callable[[], list[str]]
 @dataclass(frozen=True)
 class Beginning:
     """What a run goes on from: the checkpoint of another run, or, without one, the other's first
-    tick; the commands that its operators gave; what its host boards sent, which are not started
-    then; and which run that is, for the record."""
+    tick; the commands that its operators gave; what its host boards and other racks sent, which are
+    not started then; and which run that is, for the record."""
 
     checkpoint: Keeping | None = None
     requests: tuple[Request, ...] = ()
