@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 FLOORS := backplane levels boards tools configs
 CONFIG ?= nasrem
+# Where it is set, each start would compile all our modules anew, and pytest all tests.
+unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 .PHONY: help run test thorough quick mutants golden reference lint dist lock clean
 
