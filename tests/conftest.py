@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -60,6 +62,18 @@ def pytest_configure() -> None:
             # Handled, and not the default: the session itself outlives them still. Programs do not
             # inherit a handler.
             signal.signal(number, lambda number, frame: None)
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Keep all modules and items out of collections of garbage: looking through them takes a third
+    of a second, every time."""
+    gc.disable()
+    yield
+    gc.freeze()
+    gc.enable()
+    # At the end they are freed as ever: libraries complain about what is left.
+    atexit.register(gc.unfreeze)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
