@@ -166,10 +166,14 @@ def portable(model: Path) -> str:
 def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
-    known = [folder for folder in folders if not is_path or text in names(folder)]
-    named = [_named(text, folder) for folder in known]
-    files = [file_at(Path(text)), *named] if is_path else [*named, _named(text, Path.cwd())]
-    found = next((file for file in files if file is not None), None)
+    if is_path and (file := file_at(Path(text))):
+        return file
+    # Only what is no file is looked for among the names: that reads every config.
+    if is_path:
+        known = [folder for folder in folders if text in names(folder)]
+    else:
+        known = [*folders, Path.cwd()]
+    found = next((file for folder in known if (file := _named(text, folder))), None)
     if found is None:
         known_names = names(folders[-1])
         near = get_close_matches(text, known_names, 1)

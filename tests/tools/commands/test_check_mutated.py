@@ -15,6 +15,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +87,7 @@ KEYS = (
 )
 
 
+@cache
 def texts() -> dict[str, dict[str, Any]]:
     """Every shipped config, as written and resolved; tables that are not a whole rack extend one
     that is."""
@@ -99,9 +101,6 @@ def texts() -> dict[str, dict[str, Any]]:
         if "/" in place:
             tables["extends"] = ["nasrem"]
     return found | {f"{name}, resolved": tomllib.loads(load(name).text()) for name in names()}
-
-
-TEXTS = texts()
 
 
 def paths(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -128,7 +127,7 @@ def at(node: Any, path: tuple[Any, ...]) -> Any:
 def spoilt(draw: st.DrawFn) -> str:
     """Draw the text of a config with one to three changes that a user, or an attacker, might
     make."""
-    tables = copy.deepcopy(TEXTS[draw(st.sampled_from(sorted(TEXTS)))])
+    tables = copy.deepcopy(texts()[draw(st.sampled_from(sorted(texts())))])
     for _ in range(draw(st.integers(1, 3))):
         ways = list(paths(tables))
         *way, key = draw(st.sampled_from(ways))

@@ -52,7 +52,8 @@ def systems() -> list[str]:
     """
     found = sorted(path for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name)
     names = [path.stem if "adapter" not in read(path) else f"{path.stem}/{ALONE}" for path in found]
-    return ["nasrem", *(name for name in names if name in bundled())]
+    known = bundled()
+    return ["nasrem", *(name for name in names if name in known)]
 
 
 def measure(names: Sequence[str], runs: Runs, progress: Progress) -> Systems:
