@@ -14,10 +14,13 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from functools import cache, cached_property
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import numpy as np
+import pytest
 from pydantic import BaseModel
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +31,23 @@ SHIPPED = tuple(
     and "[[row]]" not in path.read_text()
 )
 """The shipped configs that are whole racks."""
+QUICK = (
+    "brown/brown.toml",
+    "brown/servo.toml",
+    "cell/cell.toml",
+    "chimera/chimera.toml",
+    "condor/condor.toml",
+    "course/1-overload/overload.toml",
+    "ibm/ibm.toml",
+    "nasrem.toml",
+    "nist-state-table/nist-state-table.toml",
+    "penn/penn.toml",
+)
+"""Those that `make quick` looks at: the others take longer, or are much like one of these."""
+each_shipped_rack = pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SHIPPED],
+)
 WRITES = "WRITE_SNAPSHOTS"
 """Set in the environment, it makes `Snapshots.check` write."""
 
@@ -41,21 +61,22 @@ class Snapshots:
     def check(self, case: str, parts: Mapping[str, object]) -> None:
         """Compare the parts of a case with what the file says of them."""
         found = {part: digest(value) for part, value in parts.items()}
-        known = tomllib.loads(self._path.read_text()) if self._path.exists() else {}
+        known = self.known
         if WRITES in os.environ:
             known[case] = found
-            self._write(known)
+            self._write()
         changed = [part for part in found if known.get(case, {}).get(part) != found[part]]
         assert not changed, f"{case}: other {', '.join(changed)} than before; meant? make golden"
         assert found.keys() == known[case].keys()
 
-    def cases(self) -> set[str]:
-        """Return the cases in the file."""
-        return set(tomllib.loads(self._path.read_text()))
+    @cached_property
+    def known(self) -> dict[str, dict[str, str]]:
+        """What the file says: digests by case and part."""
+        return tomllib.loads(self._path.read_text()) if self._path.exists() else {}
 
-    def _write(self, known: Mapping[str, Mapping[str, str]]) -> None:
+    def _write(self) -> None:
         lines = ["# Made by `make golden`, see tests/snapshots.py."]
-        for case, parts in sorted(known.items()):
+        for case, parts in sorted(self.known.items()):
             lines += ["", f"[{json.dumps(case)}]"]
             lines += [f"{json.dumps(part)} = {json.dumps(parts[part])}" for part in parts]
         self._path.write_text("\n".join(lines) + "\n")
@@ -67,17 +88,24 @@ def digest(value: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+@cache
+def shown(kind: type) -> list[str]:
+    """Return the fields of a dataclass but those that it does not show: they belong to one run."""
+    return [field.name for field in fields(kind) if field.repr]
+
+
 def plain(value: Any) -> Any:  # noqa: C901  # one match of all kinds
     """Return a value as JSON may hold it."""
+    # First, as most values are one of these; their subclasses (IntEnum, np.float64) are not.
+    if type(value) in (int, float, str, bool, NoneType):
+        return value
     match value:
         case Enum():
             return value.name
         case BaseModel():
             return plain(dict(value))
         case _ if is_dataclass(value) and not isinstance(value, type):
-            # What is not shown belongs to one run.
-            shown = [field.name for field in fields(value) if field.repr]
-            return {name: plain(getattr(value, name)) for name in shown}
+            return {name: plain(getattr(value, name)) for name in shown(type(value))}
         case Mapping():
             return {str(key): plain(entry) for key, entry in value.items()}
         case np.ndarray() | np.generic():
@@ -86,7 +114,7 @@ def plain(value: Any) -> Any:  # noqa: C901  # one match of all kinds
             return sorted(map(str, value))
         case tuple() | list():
             return [plain(entry) for entry in value]
-        case None | bool() | int() | float() | str():
+        case int() | float() | str():
             return value
         case Path():
             return str(value)

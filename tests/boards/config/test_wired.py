@@ -8,7 +8,7 @@ import pytest
 
 from rack.boards.config import load, resolve
 from rack.boards.config.timing import rack_timing
-from tests.snapshots import ROOT, SHIPPED, Snapshots
+from tests.snapshots import ROOT, SHIPPED, Snapshots, each_shipped_rack
 
 SNAPSHOTS = Snapshots(__file__)
 
@@ -18,7 +18,7 @@ def _on_four_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@each_shipped_rack
 def test_a_shipped_rack_is_wired_as_before(name: str) -> None:
     rack = resolve(load(ROOT / "configs" / name))
     lockstep = resolve(load(ROOT / "configs" / name, ["clock.mode=lockstep"]))
@@ -37,4 +37,4 @@ def test_a_shipped_rack_is_wired_as_before(name: str) -> None:
 
 
 def test_every_shipped_rack_is_in_the_file_and_no_other() -> None:
-    assert SNAPSHOTS.cases() == set(SHIPPED)
+    assert SNAPSHOTS.known.keys() == set(SHIPPED)

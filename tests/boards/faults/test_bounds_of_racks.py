@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import pytest
-
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.boards.config import load, wire
 from rack.boards.faults.bounds import last_read, struck_mailboxes
 from rack.boards.faults.kind import KINDS, Kind
-from tests.snapshots import ROOT, SHIPPED, Snapshots
+from tests.snapshots import ROOT, Snapshots, each_shipped_rack
 
 SNAPSHOTS = Snapshots(__file__)
 RESTARTS_S = (0.0, 0.25)
@@ -26,7 +24,7 @@ def injections(kind: Kind, layout: Layout) -> Iterator[Injection]:
             yield Injection(kind.number, task, mailbox, 0, 0, 0, 0, None, parameters)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@each_shipped_rack
 def test_the_bounds_of_a_shipped_rack_are_as_before(name: str) -> None:
     layout = wire(load(ROOT / "configs" / name))
     parts: dict[str, object] = {}

@@ -17,7 +17,7 @@ from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.response_time import load_of, response_times
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Budget
-from tests.snapshots import ROOT, SHIPPED, Snapshots
+from tests.snapshots import ROOT, Snapshots, each_shipped_rack
 
 SNAPSHOTS = Snapshots(__file__)
 SHARES = (0.02, 0.3)
@@ -65,7 +65,7 @@ def model(rack: RackTiming) -> Iterable[object]:
     ]
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@each_shipped_rack
 def test_the_timing_of_a_shipped_rack_is_as_before(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
