@@ -116,6 +116,7 @@ def test_object_that_the_fingers_do_not_meet_is_not_judged() -> None:
     Payloads(made, SCENE.objects).check_grip(BLOCK1, aside)
 
 
+@pytest.mark.slow
 def test_task_refuses_what_is_too_heavy_as_it_is_to_pick_it() -> None:
     made = weighing(6.0)
     program = read_program(

@@ -88,6 +88,7 @@ def test_obstacle_that_enters_the_path_after_the_arm_has_passed_does_not_hold_it
     assert not any(s["blocked"] for s in rack.seen)
 
 
+@pytest.mark.slow
 def test_hold_keeps_the_path_and_brakes_within_its_limits() -> None:
     made = [p for p in crossed(1.4, 0.0).set_points if p["due"]]
     accelerations = np.array([p["acceleration"] for p in made])

@@ -59,6 +59,7 @@ def test_executor_that_starts_anew_keeps_its_grip(died_at_s: float) -> None:
     assert (rack.set_points[-1]["force"], rack.set_points[-1]["opening"]) == (17.0, 0.0)
 
 
+@pytest.mark.slow
 def test_planner_that_starts_anew_makes_the_plan_that_was_lost() -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))
@@ -81,6 +82,7 @@ def test_path_whose_planner_is_lost_waits_with_a_reason() -> None:
     assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
 
 
+@pytest.mark.slow
 def test_executor_that_skips_cycles_continues_along_the_path() -> None:
     rack = PrimitiveRack()
     rack.command(*two_paths(rack))

@@ -132,6 +132,7 @@ def test_fault_between_level_and_arm_brakes_it_within_limits(
     assert_goes_on(rig)
 
 
+@pytest.mark.slow
 def test_arm_is_not_released_towards_where_its_sensors_did_not_see_it() -> None:
     rig = JointRig(TOGETHER, following=0.01)
     rig.run(

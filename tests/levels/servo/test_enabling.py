@@ -162,6 +162,7 @@ def test_a_disabled_arm_is_disabled_after_a_restart_and_an_enabled_one_goes_on(
     assert (servo.status.braked, servo.status.error) == (1, Error.DISABLED)
 
 
+@pytest.mark.slow
 def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_restart(
     tmp_path: Path,
 ) -> None:

@@ -46,6 +46,7 @@ def test_a_two_second_move_is_followed_within_a_third_of_a_milliradian(name: str
     assert (rig.status.clipped, rig.status.touches, rig.status.error) == (0, 0, Error.NONE)
 
 
+@pytest.mark.slow
 def test_the_planned_inertia_follows_the_arm_and_a_higher_bandwidth_follows_more_closely() -> None:
     move, worst = course("puma560"), []
     for bandwidth in (15.0, 60.0):
@@ -97,6 +98,7 @@ def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_l
     assert rig.status.clipped == 0
 
 
+@pytest.mark.slow
 def test_motion_resumes_smoothly_after_a_pause_above() -> None:
     rig, move = rig_of("puma560"), course("puma560", 3.0)
     limits = np.array(config("puma560")[0].acceleration)

@@ -85,6 +85,7 @@ def test_a_biased_sensor_is_not_trusted_until_the_bias_is_gone() -> None:
     assert rig.status.stopped == 0
 
 
+@pytest.mark.slow
 def test_a_bias_is_seen_by_a_restarted_servo_as_well() -> None:
     rig = rig_under_way()
     rig.inject("sensor-bias", size=0.02, joint=1)
@@ -109,6 +110,7 @@ def test_a_bias_that_begins_while_the_servo_is_dead_is_found_when_it_is_back() -
     assert Alarm.SENSOR_MODEL in rig.alarms()
 
 
+@pytest.mark.slow
 def test_a_sensor_stuck_at_rest_is_found_once_its_joint_is_to_move() -> None:
     rig = ServoRig(*config("puma560"))
     home = move().start

@@ -99,6 +99,7 @@ def transfer(to: list[float]) -> dict[str, Any]:
     return {"do": "transfer", "object": "can", "to": to, "lift": 0.06}
 
 
+@pytest.mark.slow
 def test_a_refusal_says_when_another_orientation_would_reach(tmp_path: Path) -> None:
     start = rehearsal(five(tmp_path))
     with pytest.raises(Refused, match="in reach in another orientation"):
@@ -127,7 +128,9 @@ def leaning_of(end: Rehearsal) -> float:
     return float(np.arccos(np.clip(-down[2], -1.0, 1.0)))
 
 
-@pytest.mark.parametrize(("bend", "lean"), [(2.0, 0.0), (0.9, np.pi / 18)])
+@pytest.mark.parametrize(
+    ("bend", "lean"), [pytest.param(2.0, 0.0, marks=pytest.mark.slow), (0.9, np.pi / 18)]
+)
 def test_a_grasp_leans_where_it_cannot_be_straight_down(
     tmp_path: Path, bend: float, lean: float
 ) -> None:
@@ -158,6 +161,7 @@ def moved(
     return rehearse(program, scene, rehearsal(robot, scene))
 
 
+@pytest.mark.slow
 def test_a_block_is_taken_otherwise_where_its_goal_cannot_be_reached_so() -> None:
     done = moved((0.793, -0.149, 0.475))
     grasp = next(step.move for step in done.moves if step.move.verb is Verb.GRASP)
@@ -167,6 +171,7 @@ def test_a_block_is_taken_otherwise_where_its_goal_cannot_be_reached_so() -> Non
     assert done.situation.object_pose(0).position[:2] == pytest.approx((0.793, -0.149), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
     with pytest.raises(
         Refused,

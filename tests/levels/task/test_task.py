@@ -120,6 +120,7 @@ def test_what_cannot_be_done_is_refused_with_what_can(
     assert words in str(refused)
 
 
+@pytest.mark.slow
 def test_refused_transfer_says_whether_to_pick_or_to_place_is_blocked(start: Rehearsal) -> None:
     on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
     buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))

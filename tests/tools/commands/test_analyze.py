@@ -112,7 +112,11 @@ def test_without_matplotlib_there_are_figures_and_no_pictures(
 
 
 @pytest.mark.parametrize(
-    ("missed", "said"), [(0, "no cycle missed or skipped"), (3, "3 cycles missed, 2 skipped")]
+    ("missed", "said"),
+    [
+        pytest.param(0, "no cycle missed or skipped", marks=pytest.mark.slow),
+        (3, "3 cycles missed, 2 skipped"),
+    ],
 )
 def test_what_matters_comes_first_and_the_tables_on_demand(
     small: Path, tmp_path: Path, missed: int, said: str

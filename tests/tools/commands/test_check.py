@@ -170,6 +170,7 @@ def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
     assert levels["upper"]["plan_ns"] is None
 
 
+@pytest.mark.slow
 def test_a_fix_carries_the_measured_budgets(small: Path, recorded: Path, tmp_path: Path) -> None:
     # A cycle this short leaves the measured planner nothing; whatever helps is judged by what was
     # measured.

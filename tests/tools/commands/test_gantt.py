@@ -178,6 +178,7 @@ def test_without_matplotlib_a_chart_is_printed_alone(
     assert asked.stderr.splitlines() == [f"--plot {tmp_path / 'out'}: {missing}"]
 
 
+@pytest.mark.slow
 def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
     shown = rack("gantt", "nasrem", "--figure", 5, "--out", tmp_path)
     assert (shown.returncode, shown.stderr) == (0, "")

@@ -236,6 +236,7 @@ def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
     assert pair.alpha.claim == pair.beta.claim == Claim(2, b"beta")
 
 
+@pytest.mark.slow
 def test_a_rack_launched_anew_gets_its_part_back_where_the_other_saw_it(pair: Pair) -> None:
     pair.lift(pair.alpha)
     pair.put_down(pair.alpha)

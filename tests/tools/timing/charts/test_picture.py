@@ -77,7 +77,7 @@ def test_the_numbers_of_frames_stand_above_their_columns() -> None:
 
 
 def test_a_chart_in_letters_names_what_is_too_short_for_its_columns() -> None:
-    coarse = list(lines(panel_of("nasrem", 1000.0, 1200.0), 2 * NS_PER_MS))
-    assert "too short for a column: clock, world; show less time, or see the picture" in coarse
-    fine = list(lines(panel_of("nasrem", 1000.0, 1008.0), NS_PER_MS // 10))
+    coarse = list(lines(panel_of("cell", 1000.0, 1200.0), 2 * NS_PER_MS))
+    assert "too short for a column: clock, lan, task; show less time, or see the picture" in coarse
+    fine = list(lines(panel_of("cell", 1000.0, 1008.0), NS_PER_MS // 10))
     assert not [line for line in fine if line.startswith("too short")]
