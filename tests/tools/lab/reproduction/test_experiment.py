@@ -9,12 +9,14 @@ from pathlib import Path
 import pytest
 
 from rack.tools.console.answer import Failure
+from rack.tools.lab.reproduction.experiments import experiment
 from rack.tools.lab.reproduction.experiments.experiment import (
     KEPT,
     Experiment,
     Kept,
     Lacking,
     Workshop,
+    depends,
     kept,
     made,
     program_files,
@@ -30,10 +32,10 @@ class Times:
 
 
 class Counted:
-    """An experiment that counts how often it is made; `inputs` is what it depends on."""
+    """An experiment that counts how often it is made."""
 
     def __init__(self) -> None:
-        self.times, self.inputs = 0, {"config": "a"}
+        self.times = 0
 
     def make(self, workshop: Workshop) -> Times:
         self.times += 1
@@ -42,7 +44,7 @@ class Counted:
         return Times(self.times, {"one": workshop.shown([path])})
 
     def experiment(self) -> Experiment[Times]:
-        return Experiment("counted", "counting", 1.0, Times, lambda: self.inputs, self.make)
+        return Experiment("counted", "counting", 1.0, Times, self.make)
 
 
 @pytest.fixture
@@ -52,13 +54,14 @@ def workshop(tmp_path: Path) -> Workshop:
     return found
 
 
-def test_a_result_is_kept_until_its_inputs_change(workshop: Workshop) -> None:
-    counted = Counted()
-    one = counted.experiment()
+def test_a_result_is_kept_until_the_program_changes(
+    workshop: Workshop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = Counted().experiment()
     assert kept(one, workshop.folder) is None
     first = made(one, workshop)
     assert kept(one, workshop.folder) == first
-    counted.inputs = {"config": "b"}
+    monkeypatch.setattr(experiment, "program", lambda: "another")
     assert kept(one, workshop.folder) is None
     assert made(one, workshop).found["times"] == 2
 
@@ -87,9 +90,7 @@ def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(
     def fail(workshop: Workshop) -> Times:
         raise Failure("the rack did not run")
 
-    lacking, failing = (
-        Experiment(make.__name__, "", 1.0, Times, dict, make) for make in (lack, fail)
-    )
+    lacking, failing = (Experiment(make.__name__, "", 1.0, Times, make) for make in (lack, fail))
     made(lacking, workshop)
     found = kept(lacking, workshop.folder)
     assert found is not None
@@ -103,8 +104,8 @@ def test_what_a_result_depends_on_stands_next_to_it(workshop: Workshop) -> None:
     one = Counted().experiment()
     found = made(one, workshop)
     document = json.loads((workshop.folder / KEPT / "counted.json").read_text())
-    assert document["depends"] == json.loads(json.dumps(one.depends()))
-    assert {"inputs", "program", "machine"} <= set(document["depends"])
+    assert document["depends"] == json.loads(json.dumps(depends()))
+    assert {"program", "machine"} <= set(document["depends"])
     assert isinstance(found, Kept)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from rack.tools.lab.reproduction.experiments import figures
 from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
     FigureRack,
@@ -20,6 +21,8 @@ from rack.tools.lab.reproduction.sections.page import Findings, Listing, Plate, 
 from rack.tools.timing.charts.panel import Count
 
 NOWHERE = Workshop(Path("nowhere"), share=True)
+NEWER_X = 4.0
+"""The X of the paper's newer version, ms."""
 
 
 def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
@@ -42,14 +45,14 @@ def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
 
 
 def test_figure_3_has_a_plan_in_time_with_the_shortest_x() -> None:
-    short, usual = planning("fig3", gantt.LEAST_X), planning("fig3", 2.0)
+    short, usual = planning("fig3", figures.LEAST_X), planning("fig3", 2.0)
     assert (short.in_time, short.failing) == (True, ())
     assert not usual.in_time
     assert "3.8" in usual.failing
 
 
 def test_figure_4_has_no_idle_time_with_the_longest_x() -> None:
-    usual, full, newer = (planning("fig4", x) for x in (2.0, gantt.MOST_X, gantt.NEWER_X))
+    usual, full, newer = (planning("fig4", x) for x in (2.0, figures.MOST_X, NEWER_X))
     assert (usual.pattern, usual.failing) == ("C R X W -", ())
     assert (full.pattern, full.failing, full.idle_ms) == ("C R X W", ("3.6",), 0.0)
     assert {"3.1", "3.6"} <= set(newer.failing)
@@ -60,7 +63,7 @@ def document(late: int, jobs: int = 100) -> Document:
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
     patterns = (PatternCount("level", "R X W P | R X W P U -", jobs),)
     run = FigureRun(counts, patterns, {}, 0, 0, {"measured": Path("pictures/x.svg")})
-    return gantt.FIG2.experiment.document(run)
+    return figures.FIG2.experiment.document(run)
 
 
 @pytest.mark.parametrize(
@@ -75,10 +78,10 @@ def test_a_figure_that_works_is_judged_by_its_run(late: int, ruling: Ruling) -> 
 
 def test_runs_that_do_not_confirm_the_contradiction_make_it_no_finding() -> None:
     (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2-x"]
-    confirmed = {gantt.SHORT_2.label: document(0), gantt.LONG_2.label: document(100)}
+    confirmed = {figures.SHORT_2.label: document(0), figures.LONG_2.label: document(100)}
     assert statement.tested(Findings(confirmed, NOWHERE)).ruling is Ruling.CONTRADICTS
     assert (
-        statement.tested(Findings({**confirmed, gantt.LONG_2.label: document(0)}, NOWHERE)).ruling
+        statement.tested(Findings({**confirmed, figures.LONG_2.label: document(0)}, NOWHERE)).ruling
         is Ruling.FAILS
     )
 

@@ -11,7 +11,6 @@ from rack.tools.console.answer import Failure
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
-    inputs,
     need_real_time,
 )
 from rack.tools.recording.recording import Recording
@@ -64,7 +63,6 @@ DEADLINE = Experiment(
     "goto in soft time, and by a time",
     LASTS_S,
     GotoRuns,
-    inputs(NAME, above=ABOVE_M, too_early=TOO_EARLY),
     _run,
 )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.tools.lab.benches.observed import Recorded
-from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop, inputs
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.recording.divergence import Difference, first_difference
 from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
@@ -56,7 +56,6 @@ DETERMINISM = Experiment(
     "nasrem twice in lockstep, then in real time",
     LASTS_S,
     ComparedRuns,
-    inputs(NAME, seconds=SECONDS, attempts=ATTEMPTS),
     _run,
 )
 

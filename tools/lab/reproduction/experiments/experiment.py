@@ -1,9 +1,9 @@
 """Experiments, and the folder that keeps what they found.
 
-What an experiment found is kept as JSON with all that it depends on: its configs, its own settings,
-the program and the machine. It is made again only if one of these has changed, a picture is gone,
-or it was not finished: a file appears whole or not at all, so even a killed command continues where
-it was.
+What an experiment found is kept as JSON with all that it depends on: the machine and the program,
+of which its configs and its own settings are parts. It is made again only if one of these has
+changed, a picture is gone, or it was not finished: a file appears whole or not at all, so even a
+killed command continues where it was.
 """
 
 from __future__ import annotations
@@ -112,15 +112,14 @@ class Workshop:
 class Experiment(Generic[Found]):
     """A measurement: `make` returns what it found as a record of `kind`, after about `seconds`.
 
-    `inputs` returns what it rests on besides program and machine. The names of its pictures, within
-    the folder, are the record's `pictures`. `make` raises `Lacking` and `Failure`.
+    The names of its pictures, within the folder, are the record's `pictures`. `make` raises
+    `Lacking` and `Failure`.
     """
 
     name: str
     about: str
     seconds: float
     kind: type[Found]
-    inputs: Callable[[], Any]
     make: Callable[[Workshop], Found]
 
     def record(self, document: Document) -> Found:
@@ -131,14 +130,10 @@ class Experiment(Generic[Found]):
         """Return what was found as plain data."""
         return dict(TypeAdapter(self.kind).dump_python(found, mode="json"))
 
-    def depends(self) -> Document:
-        """Return all that the result depends on, as it is now."""
-        return {"inputs": self.inputs(), "program": program(), "machine": machine()}
 
-
-def inputs(name: str, **settings: object) -> Callable[[], Document]:
-    """Return the `inputs` of an experiment that rests on a config, and on settings of its own."""
-    return lambda: {"config": load(name).text(), **settings}
+def depends() -> Document:
+    """Return all that a result depends on, as it is now."""
+    return {"program": program(), "machine": machine()}
 
 
 @dataclass(frozen=True)
@@ -158,12 +153,12 @@ def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
         document = json.loads(
             (folder / KEPT / f"{experiment.name}.json").read_text(encoding="utf-8")
         )
-        depends = document.pop("depends")
+        basis = document.pop("depends")
         result = Kept(**document)
         pictures = result.found.get("pictures", {})
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    if depends != json.loads(json.dumps(experiment.depends())):
+    if basis != depends():
         return None
     return result if all((folder / path).is_file() for path in pictures.values()) else None
 
@@ -171,7 +166,7 @@ def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
 def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
     """Make an experiment and keep its result. Raises `Failure` and what a rack raises."""
     started = time.monotonic()
-    depends = experiment.depends()
+    basis = depends()
     lacking = ""
     try:
         found = experiment.document(experiment.make(workshop))
@@ -187,7 +182,7 @@ def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
     path = workshop.folder / KEPT / f"{experiment.name}.json"
     part = path.with_suffix(".part")
     part.write_text(
-        json.dumps({"depends": depends, **vars(result)}, indent=1) + "\n", encoding="utf-8"
+        json.dumps({"depends": basis, **vars(result)}, indent=1) + "\n", encoding="utf-8"
     )
     part.replace(path)
     return result

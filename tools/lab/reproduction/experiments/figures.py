@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import Count, Panel
 from rack.tools.timing.charts.scheduled import Schedule
 
+LEAST_X = 1.0
+MOST_X = 3.0
+"""The paper's X, ms: "will range from 1 to 3 ms"."""
 SECONDS = 3.0
 ATTEMPTS = 3
 """Most runs of a figure, until the cycles of its executor are in time."""
@@ -81,15 +84,7 @@ class FigureRack:
         """Its run by real processes."""
         lasts_s = SECONDS + LAUNCH_S
         about = f"{self.label} by real processes"
-        return Experiment(self.label, about, lasts_s, FigureRun, self._inputs, partial(_run, self))
-
-    def _inputs(self) -> Any:
-        return {
-            "config": self.loaded().text(),
-            "seconds": SECONDS,
-            "cycles": self.cycles,
-            "attempts": ATTEMPTS,
-        }
+        return Experiment(self.label, about, lasts_s, FigureRun, partial(_run, self))
 
     def schedule(self) -> Schedule:
         """Return the schedule that follows from its budget."""
@@ -105,6 +100,18 @@ class FigureRack:
         """The time that its charts show."""
         config = self.loaded()
         return self.cycles * config.every(LEVEL) * config.clock_ns
+
+
+FIG2 = FigureRack("fig2", 2)
+FIG3 = FigureRack("fig3", 3)
+FIG4 = FigureRack("fig4", 2)
+OVERLOAD = FigureRack("fig4-overload", 3)
+BUFFERED = FigureRack("fig4", 2, protocol="double-buffer")
+BEHIND = FigureRack("fig2", 6, stores="planner")
+IN_LINE = FigureRack("fig2", 6, stores="executor")
+SHORT_2 = FigureRack("fig2", 2, LEAST_X)
+LONG_2 = FigureRack("fig2", 3, MOST_X)
+SHORT_3 = FigureRack("fig3", 3, LEAST_X)
 
 
 def budget_of(config: RackConfig) -> BudgetConfig:

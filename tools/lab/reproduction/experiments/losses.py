@@ -8,7 +8,6 @@ from functools import partial
 
 from pydantic import TypeAdapter
 
-from rack.boards.config import load
 from rack.tools.faults.judge import Judgement, faults
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
@@ -40,7 +39,6 @@ def losses_of(script: str, about: str) -> Experiment[LossesRun]:
         about,
         LASTS_S,
         LossesRun,
-        lambda: {"config": load(NAME, (), script).text()},
         partial(_run, script),
     )
 

@@ -17,7 +17,6 @@ from rack.tools.lab.benches.systems.tables import Systems
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
-    inputs,
     need_real_time,
 )
 
@@ -53,7 +52,6 @@ SWITCH = Experiment(
     "the context switch",
     switch.WAKES * switch.PERIOD_S + LAUNCH_S,
     SwitchRun,
-    inputs(NAME, wakes=switch.WAKES),
     _switch,
 )
 
@@ -81,7 +79,6 @@ RESPONSE = Experiment(
     "holds and resumes by an operator",
     62.0,
     ResponseRun,
-    inputs(NAME, commands=COMMANDS, twins=TWINS, seed=SEED),
     _response,
 )
 
@@ -96,7 +93,6 @@ PARTITION = Experiment(
     "nasrem with its planners on one core and on two",
     len(partition.PARTITIONS) * (PARTITION_S + LAUNCH_S),
     partition.Partitions,
-    inputs(NAME, seconds=PARTITION_S),
     _partition,
 )
 
@@ -108,7 +104,6 @@ def system_experiment(name: str) -> Experiment[Systems]:
         f"{name} next to the other systems",
         SYSTEM_LASTS_S + POSES_LAST_S * (poses_config(name) is not None),
         Systems,
-        inputs(name, seconds=SYSTEM_S),
         partial(_system, name),
     )
 

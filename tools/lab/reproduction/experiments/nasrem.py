@@ -18,7 +18,6 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     Document,
     Experiment,
     Workshop,
-    inputs,
     need_real_time,
 )
 from rack.tools.recording.cycles import Cycles
@@ -174,7 +173,6 @@ NASREM = Experiment(
     "nasrem in real time, its whole task",
     LASTS_S,
     NasremRun,
-    inputs(NAME),
     _run,
 )
 

@@ -77,7 +77,6 @@ CHAINS = Experiment(
     "a message down five levels, with locks too, and down ten",
     4 * (SECONDS + LAUNCH_S),
     Chains,
-    lambda: {"rate": RATE_HZ, "seconds": SECONDS, "boards": (LEVELS, GROWN)},
     _chains,
 )
 
@@ -101,6 +100,5 @@ WAITS = Experiment(
     "a board that blocks, and one that polls",
     len(WAYS) * (SECONDS + LAUNCH_S),
     Waits,
-    lambda: {"rate": RATE_HZ, "seconds": SECONDS},
     _waits,
 )

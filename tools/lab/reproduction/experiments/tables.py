@@ -10,7 +10,6 @@ from pydantic import TypeAdapter
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
-    inputs,
     need_real_time,
 )
 from rack.tools.recording.history import fired_rows
@@ -56,7 +55,6 @@ TABLES = Experiment(
     "state tables, with a disturbance and without",
     LASTS_S,
     TableRuns,
-    inputs(NAME, without=UNDISTURBED),
     _run,
 )
 

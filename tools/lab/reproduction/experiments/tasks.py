@@ -24,7 +24,6 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     RUNS,
     Experiment,
     Workshop,
-    inputs,
     need_real_time,
 )
 from rack.tools.live.host_side import entries_of
@@ -209,12 +208,9 @@ def _first_ns(recording: Recording, box: str, field: str) -> int | None:
 
 
 def _two_racks(later_ms: int, about: str) -> Experiment[NetworkRun]:
-    def depends() -> dict[str, str | int]:
-        return {"general": load(BROWN).text(), "servo": load(SERVO).text(), "later": later_ms}
-
     name = f"task-{BROWN}-later" if later_ms else f"task-{BROWN}"
     lasts_s = BROWN_S + 2 * LAUNCH_S
-    return Experiment(name, about, lasts_s, NetworkRun, depends, partial(_run_two, later_ms))
+    return Experiment(name, about, lasts_s, NetworkRun, partial(_run_two, later_ms))
 
 
 NETWORK = _two_racks(0, "the whole task of brown's two racks in real time")
@@ -226,7 +222,6 @@ TASKS: dict[str, Experiment[Any]] = {
             f"the whole task of {name} in real time",
             lasts_s + LAUNCH_S,
             TaskRun,
-            inputs(name),
             partial(_run, name),
         )
         for name, lasts_s in TASKS_S.items()

@@ -7,9 +7,18 @@ from functools import partial
 
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
+    FIG2,
+    FIG3,
+    FIG4,
+    LEAST_X,
     LEVEL,
+    LONG_2,
+    MOST_X,
     MS,
+    OVERLOAD,
     PLANNER,
+    SHORT_2,
+    SHORT_3,
     FigureRack,
     FigureRun,
     Planning,
@@ -35,10 +44,6 @@ from rack.tools.lab.reproduction.sections.page import (
 )
 from rack.tools.timing.charts.letters import column_for, lines
 
-LEAST_X = 1.0
-MOST_X = 3.0
-NEWER_X = 4.0
-"""The paper's X, ms: "will range from 1 to 3 ms", and the newer version's."""
 STEP_X = 0.5
 LEAST_P = 3.0
 """"The planner runs at least 3 ms each cycle"."""
@@ -48,17 +53,6 @@ MOSTLY = 0.5
 """Part of the cycles, or plans, late from which on a run is said to fail: the figures fail in all,
 or in none."""
 PAPER_X = [LEAST_X + STEP_X * k for k in range(round((MOST_X - LEAST_X) / STEP_X) + 1)]
-
-FIG2 = FigureRack("fig2", 2)
-FIG3 = FigureRack("fig3", 3)
-FIG4 = FigureRack("fig4", 2)
-OVERLOAD = FigureRack("fig4-overload", 3)
-BUFFERED = FigureRack("fig4", 2, protocol="double-buffer")
-BEHIND = FigureRack("fig2", 6, stores="planner")
-IN_LINE = FigureRack("fig2", 6, stores="executor")
-SHORT_2 = FigureRack("fig2", 2, LEAST_X)
-LONG_2 = FigureRack("fig2", 3, MOST_X)
-SHORT_3 = FigureRack("fig3", 3, LEAST_X)
 
 
 def drawn(figure: FigureRack, workshop: Workshop) -> tuple[Plate, Listing]:

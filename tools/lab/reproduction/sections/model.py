@@ -14,6 +14,8 @@ from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.tools.faults.judge import Judgement
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
+    FIG2,
+    FIG4,
     LEVEL,
     PLANNER,
     budget_of,
@@ -27,7 +29,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
 )
 from rack.tools.lab.reproduction.sections.equations import stolen
 from rack.tools.lab.reproduction.sections.flow import between, flow_svg
-from rack.tools.lab.reproduction.sections.gantt import FIG2, FIG4, judge_both
+from rack.tools.lab.reproduction.sections.gantt import judge_both
 from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,

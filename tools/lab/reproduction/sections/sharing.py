@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
+from rack.tools.lab.reproduction.experiments.figures import (
+    BEHIND,
+    BUFFERED,
+    FIG3,
+    FIG4,
+    IN_LINE,
+    LEVEL,
+    PLANNER,
+    FigureRun,
+)
 from rack.tools.lab.reproduction.experiments.sharing import (
     CHAINS,
     LEVELS,
@@ -19,11 +28,6 @@ from rack.tools.lab.reproduction.experiments.tasks import (
     NetworkRun,
 )
 from rack.tools.lab.reproduction.sections.gantt import (
-    BEHIND,
-    BUFFERED,
-    FIG3,
-    FIG4,
-    IN_LINE,
     MOSTLY,
     judge_both,
     ran_all,
