@@ -79,7 +79,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType, SimpleNamespace
+from types import MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any, ClassVar, NamedTuple, Self
 
 from pydantic import ValidationError, model_validator
@@ -268,6 +268,8 @@ class LevelSection:
     program: ClassVar[type[Program] | None] = None
     """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it
     by itself."""
+    preloads: ClassVar[tuple[ModuleType, ...]] = ()
+    """Modules of which every process of the level needs the compiled functions."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
@@ -276,6 +278,8 @@ class LevelSection:
     def preload(cls) -> None:
         """Load what every process of the level needs, such as compiled code. Called once, before
         the crate forks."""
+        for module in cls.preloads:
+            module.preload()
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the

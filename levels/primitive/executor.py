@@ -69,6 +69,7 @@ class PrimitiveExecutor(Executor):
     }
     outputs = {"command": JOINT_SET_POINT, "status": PRIMITIVE_STATUS}
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    preloads = (collision, paths)
     params = PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -101,12 +102,6 @@ class PrimitiveExecutor(Executor):
         self._displaced = (
             False  # the servo was out of step since the last path: the arm may not be at its end
         )
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of collision checks."""
-        collision.preload()
-        paths.preload()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read command, status, plan and world model; write the next set point and this level's

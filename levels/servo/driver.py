@@ -135,6 +135,7 @@ class ArmDriver(Executor):
     @classmethod
     def preload(cls) -> None:
         """Load the compiled functions of the level and of its arm."""
+        super().preload()
         preload()
         for module in (sensor_monitor, actuator_monitor):
             module.preload()

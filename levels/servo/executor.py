@@ -49,6 +49,7 @@ class ServoExecutor(ArmDriver):
         **dict.fromkeys(DRIVES, ()),
     }
     params: ClassVar[type[ServoParams]] = ServoParams
+    preloads = (control, reference)
     gives_set_points = True
 
     def __init__(self, context: LevelContext) -> None:
@@ -86,13 +87,6 @@ class ServoExecutor(ArmDriver):
         if interface != "torque" and (names := cls.names(context.params)):
             why = f'they modify a law of torques; [robot] interface is "{interface}"'
             yield "params.modifications", ", ".join(names), why
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level and of its arm."""
-        super().preload()
-        for module in (control, reference):
-            module.preload()
 
     def take_messages(self, read: Ports) -> None:
         """Take over what is new."""

@@ -59,6 +59,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
     outputs = {**ArmExecutor.outputs, "wrench": WRENCH}
     params = ForceArmParams
+    preloads = (*ArmExecutor.preloads, wrist, contact_wrench)
 
     def __init__(self, context: LevelContext) -> None:
         params = read_params(ForceArmParams, context.params)
@@ -72,13 +73,6 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         self._before = np.zeros(len(self.cell.dof))
         self._since: int | None = None  # that tick; None: not known
         self._exceeded = 0  # cycles in which the contact was beyond the limits
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level, its arm and its sensor."""
-        super().preload()
-        wrist.preload()
-        contact_wrench.preload()
 
     def self_test(self) -> None:
         """Raise `LevelError` for a class of arms that has no wrist sensor."""

@@ -54,6 +54,7 @@ class HybridExecutor(WristLevel):
         "force": Output(FORCE_STATUS, rests_on="wrench"),
     }
     params = HybridGains
+    preloads = (dynamics, reference)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -68,12 +69,6 @@ class HybridExecutor(WristLevel):
         self._moving = np.zeros(len(cell.home))
         self._still = np.zeros(len(cell.home))
         self._tick: int | None = None  # of the last cycle
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level."""
-        for module in (dynamics, reference):
-            module.preload()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Follow references and forces; report."""

@@ -50,6 +50,7 @@ class HandExecutor(Executor):
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params = Table
     faults = (TendonStep,)
+    preloads = (substeps, poses)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -69,12 +70,6 @@ class HandExecutor(Executor):
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
         self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
         self._shown: tuple[Any, ...] = ()  # what seldom changes, in the last status
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the plant."""
-        for module in (substeps, poses):
-            module.preload()
 
     @classmethod
     def misfits(

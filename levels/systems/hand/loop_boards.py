@@ -83,17 +83,12 @@ class JointLoop(HandLoop):
     }
     outputs = {"command": TENDON_TORQUE, "status": LOOP_STATUS}
     params = JointGains
+    preloads = (dynamics, joint_law)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
         self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level."""
-        for module in (dynamics, joint_law):
-            module.preload()
 
     def meet(self, read: Ports, hand: Message) -> None:
         """Hold the joints where they are, until there are targets."""
@@ -122,17 +117,13 @@ class TendonLoop(HandLoop):
     }
     outputs = {"command": TENSION_COMMAND, "status": LOOP_STATUS}
     params = TendonGains
+    preloads = (tendon_law,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
         gains = read_params(TendonGains, context.params)
         self._law = TendonLaw(self.hand, self.driven, gains, context)
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level."""
-        tendon_law.preload()
 
     def meet(self, read: Ports, hand: Message) -> None:
         """Begin with the tensions that are there."""
@@ -169,6 +160,7 @@ class FingerExecutor(HandLoop):
     }
     outputs = {"command": TENSION_COMMAND, "status": FINGER_STATUS}
     params = FingerParams
+    preloads = (dynamics, joint_law, tendon_law)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -184,12 +176,6 @@ class FingerExecutor(HandLoop):
         self._tendons = TendonLaw(hand, self._joints, params, context)
         self._target = Message(FINGER_TARGET.dtype(context.sizes))
         self._torque = np.zeros(len(self._joints))
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level."""
-        for module in (dynamics, joint_law, tendon_law):
-            module.preload()
 
     @classmethod
     def misfits(

@@ -4,6 +4,7 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
@@ -45,6 +46,7 @@ class ArmExecutor(ArmDriver):
     outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
     commands = {Operation.HOLD: (), Operation.RESUME: (), **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
+    preloads: ClassVar[tuple[ModuleType, ...]] = (joint_torques,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context, read_params(self.params, context.params))
@@ -60,12 +62,6 @@ class ArmExecutor(ArmDriver):
         self._braked_at: int | None = None
         self._torques: Mapping[str, Reading] = {}
         self._waiting = ""  # why the boards above do not drive the arm
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level and of its arm."""
-        super().preload()
-        joint_torques.preload()
 
     @classmethod
     def misfits(

@@ -70,6 +70,7 @@ class JointServo(Executor):
         Operation.SET: (),
     }
     params = JointServoParams
+    preloads = (dynamics, reference, joint_control)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -104,12 +105,6 @@ class JointServo(Executor):
         self._refused = ""  # why the newest reference was not taken
         self._shown: tuple[Any, ...] = ()  # in the last status
         self._met = False  # a status of the arm has come
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the level."""
-        for module in (dynamics, reference, joint_control):
-            module.preload()
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:

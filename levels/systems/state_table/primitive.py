@@ -90,6 +90,7 @@ class PrimitiveTable(StateTableExecutor):
     }
     outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_MOVE_STATUS, rests_on="statuses")}
     commands = OPERATIONS
+    preloads = (curves,)
     vocabulary = vocabulary(
         conditions={
             "hold": Condition(
@@ -143,11 +144,6 @@ class PrimitiveTable(StateTableExecutor):
         self._target = -1  # row of the object that the newest command concerns
         self._due = 0  # tick at which the set point of this cycle is due
         self._grips = 0  # cycles until the gripper's motion must show
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the curves."""
-        curves.preload()
 
     def recall(self, read: Ports, write: Ports) -> None:
         """Continue with the gripper as it is; the arm's motion begins anew from where the boards

@@ -60,6 +60,7 @@ class TrajectoryExecutor(Executor):
     }
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
+    preloads = (dynamics,)
     work: ClassVar[type[RequestWork]] = RequestWork
     """Does the requests."""
 
@@ -82,11 +83,6 @@ class TrajectoryExecutor(Executor):
             self._work.grip = robot.gripper.open, robot.gripper.force
         self._tick: int | None = None  # of the last cycle
         self._saved: tuple[int, ...] = ()  # what the last state depends on
-
-    @classmethod
-    def preload(cls) -> None:
-        """Load the compiled functions of the dynamics."""
-        dynamics.preload()
 
     def room(self, port: str) -> int:
         """Return how many requests to take: the rest waits in the queue."""
