@@ -177,7 +177,6 @@ class Commit:
     """A commit of this checkout."""
 
     day: datetime.date
-    parents: Sequence[str]
     files: Sequence[str]
 
 
@@ -185,16 +184,9 @@ class Commit:
 def _commits_since(start: str) -> list[Commit] | None:
     """Return the commits that are not `start`, given by the head of its name, nor before it."""
     commits = _history()
-    left = [name for name in commits if name.startswith(start)]
-    if not left:
+    if not any(name.startswith(start) for name in commits):
         return None
-    before = set()
-    while left:
-        name = left.pop()
-        if name not in before:
-            before.add(name)
-            left += commits[name].parents
-    return [commit for name, commit in commits.items() if name not in before]
+    return [commits[name] for name in _git("rev-list", f"{start}..").split()]
 
 
 @cache
@@ -207,10 +199,10 @@ def _history() -> dict[str, Commit]:
     if _git("rev-parse", "--is-shallow-repository").strip() != "false":
         return {}
     commits = {}
-    for entry in _git("log", "--name-only", "--format=%x00%cs %H %P").split("\0")[1:]:
+    for entry in _git("log", "--name-only", "--format=%x00%cs %H").split("\0")[1:]:
         head, *files = entry.splitlines()
-        day, name, *parents = head.split()
-        commits[name] = Commit(datetime.date.fromisoformat(day), parents, files)
+        day, name = head.split()
+        commits[name] = Commit(datetime.date.fromisoformat(day), files)
     return commits
 
 
