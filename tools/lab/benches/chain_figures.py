@@ -32,9 +32,8 @@ class Fit:
         if len(counts) < 3:
             return None
         slope, base = np.polyfit(counts, costs_us, 1)
-        residual = np.asarray(costs_us) - (base + slope * np.asarray(counts))
-        total = np.asarray(costs_us) - np.mean(costs_us)
-        return cls(float(base), float(slope), 1.0 - float((residual**2).sum() / (total**2).sum()))
+        r = np.corrcoef(counts, costs_us)[0, 1]
+        return cls(float(base), float(slope), float(r * r))
 
     @property
     def words(self) -> str:
