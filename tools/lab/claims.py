@@ -25,7 +25,7 @@ from typing import Any
 
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.checkout import rack_commands
-from rack.tools.lab.benches.harness import finished
+from rack.tools.lab.benches.harness import finished, last_line
 
 ROOT = Path(__file__).resolve().parents[2]
 """The checkout, from which commands are run; of an installed wheel, the folder of the package."""
@@ -140,9 +140,9 @@ def repeated(claim: MeasuredClaim) -> Repeated:
     try:
         return Repeated(claim, taken(json.loads(ended.stdout), claim.take))
     except (AttributeError, LookupError, TypeError, ValueError):
-        reasons = ended.stderr.splitlines() or [f"exit status {ended.returncode}"]
+        why = last_line(ended.stderr, f"exit status {ended.returncode}")
         raise Failure(
-            f"{claim.name}: `{claim.command}` gave no figure at {list(claim.take)}: {reasons[-1]}"
+            f"{claim.name}: `{claim.command}` gave no figure at {list(claim.take)}: {why}"
         ) from None
 
 

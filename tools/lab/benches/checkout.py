@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import finished
+from rack.tools.lab.benches.harness import finished, last_line
 
 THIS = "this tree"
 RUN = "import sys; from rack.tools.cli import main; sys.argv[0] = 'rack'; sys.exit(main())"
@@ -49,8 +49,7 @@ class RackCommand:
         argv = [*self.argv, *map(str, arguments)]
         done = finished(called, argv, bound_s, self.environment)
         if done.returncode:
-            reasons = [line for line in done.stderr.splitlines() if line.strip()]
-            why = reasons[-1] if reasons else f"exit status {done.returncode}"
+            why = last_line(done.stderr, f"exit status {done.returncode}")
             raise Failure(f"{called}: {why}")
         return done.stdout
 

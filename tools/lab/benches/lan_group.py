@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Self
 
 from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.harness import last_line
 from rack.tools.lab.benches.lan_ends import COORDINATOR, LanTask, rack_name
 from rack.tools.lab.benches.lan_machine import (
     ANSWER_S,
@@ -174,8 +175,7 @@ class _Member:
             with suppress(TimeoutExpired):
                 self.process.wait(ANSWER_S)
             self._errors.seek(0)
-            said = self._errors.read().decode(errors="replace").strip().splitlines()
-            why = said[-1] if said else "it says nothing"
+            why = last_line(self._errors.read().decode(errors="replace"), "it says nothing")
             raise Failure(f"{self._name}: ended: {why}") from None
 
     def end(self) -> None:

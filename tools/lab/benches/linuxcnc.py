@@ -23,7 +23,7 @@ import numpy as np
 
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.cyclictest import WakeGrid
-from rack.tools.lab.benches.harness import Absent, absent_program
+from rack.tools.lab.benches.harness import Absent, absent_program, last_line
 
 LINUXCNC = "LinuxCNC thread"
 PACKAGE = "linuxcnc-uspace"
@@ -44,6 +44,7 @@ MEASURE = """\
 start
 loadusr -w halsampler -n {samples}
 """
+SILENT = "it printed no interval"
 LEAD = 3
 """Samples before the first interval from one run to the next."""
 
@@ -70,7 +71,7 @@ def linuxcnc(grid: WakeGrid) -> np.ndarray:
             raise Failure(f"{LINUXCNC}: still running after {grid.patience_s:g} s") from None
     found = np.array([line for line in out.split() if line.lstrip("-").isdigit()][LEAD:], np.int64)
     if not len(found):
-        raise Failure(f"{LINUXCNC}: {_reason(err)}")
+        raise Failure(f"{LINUXCNC}: {last_line(err, SILENT)}")
     return lateness_us(found, grid.period_ns)
 
 
@@ -144,7 +145,7 @@ def _await_thread(hal: subprocess.Popen[str], others: frozenset[int]) -> int:
         time.sleep(0.02)
     if hal.poll() is None:
         raise Failure(f"{LINUXCNC}: it started no thread within {START_S:g} s")
-    raise Failure(f"{LINUXCNC}: {_reason(hal.communicate()[1])}")
+    raise Failure(f"{LINUXCNC}: {last_line(hal.communicate()[1], SILENT)}")
 
 
 def _threads() -> frozenset[int]:
@@ -163,8 +164,3 @@ def _schedule(thread: int, grid: WakeGrid) -> None:
     with suppress(PermissionError, ProcessLookupError):
         os.sched_setaffinity(thread, {grid.cores[0]})
         os.sched_setscheduler(thread, policy, os.sched_param(grid.priority))
-
-
-def _reason(errors: str) -> str:
-    lines = [line for line in errors.splitlines() if line.strip()]
-    return lines[-1] if lines else "it printed no interval"
