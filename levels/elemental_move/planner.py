@@ -28,7 +28,7 @@ from rack.levels.messages import (
 from rack.levels.motion.path import Path
 from rack.levels.planning.moves import Move, Situation, read_window
 from rack.levels.planning.pose import Pose, pose
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
 
 ACKNOWLEDGED_CYCLES = 2
@@ -95,7 +95,7 @@ class ElementalMovePlanner(Planner):
         from rack.levels.planning.motion_planner import MotionPlanner
 
         self._params = read_params(ElementalMoveParams, context.params)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._published: list[Published] = []
         self._job: PlanningJob | None = None

@@ -39,7 +39,7 @@ from rack.levels.primitive.tracking import (
     Tracking,
 )
 from rack.levels.primitive.work import GripperWork, PathWork, PrimitiveParams, WorkCycle, WorkRules
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
 
 Work = PathWork | GripperWork
@@ -75,7 +75,7 @@ class PrimitiveExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         params = read_params(PrimitiveParams, context.params)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
         self._guard = Guard(cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s)
         self._gripper = context.robot.gripper

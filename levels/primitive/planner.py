@@ -14,7 +14,7 @@ from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory, make_trajectory
 from rack.levels.primitive.segment import MotionSegment, SegmentFault, read_segment, window
 from rack.levels.primitive.work import PrimitiveParams, WorkRules
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
 
 
@@ -31,7 +31,7 @@ class PrimitivePlanner(Planner):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        limits = build_cell(context.robot, context.scene, context.clock_ns).limits
+        limits = cell_of(context).limits
         self._positions = limits.position
         params = read_params(PrimitiveParams, context.params)
         self._rules = WorkRules(context.robot.joints, limits, params, context.period_s)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
+from rack.levels.level import LevelContext
 from rack.levels.robot import lookup
 from rack.levels.robot.hand import Hand, find_hand, fit_tendons
 from rack.levels.robot.limits import (
@@ -97,6 +98,11 @@ def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     """
     cell = _compiled(robot, scene, clock_ns)
     return replace(cell, model=copy(cell.model))
+
+
+def cell_of(context: LevelContext) -> Cell:
+    """Build the cell of a level's rack. Raises as `build_cell`."""
+    return build_cell(context.robot, context.scene, context.clock_ns)
 
 
 @lru_cache(maxsize=4)

@@ -31,7 +31,7 @@ from rack.levels.errors import RobotError
 from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
 from rack.levels.messages import SCENE, Error
 from rack.levels.operator import Operation, Orders
-from rack.levels.robot.cell import build_cell, sensed_by
+from rack.levels.robot.cell import cell_of, sensed_by
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
@@ -91,7 +91,7 @@ class ArmDriver(Executor):
         every = context.every
         robot = context.robot
         kind = find_arm(params.arm)
-        cell = sensed_by(build_cell(robot, context.scene, context.clock_ns), robot, kind.sensors)
+        cell = sensed_by(cell_of(context), robot, kind.sensors)
         self.cell = cell
         self.arm: Arm = kind(cell, context.scene, context.clock_ns, every, context.seed)
         self.part = robot.bring_up or 1.0  # of full speed, until the operator's release
@@ -151,7 +151,7 @@ class ArmDriver(Executor):
         robot = context.robot
         given = context.params.get("arm")
         if given is not None and not find_arm(given).keeps_limits:
-            cell = build_cell(robot, context.scene, context.clock_ns)
+            cell = cell_of(context)
             try:
                 own = sensed_by(cell, robot, find_arm(given).sensors)
                 kept_bounds(own, robot.joints, robot.bring_up or 1.0)

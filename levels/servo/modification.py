@@ -27,7 +27,7 @@ from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.operator import NAME_BYTES
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.servo.curves import Motion
 from rack.levels.tables import Positive, Table, named_class, read_params
 
@@ -203,7 +203,7 @@ def misfits_of(context: LevelContext) -> Iterable[tuple[str, Any, str]]:
     )
     if not params.modifications:
         return
-    torque = build_cell(context.robot, context.scene, context.clock_ns).bounds.torque
+    torque = cell_of(context).bounds.torque
     for name, entry in params.modifications.items():
         try:
             entry.kind(LawContext(context.robot.joints, context.period_s, torque, entry.params))

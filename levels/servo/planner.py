@@ -9,7 +9,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array, mat_vec, transposed_mat_vec
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
 
 
@@ -25,7 +25,7 @@ class ServoPlanner(Planner):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         self._dynamics = Dynamics(cell)
         self._home = cell.home
         self._objects = len(cell.object_qpos)

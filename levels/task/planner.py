@@ -13,7 +13,7 @@ from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports, Program
 from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
 from rack.levels.planning.moves import Situation
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, TaskConfig, TaskParams, read_program
 from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times, pipeline_periods
@@ -58,7 +58,7 @@ class TaskPlanner(Planner):
         self._ahead_s = 0.0  # the time of the program's `by`, less simulated time here
         self._needs = read_params(self.params, context.params)
         self._periods = pipeline_periods(context)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._plan: Message | None = None  # made by this process
         self._visible_at = 0  # tick from which it is visible

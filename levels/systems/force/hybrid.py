@@ -9,7 +9,7 @@ from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import reference
 from rack.levels.servo.reference import Reference
@@ -58,7 +58,7 @@ class HybridExecutor(WristLevel):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         assert cell.wrist is not None, "`misfits` refuses an arm without a sensor"
         self._watch = ComplianceWatch(cell.wrist.most, context.every)
         self._law = HybridLaw(cell, read_params(HybridGains, context.params))

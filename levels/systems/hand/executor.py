@@ -18,7 +18,7 @@ from rack.levels.faults import TendonStep
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import ARM_STATE, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
 from rack.levels.servo.driver import SCENES
@@ -54,7 +54,7 @@ class HandExecutor(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         assert cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand = SimulatedHand(
             cell, context.scene, context.clock_ns, context.every, context.seed

@@ -15,7 +15,7 @@ from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Po
 from rack.levels.messages import WORLD_MODEL, Error
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.planning.pose import Pose
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.systems.hand.fingers_below import FingersBelow
 from rack.levels.systems.hand.grasp_program import (
     CloseStep,
@@ -71,7 +71,7 @@ class GraspExecutor(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         assert cell.hand is not None, "checked with the config"
         self._program = GraspProgram.model_validate(dict(context.task))
         kinematics = FingerKinematics(cell, cell.hand)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, LevelContext, Misfits, Ports, Reading
 from rack.levels.operator import BELOW_LOST, Operation, Orders
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
 
 NO_HAND_YET = "no status of the hand yet: waiting for its board"
@@ -33,7 +33,7 @@ class HandLoop(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self.cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self.cell = cell_of(context)
         assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand: Hand = self.cell.hand
         self.orders = Orders(self.commands)

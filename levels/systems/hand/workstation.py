@@ -22,7 +22,7 @@ from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext
 from rack.levels.messages import WORLD_MODEL
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.systems.hand.grasp_planner import GraspPlanner, GraspRules, PlannedGrasp
 from rack.levels.systems.hand.messages import GRASP_PLAN, GRASP_STATUS, HAND_STATUS, GraspKind
 from rack.levels.systems.hand.picture import HandPicture, HandScene
@@ -67,7 +67,7 @@ class Workstation(HostProgram):
             known = ", ".join(context.scene.objects) or "none"
             raise LevelError(f"params.object = {p.object}: not in the scene; objects: {known}")
         self._row = context.scene.objects.index(p.object)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         assert cell.hand is not None, "a cell with a hand"
         self._hand = cell.hand
         self._planner = GraspPlanner(cell, p.opposing, p.rules)

@@ -16,7 +16,7 @@ from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports
 from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.servo import reference
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
@@ -76,7 +76,7 @@ class JointServo(Executor):
         super().__init__(context)
         self._given = params = read_params(JointServoParams, context.params)
         robot = context.robot
-        cell = build_cell(robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         names = robot.joints if params.joints is None else params.joints
         self._driven = np.array([name in names for name in robot.joints])
         self._constants = constants = np.zeros((5, len(robot.joints)))  # rows of `servo_joints`

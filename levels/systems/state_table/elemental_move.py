@@ -19,7 +19,7 @@ from rack.levels.messages import WORLD_MODEL
 from rack.levels.operator import OPERATOR_COMMAND
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pointing, yaw_of
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.systems.state_table.level import (
     BELOW,
     STATUS_HEAD,
@@ -121,7 +121,7 @@ class MoveTable(StateTableExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._cell = build_cell(context.robot, context.scene, context.clock_ns)
+        self._cell = cell_of(context)
         self._ik = InverseKinematics(self._cell, context.seed)
         # The newest command sent down: it aims at a place, unless `object` is a row.
         self._command = Message(JOINT_MOVE.dtype(context.sizes))

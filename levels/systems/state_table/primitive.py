@@ -15,7 +15,7 @@ from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.operator import OPERATOR_COMMAND
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo import curves
 from rack.levels.servo.curves import Curve, Passage, Ramp
@@ -123,7 +123,7 @@ class PrimitiveTable(StateTableExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         if context.robot.gripper is None:
             raise RobotError("the level works a gripper, and [robot] has none")
         self._gripper = context.robot.gripper

@@ -16,7 +16,7 @@ from rack.levels.messages import WORLD_MODEL
 from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
@@ -68,7 +68,7 @@ class TrajectoryExecutor(Executor):
         super().__init__(context)
         params = read_params(self.params, context.params)
         robot = context.robot
-        cell = build_cell(robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         self._ik = InverseKinematics(cell, context.seed)
         self._sight = WorldSight(context.scene.bodies, params.blind, context.tick_s)
         tools = MotionTools(self._ik, cell.limits, self._sight, params, context.period_s)

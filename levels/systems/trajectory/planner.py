@@ -19,7 +19,7 @@ from rack.levels.level import Executor, Input, LevelContext, Output, Planner, Po
 from rack.levels.messages import TASK_STATUS, WORLD_MODEL
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pose
-from rack.levels.robot.cell import build_cell
+from rack.levels.robot.cell import cell_of
 from rack.levels.systems.trajectory.messages import HELD, MOTION_REQUEST, MOTION_STATUS, MotionKind
 from rack.levels.systems.trajectory.program import (
     CancelStep,
@@ -103,7 +103,7 @@ class RequestPlanner(Planner):
         super().__init__(context)
         self._steps = self.program.read(context.task, context.robot, context.scene).step
         self._ahead = read_params(PlanningParams, context.params).ahead
-        cell = build_cell(context.robot, context.scene, context.clock_ns)
+        cell = cell_of(context)
         self._ik = InverseKinematics(cell, context.seed)
         self._home = cell.home
         self._upright = self._ik.tool_at(cell.home).quaternion
