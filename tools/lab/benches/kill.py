@@ -11,9 +11,9 @@ from typing import NamedTuple
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
+from rack.boards.config.cell import built_cell
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.kind import DIED
-from rack.levels.robot.cell import build_cell
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.faults.campaigns.plan import Kill
@@ -100,7 +100,7 @@ class Killing:
             raise Failure(f"{name}: no arm whose brakes could engage", 2)
         self.boards = servo, above[0]
         self._config = config
-        cell = build_cell(config.robot, config.scene, config.clock_ns)
+        cell = built_cell(config)
         self._patience = cell.patience.ticks(config.every(servo), config.clock_ns * 1e-9)
         self._random = Random(kills)
 

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from rack.levels.robot.cell import STATE, Cell, build_cell
+from rack.boards.config.cell import built_cell
+from rack.levels.robot.cell import STATE, Cell
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.harness import pinned
 from rack.tools.recording.recording import Recording
@@ -54,8 +55,7 @@ class Replay:
         """Take it from a recording without missed cycles. Raises `Failure` if the arm never moved
         in it."""
         config = recording.rack_config
-        assert config.robot is not None, "the rack has an arm"
-        cell = build_cell(config.robot, config.scene, config.clock_ns)
+        cell = built_cell(config)
         first, last = _stretch(recording)
         status = f"{SERVO}.status"
         state = f"{SERVO}.state"

@@ -20,11 +20,11 @@ from rack.backplane.layout import Layout
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.boards.config import RackConfig, load, wire
+from rack.boards.config.cell import built_cell
 from rack.boards.config.files import CONFIGS, file_at, read
 from rack.boards.config.schema import CommandConfig
 from rack.levels.algebra import Array, norm
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.robot.cell import build_cell
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import UNVIEWED, Deed, observe, record
@@ -190,9 +190,7 @@ class PosesBench:
 
     def _tool_error(self, position: np.ndarray, target: np.ndarray) -> float:
         """Return the largest distance of the tool from its target, m."""
-        robot = self._config.robot
-        assert robot is not None, "it has an arm"
-        ik = InverseKinematics(build_cell(robot, self._config.scene, self._layout.clock_ns), 0)
+        ik = InverseKinematics(built_cell(self._config), 0)
         some = np.unique(np.linspace(0, len(position) - 1, TOOL_SAMPLES, dtype=int))
         pairs = [(ik.tool_at(position[k]).position, ik.tool_at(target[k]).position) for k in some]
         return max(float(norm(is_at - wanted)) for is_at, wanted in pairs)
