@@ -111,6 +111,8 @@ ANSWER = (
 """Fields of a status that answer an operator."""
 
 Commands = Mapping[Operation, Sequence[Goal]]
+HOLDABLE: Commands = {Operation.HOLD: (), Operation.RESUME: ()}
+"""The commands of a level that an operator can only hold."""
 
 EFFECTS = {
     Operation.HOLD: "held",
@@ -187,6 +189,16 @@ class Orders:
     def answer(self) -> Answer:
         """The answer to that command."""
         return self._in_force.answer
+
+    @property
+    def stands(self) -> bool:
+        """Whether a command keeps the level from its own work."""
+        return self.standing is not Operation.NONE
+
+    @property
+    def holds(self) -> bool:
+        """Whether that is HOLD."""
+        return self.standing is Operation.HOLD
 
     def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
         """Read the mailbox; return True in the cycle that accepts a command other than a setting.

@@ -23,8 +23,8 @@ from rack.levels.operator import (
     ABOVE_LOST,
     BELOW_LOST,
     HELD_FROM_ABOVE,
+    HOLDABLE,
     OPERATOR_COMMAND,
-    Operation,
     Orders,
 )
 from rack.levels.tables import GripperConfig, read_params
@@ -49,7 +49,7 @@ class ElementalMoveExecutor(Executor):
     # The status first: a board killed between the two finds done moves still in its window, and
     # removes them again.
     outputs = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = HOLDABLE
     params = ElementalMoveParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -86,9 +86,7 @@ class ElementalMoveExecutor(Executor):
             self._fill(command.value, segments, tick)
         if self._error:
             segments.clear()
-        held = (
-            command.is_lost or bool(command.value.hold) or self._orders.standing is Operation.HOLD
-        )
+        held = command.is_lost or bool(command.value.hold) or self._orders.holds
         write.command.hold = self._request > 0 or self._error > 0 or held
         self._report(read, segments, write.status)
         self._answer(read, write)
@@ -262,7 +260,7 @@ class ElementalMoveExecutor(Executor):
             report.state = State.HOLDING
         report.error = self._error
         report.reason = self._reason if self._error else waits
-        report.operated = status.operated or self._orders.standing is not Operation.NONE
+        report.operated = status.operated or self._orders.stands
         self._report_move(command, status, segments, report)
         self._report_plans(command, status, segments, report)
         report.replan = self._request
@@ -314,7 +312,7 @@ class ElementalMoveExecutor(Executor):
     def _reason_to_wait(self, command: Reading, below: Reading) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
-        if self._orders.standing is not Operation.NONE:
+        if self._orders.stands:
             return self._orders.keeps(self.context.board)
         if command.is_lost:
             return ABOVE_LOST

@@ -18,7 +18,7 @@ from rack.levels.messages import (
     SegmentKind,
 )
 from rack.levels.motion import path as paths
-from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.planning import collision
 from rack.levels.primitive.guard import Guard, Sight
 from rack.levels.primitive.path_motion import JointSetPoint
@@ -68,7 +68,7 @@ class PrimitiveExecutor(Executor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"command": JOINT_SET_POINT, "status": PRIMITIVE_STATUS}
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = HOLDABLE
     preloads = (collision, paths)
     params = PrimitiveParams
 
@@ -159,11 +159,7 @@ class PrimitiveExecutor(Executor):
 
     def _do_segments(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish, drop, begin or advance it."""
-        hold = (
-            bool(read.command.value.hold)
-            or read.command.is_lost
-            or self._orders.standing is Operation.HOLD
-        )
+        hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.holds
         if read.status.is_new:
             self._finish(read.status.value, tick)
             self._straying.update(read.status.value)
@@ -309,11 +305,7 @@ class PrimitiveExecutor(Executor):
             path_work.progress if path_work is not None else memory.progress * bool(interrupted)
         )
         servo = read.status.value
-        status.operated = (
-            self._orders.standing is not Operation.NONE
-            or servo.standing > 0
-            or servo.error == Error.DISABLED
-        )
+        status.operated = self._orders.stands or servo.standing > 0 or servo.error == Error.DISABLED
         # Out of step, the world is not the reason why motion holds.
         status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
         status.resting = path_work is None or path_work.motion.resting
@@ -333,7 +325,7 @@ class PrimitiveExecutor(Executor):
             return self._tracking.awaited(read.status.value)
         if isinstance(work, GripperWork):
             return ""
-        if self._orders.standing is not Operation.NONE:
+        if self._orders.stands:
             return self._orders.keeps(self.context.board)
         if work is not None:
             blocked = f"blocked: {work.obstacle}" if work.blocked else ""

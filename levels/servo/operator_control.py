@@ -57,9 +57,9 @@ class OperatorControl:
         self._position[:] = position
         if not self.orders.take(operator, self._judge):
             return
-        if self.orders.standing is Operation.NONE and self._way:
+        if not self.orders.stands and self._way:
             self.orders.under_way()
-        self.stands = self.orders.standing is not Operation.NONE or bool(self._way)
+        self.stands = self.orders.stands or bool(self._way)
 
     def forget(self) -> None:
         """Forget the way back: the level above continues from where the arm is."""
@@ -70,13 +70,9 @@ class OperatorControl:
         """Why the arm does not follow the level above; empty: it does."""
         if not self.stands:
             return ""
-        if self.orders.standing is Operation.NONE:
+        if not self.orders.stands:
             return "returning to where the operator took over, then follows the level above"
-        what = (
-            "held"
-            if self.orders.standing is Operation.HOLD
-            else f"at the {self.orders.standing.name.lower()}"
-        )
+        what = "held" if self.orders.holds else f"at the {self.orders.standing.name.lower()}"
         return f"{what} by the operator; `resume` releases it"
 
     def _judge(self, command: Message) -> None:
@@ -111,12 +107,12 @@ class OperatorControl:
         """Return the goal of the joints, (joints,), rad; None: they stay."""
         if self.orders.standing is Operation.SETPOINT:
             return self._goal
-        return self._way[-1] if self.orders.standing is Operation.NONE and self._way else None
+        return self._way[-1] if not self.orders.stands and self._way else None
 
     def _arrive(self) -> None:
         """React to the arm's arrival at its goal."""
-        if self.orders.standing is Operation.NONE and self._way:
+        if not self.orders.stands and self._way:
             self._way.pop()
-        if self.orders.standing is not Operation.NONE or not self._way:
-            self.stands = self.orders.standing is not Operation.NONE
+        if self.orders.stands or not self._way:
+            self.stands = self.orders.stands
             self.orders.done()

@@ -143,7 +143,7 @@ class TaskExecutor(Executor):
         orders = self._orders
         if orders.standing is Operation.GOTO:
             return self._detour.reason()
-        if orders.standing is not Operation.NONE:
+        if orders.stands:
             return orders.keeps(self.context.board)
         if below.is_lost:
             return BELOW_LOST
@@ -163,7 +163,7 @@ class TaskExecutor(Executor):
             self._detour.move,
         )
         progress = (*progress, *self._stage())
-        operated = below.operated or self._orders.standing is not Operation.NONE
+        operated = below.operated or self._orders.stands
         if operated or progress != self._progress:
             self._progress = progress
             self._moved_at = tick
@@ -222,9 +222,9 @@ class TaskExecutor(Executor):
         """Obey and answer the operator, and pass down the newest command on which this cycle is
         based."""
         orders = self._orders
-        write.command.hold = orders.standing is Operation.HOLD or self._detour.holds
+        write.command.hold = orders.holds or self._detour.holds
         write.command.operator = orders.rests_on(0)
-        if orders.standing is Operation.HOLD and below.resting and below.operator >= orders.basis:
+        if orders.holds and below.resting and below.operator >= orders.basis:
             orders.done()
         orders.report(write.status)
 

@@ -19,7 +19,7 @@ from rack.levels.level import (
     Reading,
 )
 from rack.levels.messages import TASK_STATUS, Error
-from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.systems.cell.actions import write_action
 from rack.levels.systems.cell.agreement import Agreement
 from rack.levels.systems.cell.messages import (
@@ -72,7 +72,7 @@ class Coordinator(Executor):
     # The progress first: a board killed before it has written its orders writes them when it is
     # back.
     outputs = {"progress": CELL_PROGRESS, "status": TASK_STATUS}
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = HOLDABLE
     params = CoordinatorParams
     program = CellProgram
 
@@ -154,7 +154,7 @@ class Coordinator(Executor):
 
     def _reason_to_hold(self) -> str:
         """Return why the arms are to rest on their paths; empty: they are not."""
-        if self._operated.standing is Operation.HOLD:
+        if self._operated.holds:
             return self._operated.keeps(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):
             return ""
@@ -183,9 +183,7 @@ class Coordinator(Executor):
         going on."""
         agreement = self._agreement
         reports = [reading.value for reading in self._readings.values()]
-        operated = self._operated.standing is not Operation.NONE or any(
-            report.operated for report in reports
-        )
+        operated = self._operated.stands or any(report.operated for report in reports)
         stage = (
             agreement.phase,
             agreement.order,
@@ -232,6 +230,6 @@ class Coordinator(Executor):
         fill_counts(
             status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves)
         )
-        if self._operated.standing is Operation.HOLD:
+        if self._operated.holds:
             self._operated.done()
         self._operated.report(status)

@@ -15,7 +15,6 @@ from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.levels.errors import ProgramError, Refused
 from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
 from rack.levels.messages import TASK_PLAN, WORLD_MODEL, Error
-from rack.levels.operator import Operation
 from rack.levels.peer import PEER, peer_port
 from rack.levels.systems.cell.actions import copy_action, read_action
 from rack.levels.systems.cell.messages import (
@@ -141,7 +140,7 @@ class OrderedTaskExecutor(TaskExecutor):
         write.status.echo = plan.id if plan.id == request.id else 0
         self._fill_times(plan, request, write.report)
         below = read.status.value
-        write.report.operated = below.operated or self._orders.standing is not Operation.NONE
+        write.report.operated = below.operated or self._orders.stands
         return plan if self._begun and self._begun == plan.id else self._nothing
 
     def _listen(self, reading: Reading) -> None:
@@ -204,7 +203,7 @@ class OrderedTaskExecutor(TaskExecutor):
 
     def _not_ready(self, read: Ports) -> str:
         """Return why nothing can be planned now; empty: it can."""
-        if self._orders.standing is not Operation.NONE or not read.status.value.resting:
+        if self._orders.stands or not read.status.value.resting:
             return "the arm does not rest yet"
         if not read.world.value.revision:
             return "the world model knows nothing yet"
@@ -257,7 +256,7 @@ class OrderedTaskExecutor(TaskExecutor):
 
     def _reason_to_wait(self, below: Reading) -> str:
         waits = super()._reason_to_wait(below)
-        if self._orders.standing is not Operation.NONE:
+        if self._orders.stands:
             return waits
         return self._absent or self._held or waits or self._waits
 

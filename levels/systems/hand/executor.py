@@ -17,7 +17,7 @@ from rack.levels.arm.above import CommandsAbove
 from rack.levels.faults import TendonStep
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import ARM_STATE, Error
-from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
@@ -47,7 +47,7 @@ class HandExecutor(Executor):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"status": HAND_STATUS, "state": ARM_STATE, "scene": SCENES}
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = HOLDABLE
     params = Table
     faults = (TendonStep,)
     preloads = (substeps, poses)
@@ -147,7 +147,7 @@ class HandExecutor(Executor):
             self.tensions.join(read.tensions)
             found, self._waiting = self.tensions.check()
             self._find(found)
-        held = self.orders.standing is Operation.HOLD
+        held = self.orders.holds
         if held and not self._waiting:
             self._waiting = HELD
         if self.demand is not Demand.NONE:

@@ -13,7 +13,7 @@ from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Ports, Reading
 from rack.levels.messages import WORLD_MODEL, Error
-from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import cell_of
 from rack.levels.systems.hand.fingers_below import FingersBelow
@@ -65,7 +65,7 @@ class GraspExecutor(Executor):
         "command": Output(GRASP_TARGET, rests_on="fingers"),
         "status": Output(GRASP_STATUS, rests_on="fingers"),
     }
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = HOLDABLE
     params = GraspParams
     program = GraspProgram
 
@@ -175,7 +175,7 @@ class GraspExecutor(Executor):
         """Return why the step under way does not go on; empty: it does."""
         if self._grasp.fingers.awaited:
             return self._grasp.fingers.awaited
-        if self._orders.standing is Operation.HOLD:
+        if self._orders.holds:
             self._orders.done()
             return self._orders.keeps(self.context.board)
         if read.world.is_lost or (self._closing() is not None and self._grasp.object is None):
@@ -186,7 +186,7 @@ class GraspExecutor(Executor):
 
     def _count_waiting(self, waits: str) -> None:
         """Fail when something has kept the program for too long."""
-        is_over = self._done == len(self._program.step) or self._orders.standing is Operation.HOLD
+        is_over = self._done == len(self._program.step) or self._orders.holds
         self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
         if self._waited_s > self._grasp.params.stalled and not self._failed.code:
             self._failed = Refused(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, LevelContext, Misfits, Ports, Reading
-from rack.levels.operator import BELOW_LOST, Operation, Orders
+from rack.levels.operator import BELOW_LOST, HOLDABLE, Orders
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
 
@@ -29,7 +29,7 @@ class HandLoop(Executor):
     subclass has the ports "command", "hand", "operator" and, unless the hand is below it, "below".
     """
 
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = HOLDABLE
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -107,7 +107,7 @@ class HandLoop(Executor):
     def _take(self, command: Reading, tick: int) -> None:
         """Follow what is new, unless an operator holds the loop."""
         released = self._held
-        self._held = self.orders.standing is Operation.HOLD
+        self._held = self.orders.holds
         if self._held:
             for name in self._numbers:
                 if name.endswith("velocity"):  # what is commanded is kept at rest

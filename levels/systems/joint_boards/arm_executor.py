@@ -14,7 +14,7 @@ from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.level import Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import ARM_STATE
-from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import DRIVES, HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams
 from rack.levels.servo.curves import Motion
@@ -44,7 +44,7 @@ class ArmExecutor(ArmDriver):
         "operator": Input(OPERATOR_COMMAND, "own.operator"),
     }
     outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
-    commands = {Operation.HOLD: (), Operation.RESUME: (), **dict.fromkeys(DRIVES, ())}
+    commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
     preloads: ClassVar[tuple[ModuleType, ...]] = (joint_torques,)
 
@@ -107,7 +107,7 @@ class ArmExecutor(ArmDriver):
         if self.arm.braked and self._braked_at is None:
             self._waiting = "braked until the boards above have seen it"
             return None
-        stops = reaction > 0 or self.orders.standing is Operation.HOLD
+        stops = reaction > 0 or self.orders.holds
         self._defied = self._defied and stops
         if self._defied or (reaction is Reaction.STOP and self.abandoned):
             return None
@@ -123,7 +123,7 @@ class ArmExecutor(ArmDriver):
             self._waiting = "braked: the boards above did not bring it to rest"
             return None
         self._braked_at = None
-        if self.orders.standing is Operation.HOLD and not self.joints.moves:
+        if self.orders.holds and not self.joints.moves:
             self.orders.done()
         return self.joints.wanted
 
@@ -181,7 +181,7 @@ class ArmExecutor(ArmDriver):
 
     def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
         """Return what the status says of the torques from above."""
-        held = self.orders.standing is Operation.HOLD
+        held = self.orders.holds
         kept = self.stopping.reason or self._waiting
         if held and not kept:
             kept = HELD

@@ -324,7 +324,7 @@ class StateTableExecutor(Executor):
             self._hear(above)
         elif orders.standing is not Operation.DO:
             self._newest = self._taken
-        if orders.standing is Operation.HOLD:
+        if orders.holds:
             self._kept = orders.keeps(self.context.board)
 
     def _hear(self, above: Reading) -> None:
@@ -393,7 +393,7 @@ class StateTableExecutor(Executor):
         shown.fired = row.name
         shown.words = words
         shown.done = self._done
-        is_done = self.resting if orders.standing is Operation.HOLD else state is State.DONE
+        is_done = self.resting if orders.holds else state is State.DONE
         if is_operators and serial == orders.in_force and state is State.ERROR:
             orders.fail(reason)
         elif is_done:

@@ -13,7 +13,7 @@ from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
 from rack.levels.messages import WORLD_MODEL
-from rack.levels.operator import OPERATOR_COMMAND, Operation, Orders
+from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
@@ -58,7 +58,7 @@ class TrajectoryExecutor(Executor):
         "status": Output(MOTION_STATUS, rests_on="boards"),
         "state": MOTION_STATE,
     }
-    commands = {Operation.HOLD: (), Operation.RESUME: ()}
+    commands = HOLDABLE
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
     preloads = (dynamics,)
     work: ClassVar[type[RequestWork]] = RequestWork
@@ -107,7 +107,7 @@ class TrajectoryExecutor(Executor):
         if cancelled:
             self._work.cancel()
         self._watch(read, cycles)
-        hold = self._orders.standing is Operation.HOLD
+        hold = self._orders.holds
         # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the
         # boards hold.
         for late in reversed(range(min(cycles, HANDOVER_CYCLES))):
@@ -194,7 +194,7 @@ class TrajectoryExecutor(Executor):
     def _reason_to_wait(self) -> str:
         if not self._boards.in_step:
             return self._boards.awaited
-        if self._orders.standing is not Operation.NONE:
+        if self._orders.stands:
             return self._orders.keeps(self.context.board)
         if self._agenda.missing:
             return (
