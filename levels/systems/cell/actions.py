@@ -9,9 +9,9 @@ from pydantic import TypeAdapter, ValidationError
 
 from rack.backplane.message import Message
 from rack.levels.errors import ProgramError
+from rack.levels.level import LevelContext
 from rack.levels.operator import Goal
 from rack.levels.systems.cell.messages import ACTION_FIELDS, OrderAction
-from rack.levels.tables import RobotConfig, SceneConfig
 from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, misfits
 
 _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
@@ -53,7 +53,7 @@ def copy_action(source: Message, target: Message) -> None:
         target.record[field.name] = source.record[field.name]
 
 
-def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> AnyAction:
+def read_action(message: Message, context: LevelContext) -> AnyAction:
     """Return the action in the `ACTION_FIELDS` of a message. Raises `ProgramError`: it does not
     suit arm or scene."""
     try:
@@ -61,7 +61,10 @@ def read_action(message: Message, robot: RobotConfig, scene: SceneConfig) -> Any
     except ValidationError as error:
         lines = [f"{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
         raise ProgramError("\n".join(lines)) from error
-    if found := [f"{key} = {value!r}: {why}" for key, value, why in misfits(action, robot, scene)]:
+    if found := [
+        f"{key} = {value!r}: {why}"
+        for key, value, why in misfits(action, context.robot, context.scene)
+    ]:
         raise ProgramError("\n".join(found))
     return action
 

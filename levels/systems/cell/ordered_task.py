@@ -179,7 +179,7 @@ class OrderedTaskExecutor(TaskExecutor):
         ahead_s = float(read.peer.value.ahead) if self._table.coordinator else 0.0
         now_s = tick * self.context.tick_s
         try:
-            action = read_action(order, self.context.robot, self.context.scene)
+            action = read_action(order, self.context)
         except ProgramError as error:
             taken.fail(Error.UNREACHABLE, str(error))
             return
@@ -231,7 +231,7 @@ class OrderedTaskExecutor(TaskExecutor):
             self._orders_begun += 1
 
     def _take_action(self, request: Message) -> None:
-        self._actions = (read_action(request, self.context.robot, self.context.scene),)
+        self._actions = (read_action(request, self.context),)
         self._ahead_s = request.ahead
 
     def _step_aside(self, plan: Message, below: Message) -> int:
@@ -361,7 +361,7 @@ class OrderedTaskPlanner(TaskPlanner):
         request: Message = read.request.value
         if request.id not in (0, self._id):
             # Whoever requests it has found that it suits the arm.
-            action = read_action(request, self.context.robot, self.context.scene)
+            action = read_action(request, self.context)
             self._program = TaskConfig(action=(action,))
             self._id = request.id
             self._plan = None
