@@ -170,18 +170,18 @@ class ForceMotions(Motions):
 
     def wrench(self) -> Mapping[str, float]:
         """Return the wrench of the tool on the surroundings, N, N m, by axis of the task frame."""
-        values = self._bus.read("motion").value.wrench
+        values = self._status.wrench
         return {
             name: round(float(value), 3) for name, value in zip(AXIS_NAMES, values, strict=True)
         }
 
     def mode(self) -> Mode:
         """Return what the server does."""
-        return Mode(self._bus.read("motion").value.mode)
+        return Mode(self._status.mode)
 
     def where(self) -> list[float]:
         """Return the tool position as sensed, m."""
-        return [round(float(x), 4) for x in self._bus.read("motion").value.place]
+        return [round(float(x), 4) for x in self._status.place]
 
     def _wanted(self, call: str, name: str, changes: Mapping[str, Any]) -> Wanted:
         """Return a contact of the program, with changes. Raises `LevelError`."""

@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
+from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext
@@ -136,14 +137,14 @@ class Motions:
 
     def end_of(self, request: int) -> RequestEnd:
         """Return how a request ended: NONE until it has, or if it is too long ago."""
-        status = self._bus.read("motion").value
+        status = self._status
         ends = dict(zip(status.ended.tolist(), status.ends.tolist(), strict=True))
         return RequestEnd(ends.get(request, RequestEnd.NONE))
 
     def done(self, request: int | None = None) -> bool:
         """Return whether a request, by default the newest, has ended."""
         number = self._newest if request is None else request
-        return bool(self._bus.read("motion").value.done >= number)
+        return bool(self._status.done >= number)
 
     def wait(self, request: int | None = None, until: Callable[[], bool] = lambda: False) -> bool:
         """Wait until a request, by default the newest, has ended; False if `until` holds before, or
@@ -156,7 +157,12 @@ class Motions:
 
     def where(self) -> list[float]:
         """Return the tool position commanded last, m."""
-        return [round(float(x), 4) for x in self._bus.read("motion").value.tool]
+        return [round(float(x), 4) for x in self._status.tool]
+
+    @property
+    def _status(self) -> Message:
+        """The newest `MOTION_STATUS`, or that of the level in its place."""
+        return self._bus.read("motion").value
 
     def _request(self, **fields: Any) -> int:
         request = {"body": WORLD, **fields, "id": self._newest + 1}
@@ -172,7 +178,7 @@ class Motions:
         """Wait for news; send the requests again that are lost: nothing is under way, and not all
         are done."""
         self._bus.wait(LOOK_S)
-        status = self._bus.read("motion").value
+        status = self._status
         now = self._bus.time_s
         self._open = {
             number: request for number, request in self._open.items() if number > status.done
