@@ -43,7 +43,6 @@ from rack.tools.lab.reproduction.sections.page import (
     DONE,
     Assessment,
     Chapter,
-    Findings,
     Ruling,
 )
 from rack.tools.lab.reproduction.sections.sharing import judge_background, judge_loose
@@ -80,7 +79,7 @@ def judged(chapter: Chapter, name: str, experiment: Experiment[Found], found: Fo
     file."""
     (statement,) = [one for one in chapter.statements if one.name == name]
     kept = json.loads(json.dumps(experiment.document(found)))
-    return statement.tested(Findings({experiment.name: kept}, NOWHERE))
+    return statement.tested({experiment.name: kept}, NOWHERE)
 
 
 def run(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> ComparedRun:

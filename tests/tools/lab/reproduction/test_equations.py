@@ -20,7 +20,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
 )
 from rack.tools.lab.reproduction.sections import timing
 from rack.tools.lab.reproduction.sections.equations import PaperEquation
-from rack.tools.lab.reproduction.sections.page import Columns, Findings, Listing, Ruling
+from rack.tools.lab.reproduction.sections.page import Columns, Listing, Ruling
 
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
 WAY = WayResponse(4.0, Percentiles(1.0, 2.0, 3.0), ())
@@ -69,4 +69,4 @@ def test_an_equation_is_judged_by_the_worst_cycle_and_by_most(
 ) -> None:
     run = NASREM.document(replace(RUN, verdicts=(verdict(holds, mostly),)))
     (fits, *_) = timing.RESPONSE.statements
-    assert fits.tested(Findings({"nasrem": run}, NOWHERE)).ruling is ruling
+    assert fits.tested({"nasrem": run}, NOWHERE).ruling is ruling

@@ -17,7 +17,7 @@ from rack.tools.lab.reproduction.experiments.figures import (
     sweep,
 )
 from rack.tools.lab.reproduction.sections import gantt
-from rack.tools.lab.reproduction.sections.page import Findings, Listing, Plate, Ruling
+from rack.tools.lab.reproduction.sections.page import Listing, Plate, Ruling
 from rack.tools.timing.charts.panel import Count
 
 NOWHERE = Workshop(Path("nowhere"), share=True)
@@ -73,15 +73,15 @@ def document(late: int, jobs: int = 100) -> Document:
 )
 def test_a_figure_that_works_is_judged_by_its_run(late: int, ruling: Ruling) -> None:
     (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2"]
-    assert statement.tested(Findings({"fig2": document(late)}, NOWHERE)).ruling is ruling
+    assert statement.tested({"fig2": document(late)}, NOWHERE).ruling is ruling
 
 
 def test_runs_that_do_not_confirm_the_contradiction_make_it_no_finding() -> None:
     (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2-x"]
     confirmed = {figures.SHORT_2.label: document(0), figures.LONG_2.label: document(100)}
-    assert statement.tested(Findings(confirmed, NOWHERE)).ruling is Ruling.CONTRADICTS
+    assert statement.tested(confirmed, NOWHERE).ruling is Ruling.CONTRADICTS
     assert (
-        statement.tested(Findings({**confirmed, figures.LONG_2.label: document(0)}, NOWHERE)).ruling
+        statement.tested({**confirmed, figures.LONG_2.label: document(0)}, NOWHERE).ruling
         is Ruling.FAILS
     )
 

@@ -25,7 +25,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Findings,
     Plate,
     Requirement,
     Row,
@@ -86,8 +85,7 @@ def _answers(found: TableRuns) -> list[tuple[str, FiredRow]]:
     ]
 
 
-def _earlier_measured(findings: Findings) -> Side:
-    found = findings.of(TABLES)
+def _earlier_measured(workshop: Workshop, found: TableRuns) -> Side:
     extra = [
         (level, text(row.name), row.cycles, f"{row.first_s:g}") for level, row in _answers(found)
     ]
@@ -144,8 +142,7 @@ def _rates(found: NasremRun) -> Iterator[tuple[str, ExecutorCycles, float, float
         yield name, task, PAPER_HZ.get(name, own_hz), own_hz * done / due
 
 
-def _levels_measured(findings: Findings) -> Side:
-    found = findings.of(NASREM)
+def _levels_measured(workshop: Workshop, found: NasremRun) -> Side:
     lasted_s = found.ticks * load(NAME).clock_ns * 1e-9
     rows = [
         (
@@ -209,18 +206,18 @@ def _switch(workshop: Workshop) -> Side:
     return [Columns(head, rows, caption)]
 
 
-def _switch_measured(findings: Findings) -> Side:
-    found = findings.of(SWITCH).cost
+def _switch_measured(workshop: Workshop, found: SwitchRun) -> Side:
+    cost = found.cost
     rows = [
         (name, *(f"{times[part]:.1f}" for part in ("min", "p50", "p99", "max")))
         for name, times in (
-            ("planner to executor", found.in_us),
-            ("executor to planner", found.out_us),
-            ("t<sub>cs</sub>, half of both", found.switch_us),
+            ("planner to executor", cost.in_us),
+            ("executor to planner", cost.out_us),
+            ("t<sub>cs</sub>, half of both", cost.switch_us),
         )
     ]
     head = ("us", "least", "median", "99th percentile", "longest")
-    return [Columns(head, rows, f"Of {found.wakes} switches.")]
+    return [Columns(head, rows, f"Of {cost.wakes} switches.")]
 
 
 def judge_switch(found: SwitchRun) -> ClaimVerdict:
@@ -257,8 +254,7 @@ def _figure5(workshop: Workshop) -> Side:
     ]
 
 
-def _figure5_measured(findings: Findings) -> Side:
-    found = findings.of(PARTITION)
+def _figure5_measured(workshop: Workshop, found: Partitions) -> Side:
     rows = [
         _partition_row(one.partition, level) for one in found.partitions for level in one.levels
     ]

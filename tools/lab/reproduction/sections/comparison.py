@@ -19,7 +19,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Findings,
     Listing,
     Plate,
     Requirement,
@@ -77,8 +76,9 @@ def _promise_row(name: str, said: SystemPrediction) -> Row:
     )
 
 
-def _compared_measured(findings: Findings) -> Side:
-    found = compared([findings.of(one) for one in SYSTEMS])
+def _compared_measured(workshop: Workshop, *each: Systems | TaskRun) -> Side:
+    found = compared([run for run in each if isinstance(run, Systems)])
+    tasks = [run for run in each if isinstance(run, TaskRun)]
     head = (
         "rack",
         "command down",
@@ -92,16 +92,16 @@ def _compared_measured(findings: Findings) -> Side:
         "Responses in ms: longest of a run in real time. A hold is given to the highest level that"
         " takes one."
     )
-    drawn = findings.workshop.shown(found.plot(findings.workshop.folder / PICTURES))
+    drawn = workshop.shown(found.plot(workshop.folder / PICTURES))
     failures = [f"{code(one.rack)}: {text(one.failure)}." for one in found.systems if one.failure]
     ended = [
         (code(name), text(run.ended), f"{run.lasted_s:.1f}", f"{100 * run.missed:.2f}")
-        for name, run in ((name, findings.of(one)) for name, one in TASKS.items())
+        for name, run in zip(TASKS, tasks, strict=True)
     ]
-    tasks = ("rack", "end of its whole task", "after, s", "missed, %")
+    task_head = ("rack", "end of its whole task", "after, s", "missed, %")
     return [
         Columns(head, rows, caption),
-        Columns(tasks, ended, "In real time."),
+        Columns(task_head, ended, "In real time."),
         *failures,
         Plate(
             drawn,

@@ -11,7 +11,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Findings,
     Plate,
     Requirement,
     Row,
@@ -44,8 +43,7 @@ def _predictable(workshop: Workshop) -> Side:
     ]
 
 
-def _predictable_measured(findings: Findings) -> Side:
-    found = findings.of(RESPONSE)
+def _predictable_measured(workshop: Workshop, found: ResponseRun) -> Side:
     head = (
         "given to",
         "commands",
@@ -62,8 +60,7 @@ def _predictable_measured(findings: Findings) -> Side:
         "Holds and resumes at random ticks, in lockstep; ms from giving a command to the end of the"
         " cycle that acts."
     )
-    folder = findings.workshop.folder / PICTURES
-    drawn = findings.workshop.shown(found.realtime.plot(folder))
+    drawn = workshop.shown(found.realtime.plot(workshop.folder / PICTURES))
     return [
         Columns(head, _response_rows(found.lockstep), about),
         Columns(head, _response_rows(found.realtime), "The same in real time."),

@@ -25,7 +25,6 @@ from rack.tools.lab.reproduction.sections.page import (
     SIGNS,
     ClaimVerdict,
     Columns,
-    Findings,
     Listing,
     Requirement,
     Row,
@@ -132,9 +131,11 @@ def table_of(verdicts: list[MeasuredVerdict]) -> Columns:
 
 
 def _measured(
-    equation: PaperEquation, further: Callable[[NasremRun], Side], findings: Findings
+    equation: PaperEquation,
+    further: Callable[[NasremRun], Side],
+    workshop: Workshop,
+    found: NasremRun,
 ) -> Side:
-    found = findings.of(NASREM)
     lasted = found.ticks * load(NAME).clock_ns * 1e-9
     words = (
         f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without"

@@ -31,7 +31,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Findings,
     Listing,
     Plate,
     Requirement,
@@ -136,11 +135,12 @@ def judge_both(tight: FigureRun, loose: FigureRun) -> ClaimVerdict:
     return ruled_strays("cycles of executors late", late, due, why, (planned,))
 
 
-def ran_all(*figures: FigureRack) -> Callable[[Findings], Side]:
+def ran_all(*figures: FigureRack) -> Callable[..., Side]:
     """Return what shows the runs of figures, one after the other."""
 
-    def measured(findings: Findings) -> Side:
-        return [item for one in figures for item in ran(one, findings.of(one.experiment))]
+    def measured(workshop: Workshop, *found: FigureRun) -> Side:
+        runs = zip(figures, found, strict=True)
+        return [item for figure, run in runs for item in ran(figure, run)]
 
     return measured
 

@@ -18,6 +18,7 @@ from rack.tools.lab.reproduction.experiments.figures import (
     FIG4,
     LEVEL,
     PLANNER,
+    FigureRun,
     budget_of,
 )
 from rack.tools.lab.reproduction.experiments.losses import KILLS, SENSORS, LossesRun
@@ -34,7 +35,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Findings,
     Listing,
     Plate,
     Requirement,
@@ -93,8 +93,7 @@ def _passed(found: NasremRun) -> Iterator[tuple[str, str, str, MailboxTraffic]]:
                     yield way, writer, reader, boxes[box.name]
 
 
-def _flow_measured(findings: Findings) -> Side:
-    found = findings.of(NASREM)
+def _flow_measured(workshop: Workshop, found: NasremRun) -> Side:
     rows = [
         (way, code(box.mailbox), writer, reader, f"{box.every_ms:g}", box.due, box.messages)
         for way, writer, reader, box in _passed(found)
@@ -137,8 +136,7 @@ def _loop(workshop: Workshop) -> Side:
     ]
 
 
-def _loop_measured(findings: Findings) -> Side:
-    found = findings.of(NASREM)
+def _loop_measured(workshop: Workshop, found: NasremRun) -> Side:
     head = (
         "level",
         "read plan (C): median",
@@ -189,10 +187,10 @@ def _both(workshop: Workshop) -> Side:
     ]
 
 
-def _both_measured(findings: Findings) -> Side:
+def _both_measured(workshop: Workshop, tight: FigureRun, loose: FigureRun) -> Side:
     rows = []
-    for figure, coupling in ((FIG2, "tightly"), (FIG4, "loosely")):
-        tasks = findings.of(figure.experiment).tasks
+    for figure, coupling, run in ((FIG2, "tightly", tight), (FIG4, "loosely", loose)):
+        tasks = run.tasks
         executor = tasks[LEVEL]
         rows.append(
             (code(figure.label), coupling, tasks[PLANNER].jobs, executor.jobs, executor.late)
@@ -215,8 +213,8 @@ def _bounds(workshop: Workshop) -> Side:
     ]
 
 
-def _bounds_measured(findings: Findings) -> Side:
-    return [_losses(findings.of(one), one.name) for one in (KILLS, SENSORS)]
+def _bounds_measured(workshop: Workshop, kills: LossesRun, sensors: LossesRun) -> Side:
+    return [_losses(kills, KILLS.name), _losses(sensors, SENSORS.name)]
 
 
 def judge_bounds(*runs: LossesRun) -> ClaimVerdict:

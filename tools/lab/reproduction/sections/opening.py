@@ -19,7 +19,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Findings,
     Requirement,
     Row,
     Side,
@@ -48,7 +47,7 @@ def _determined(workshop: Workshop) -> Side:
     ]
 
 
-def _determined_measured(findings: Findings) -> Side:
+def _determined_measured(workshop: Workshop, found: ComparedRuns) -> Side:
     head = (
         "run",
         "mode",
@@ -60,7 +59,7 @@ def _determined_measured(findings: Findings) -> Side:
         "first in",
         "digest",
     )
-    return [Columns(head, [_run_row(run) for run in findings.of(DETERMINISM).runs])]
+    return [Columns(head, [_run_row(run) for run in found.runs])]
 
 
 def judge_determinism(found: ComparedRuns) -> ClaimVerdict:
@@ -133,8 +132,7 @@ def _communication_us(task: ExecutorCycles) -> float:
     return task.phases.exchange.p50 + task.phases.read.p50 + task.phases.write.p50
 
 
-def _costs_measured(findings: Findings) -> Side:
-    found, partitions = findings.of(NASREM), findings.of(PARTITION)
+def _costs_measured(workshop: Workshop, found: NasremRun, partitions: Partitions) -> Side:
     rows = []
     for level, task in found.executors.items():
         exec_us = task.phases.process.p50

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 from rack.tools.lab.reproduction.experiments.experiment import (
     Document,
     Experiment,
-    Found,
     Kept,
     Workshop,
 )
@@ -316,30 +315,19 @@ def _texts(table: str, name: str) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Findings:
-    """What experiments have found, by their names, and where pictures of it are drawn."""
-
-    found: Mapping[str, Document]
-    workshop: Workshop
-
-    def of(self, experiment: Experiment[Found]) -> Found:
-        """Return what an experiment has found."""
-        return experiment.record(self.found[experiment.name])
-
-
-@dataclass(frozen=True)
 class Statement:
     """A claim of the paper by its name, with the experiments that it rests on.
 
-    `predicted` computes our side from configs alone, and may draw; `measured` shows what the
-    experiments have found. `judged` rules on that: it is given their records, in their order.
+    `predicted` computes our side from configs alone; `measured` shows what the experiments have
+    found, and `judged` rules on that: both are given their records, in their order. The first two
+    may draw.
     """
 
     name: str
     experiments: tuple[Experiment[Any], ...]
     judged: Callable[..., ClaimVerdict]
     predicted: Callable[[Workshop], Side] = lambda workshop: []
-    measured: Callable[[Findings], Side] = lambda findings: []
+    measured: Callable[..., Side] = lambda workshop, *found: []
 
     def claim(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> PageClaim:
         """Return the claim with its ruling; a text among the `results` says why there is none."""
@@ -367,14 +355,16 @@ class Statement:
             if result.lacking:
                 return Assessment([], Ruling.UNTESTABLE, f"{text(result.lacking)}.")
             found[name] = result.found
-        return self.tested(Findings(found, workshop))
+        return self.tested(found, workshop)
 
-    def tested(self, findings: Findings) -> Assessment:
-        """Return what was measured with the comparisons made of it, and the ruling."""
-        verdict = self.judged(*map(findings.of, self.experiments))
+    def tested(self, documents: Mapping[str, Document], workshop: Workshop) -> Assessment:
+        """Return what was measured with the comparisons made of it, and the ruling; `documents` are
+        what was found, by experiment."""
+        found = [one.record(documents[one.name]) for one in self.experiments]
+        verdict = self.judged(*found)
         head = ("compared", "measured", "demanded", "met")
         compared = Columns(head, [demand.row for demand in verdict.demands])
-        return Assessment([*self.measured(findings), compared], verdict.ruling, verdict.why)
+        return Assessment([*self.measured(workshop, *found), compared], verdict.ruling, verdict.why)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from rack.tools.lab.reproduction.experiments.tasks import (
 from rack.tools.lab.reproduction.sections.gantt import (
     MOSTLY,
     judge_both,
+    ran,
     ran_all,
 )
 from rack.tools.lab.reproduction.sections.page import (
@@ -37,7 +38,6 @@ from rack.tools.lab.reproduction.sections.page import (
     STRAY,
     ClaimVerdict,
     Columns,
-    Findings,
     Requirement,
     Side,
     Statement,
@@ -162,10 +162,10 @@ def judge_replication() -> ClaimVerdict:
     return ruled((), "", needs=(built,))
 
 
-def _chains(findings: Findings) -> Side:
+def _chains(workshop: Workshop, found: Chains) -> Side:
     rows = [
         (name, run.boards, run.due, run.missed, took, count)
-        for name, run in vars(findings.of(CHAINS)).items()
+        for name, run in vars(found).items()
         for took, count in run.took.items()
     ]
     head = ("chain", "boards", "cycles", "missed or skipped", "a message took, cycles", "messages")
@@ -180,24 +180,22 @@ def _pipeline(workshop: Workshop) -> Side:
     ]
 
 
-def _updates(findings: Findings) -> Side:
-    found = findings.of(FIG3.experiment)
+def _updates(workshop: Workshop, found: FigureRun) -> Side:
     executor = found.tasks[LEVEL]
     return [f"{found.met} updates were met by one of {executor.jobs} releases of the executor."]
 
 
-def _waits(findings: Findings) -> Side:
+def _waits(workshop: Workshop, found: Waits) -> Side:
     rows = [
         (wake, *(f"{times[part]:.1f}" for part in ("p50", "p99", "max")))
-        for wake, times in findings.of(WAITS).late_us.items()
+        for wake, times in found.late_us.items()
     ]
     return [Columns(("waits by", "late, median, us", "99th percentile", "longest"), rows)]
 
 
-def _networks(findings: Findings) -> Side:
+def _networks(workshop: Workshop, plain: NetworkRun, later: NetworkRun) -> Side:
     rows = []
-    for later_ms, experiment in ((0, NETWORK), (LATER_MS, LATER)):
-        run = findings.of(experiment)
+    for later_ms, run in ((0, plain), (LATER_MS, later)):
         response = "-" if run.response_ms is None else f"{run.response_ms:.0f}"
         rows.append((later_ms, response, f"{100 * run.servo_missed:.2f}", run.ended))
     head = (
@@ -229,5 +227,5 @@ EXCHANGE = Statement(
     "slices-and-buffers",
     (FIG4.experiment, BUFFERED.experiment),
     judge_both,
-    measured=ran_all(BUFFERED),
+    measured=lambda workshop, tight, buffered: ran(BUFFERED, buffered),
 )

@@ -24,7 +24,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Findings,
     Plate,
     Requirement,
     Row,
@@ -68,8 +67,7 @@ def _goto(workshop: Workshop) -> Side:
     ]
 
 
-def _goto_measured(findings: Findings) -> Side:
-    found = findings.of(DEADLINE)
+def _goto_measured(workshop: Workshop, found: GotoRuns) -> Side:
     rows = [_row(run) for run in (found.soft, found.early, found.met)]
     head = ("program", "A reported done, s", "did the arm move", "end of the run", "reason")
     return [Columns(head, rows, f"At A: {list(found.place)} m. Runs in real time.")]
