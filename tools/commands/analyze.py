@@ -13,7 +13,7 @@ from rack.tools.console.answer import print_json
 from rack.tools.console.parameters import Json, RunFolder
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
-from rack.tools.console.tables import print_wrapped, terminal_width
+from rack.tools.console.tables import print_wrapped
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import document
@@ -93,7 +93,7 @@ def analyze(
     if as_json:
         print_json(found)
     else:
-        shown = text(analysis, terminal_width()) if verbose else brief(analysis)
+        shown = text(analysis) if verbose else brief(analysis)
         print_wrapped(f"{shown}\n\n{files}")
     if not analysis.holds:
         sys.exit(1)

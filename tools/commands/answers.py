@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 def list_racks(as_json: bool) -> None:
     """Print the racks on this machine."""
     from rack.backplane.segment import racks
-    from rack.tools.console.tables import table, terminal_width
+    from rack.tools.console.tables import fitted
 
     found = [describe(name) for name in racks()]
     rows = [[str(rack[key]) for key in ("rack", "state", "detail")] for rack in found]
     if rows:
-        print_answer(found, table(("rack", "state", ""), rows, terminal_width()), as_json)
+        print_answer(found, fitted(("rack", "state", ""), rows), as_json)
     else:
         print_answer(found, "no racks", as_json)
 

@@ -20,7 +20,7 @@ from rack.boards.errors import UNKEPT
 from rack.levels.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
-from rack.tools.console.tables import print_wrapped, terminal_width
+from rack.tools.console.tables import print_wrapped
 from rack.tools.timing.inventory import arm_lines, inventory, inventory_lines
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import Repair, repair
@@ -123,20 +123,19 @@ def check(
         further = {"changed": found.changed, "arm": arm_document, "unkept": unkept or None}
         print_json(stock | further | {"timing": timing})
     else:
-        width = terminal_width()
-        head, *rest = inventory_lines(stock, width)
+        head, *rest = inventory_lines(stock)
         lines = [
             head,
             *found.changed,
             *lacking,
             *([f"{UNKEPT}{unkept}"] if unkept else []),
-            *summary_lines(forecast, fitting, arm, found.joints, width),
+            *summary_lines(forecast, fitting, arm, found.joints),
         ]
         if verbose:
             lines += [
                 *rest[len(lacking) :],
                 *arm_lines(stock),
-                *forecast_lines(forecast, width),
+                *forecast_lines(forecast),
             ]
         else:
             lines.append("--verbose shows every task, mailbox and equation")

@@ -87,7 +87,7 @@ def _measured(claim: MeasuredClaim, as_json: bool) -> Repeated:
 
 
 def _overview(chosen: list[Standing]) -> Iterator[str]:
-    from rack.tools.console.tables import table, terminal_width
+    from rack.tools.console.tables import fitted
 
     head = ["claim", "figure", "permitted", "days", "commit", "changes since", "text"]
     rows = [
@@ -102,7 +102,7 @@ def _overview(chosen: list[Standing]) -> Iterator[str]:
         ]
         for one in chosen
     ]
-    return table(head, rows, terminal_width(), ("text", "permitted"))
+    return fitted(head, rows, ("text", "permitted"))
 
 
 def _details(chosen: list[Standing]) -> Iterator[str]:

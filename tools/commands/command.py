@@ -126,7 +126,6 @@ def command(
       rack command nist-state-table elemental_move do pick block1 --wait
       rack command 192.168.1.5/cell task hold --certificates ~/cell
     """
-    from rack.tools.console.tables import terminal_width
     from rack.tools.live.desk import LiveDesk, goal_of
     from rack.tools.live.holds import resume_command
     from rack.tools.live.watched import watched
@@ -138,7 +137,7 @@ def command(
     with INTERRUPT.raising(), watched(rack, Asker.of(name, certificates)) as one:
         desk = LiveDesk(one)
         if is_list:
-            print_answer(desk.levels(), desk.text(terminal_width()), as_json)
+            print_answer(desk.levels(), desk.text(), as_json)
             return
         if level is None or what is None:
             raise Failure(

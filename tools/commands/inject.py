@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, Timeout, check_timeout, named
-from rack.tools.console.tables import table, terminal_width
+from rack.tools.console.tables import fitted
 
 Rack = Annotated[
     str | None,
@@ -101,7 +101,7 @@ def inject(
       rack inject nasrem --withdraw 0
     """
     if is_list and rack is None:
-        print_answer(kinds_document(), kinds_text(terminal_width()), as_json)
+        print_answer(kinds_document(), kinds_text(), as_json)
         return
     needs_fault = not is_list and withdraw is None
     if rack is None or (needs_fault and (board is None or kind is None)):
@@ -114,7 +114,7 @@ def inject(
 
     live = LiveRack(Segment.attach(rack))
     if is_list:
-        print_answer(live.faults(), live.text(terminal_width()), as_json)
+        print_answer(live.faults(), live.text(), as_json)
         return
     if withdraw is not None:
         answer = live.withdraw(withdraw)
@@ -151,12 +151,11 @@ class KindsCommand(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help."""
-        return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text(terminal_width())])
+        return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text()])
 
 
-def kinds_text(width: int | None = None) -> Iterator[str]:
-    """Yield the kinds as a table, and their parameters as another; with a width they fit into
-    it."""
+def kinds_text() -> Iterator[str]:
+    """Yield the kinds as a table, and their parameters as another."""
     from rack.boards.faults import KINDS
 
     remarks = {"real time only": "realtime", "strikes once": "once"}
@@ -169,7 +168,7 @@ def kinds_text(width: int | None = None) -> Iterator[str]:
         ]
         for kind in KINDS
     ]
-    yield from table(["kind", "effect", "found within", ""], rows, width)
+    yield from fitted(["kind", "effect", "found within", ""], rows)
     yield ""
     yield "Cycles are the task's; a planner's is its time slice."
     yield "A delivery is the time until a message is visible and its reader has read it."
@@ -182,7 +181,7 @@ def kinds_text(width: int | None = None) -> Iterator[str]:
         for kind in KINDS
         for p in kind.parameters
     ]
-    yield from table(["kind", "parameter", "unit", "default", "range", "meaning"], numbers, width)
+    yield from fitted(["kind", "parameter", "unit", "default", "range", "meaning"], numbers)
 
 
 def kinds_document() -> list[dict[str, Any]]:

@@ -56,10 +56,10 @@ def list_racks(
     given = [HostAddress.of(host) for host in hosts or ()]
     with needing_zenoh():
         from rack.tools.network.listing import known_hosts, racks_at
-    from rack.tools.console.tables import table, terminal_width
+    from rack.tools.console.tables import fitted
 
     found = racks_at(list(dict.fromkeys([*given, *known_hosts()])), asker)
     rows = [[row.host, row.rack, row.state, row.detail] for row in found]
     nothing = "no hosts: no rack here has an adapter; to look elsewhere: rack list --lan HOST"
-    shown = table(("host", "rack", "state", ""), rows, terminal_width()) if rows else nothing
+    shown = fitted(("host", "rack", "state", ""), rows) if rows else nothing
     print_answer([asdict(row) for row in found], shown, as_json)

@@ -15,7 +15,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
-from rack.tools.console.tables import console, table, terminal_width
+from rack.tools.console.tables import console, fitted
 from rack.tools.live.message_text import MessageText
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import mailbox_of
@@ -56,7 +56,7 @@ def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Js
             raise Failure("--watch needs the NAME of a mailbox", 2)
         rows = [_row(segment, box) for box in segment.layout.mailboxes]
         cells = [[str(row[column]) for column in COLUMNS] for row in rows]
-        print_answer(rows, table(COLUMNS, cells, terminal_width(), DROPPED), as_json)
+        print_answer(rows, fitted(COLUMNS, cells, DROPPED), as_json)
         return
     messages = Messages(segment, mailbox_of(name, segment.layout.mailboxes))
     if watch:

@@ -10,7 +10,7 @@ import typer
 
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, config_names
-from rack.tools.console.tables import table, terminal_width
+from rack.tools.console.tables import fitted
 
 if TYPE_CHECKING:
     from rack.boards.config.reference import KeyTable
@@ -62,7 +62,7 @@ def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False)
 
 def _names(found: list[KeyTable]) -> Iterator[str]:
     rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
-    return table(["table", "in TOML", "meaning"], rows, terminal_width(), ("in TOML",))
+    return fitted(["table", "in TOML", "meaning"], rows, ("in TOML",))
 
 
 def _keys(found: list[KeyTable]) -> Iterator[str]:
@@ -72,4 +72,4 @@ def _keys(found: list[KeyTable]) -> Iterator[str]:
         if at:
             yield ""
         yield f"{entry.heading}: {entry.meaning}"
-        yield from table(head, rows, terminal_width(), DROPPED)
+        yield from fitted(head, rows, DROPPED)

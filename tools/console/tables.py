@@ -53,6 +53,13 @@ def table(
     yield from (line.rstrip() for line in captured.get().splitlines())
 
 
+def fitted(
+    head: Sequence[str], rows: Sequence[Sequence[str]], dropped: Sequence[str] = ()
+) -> Iterator[str]:
+    """Yield the lines of a table that fits the terminal on stdout; where that is none, whole."""
+    return table(head, rows, terminal_width(), dropped)
+
+
 def grid(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],

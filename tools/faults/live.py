@@ -24,7 +24,7 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.faults.tasks import act_on_core
 from rack.tools.console.answer import Failure
 from rack.tools.console.held import waits
-from rack.tools.console.tables import table
+from rack.tools.console.tables import fitted
 
 BEGIN_S = 5.0
 """Longest wait for a fault to begin at the next tick."""
@@ -90,8 +90,8 @@ class LiveRack:
         injected = self._table.staged((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
         return [self._document(entry) for entry in injected]
 
-    def text(self, width: int | None = None) -> Iterator[str]:
-        """Yield the faults injected so far, as a table that fits into `width`."""
+    def text(self) -> Iterator[str]:
+        """Yield the faults injected so far, as a table."""
         columns = {
             "no": "fault",
             "fault": "text",
@@ -103,7 +103,7 @@ class LiveRack:
             "waits for": "waits_for",
         }
         rows = [[_cell(fault[key]) for key in columns.values()] for fault in self.faults()]
-        yield from table(list(columns), rows, width)
+        return fitted(list(columns), rows)
 
     def _fault(self, given: dict[str, Any]) -> FaultConfig:
         """Return a fault as in a config. Raises `ConfigError`."""

@@ -29,7 +29,7 @@ from rack.boards.operator import describe, message_of
 from rack.levels.operator import EFFECTS, Operation
 from rack.tools.console.answer import Failure
 from rack.tools.console.held import waits
-from rack.tools.console.tables import table
+from rack.tools.console.tables import fitted
 from rack.tools.live.holds import resume_command
 from rack.tools.live.replies import LastCycle, Replies, Reply, answering
 from rack.tools.live.watched import WatchedRack
@@ -61,11 +61,9 @@ class LiveDesk:
             for name, commands in known.items()
         ]
 
-    def text(self, width: int | None = None) -> Iterator[str]:
-        """Yield the same as a table that fits `width`."""
-        yield from table(
-            ["level", "in force", "takes"], [list(row.values()) for row in self.levels()], width
-        )
+    def text(self) -> Iterator[str]:
+        """Yield the same as a table."""
+        return fitted(["level", "in force", "takes"], [list(row.values()) for row in self.levels()])
 
     def highest(self, *in_force: str) -> list[str]:
         """Return the levels that take a hold and have one of these commands in force ("": none),

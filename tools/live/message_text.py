@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
-from rack.tools.console.tables import table, terminal_width
+from rack.tools.console.tables import fitted
 from rack.tools.live.signals import cell
 from rack.tools.recording.parquet import HEAD
 from rack.tools.recording.signal import Signal
@@ -45,4 +45,4 @@ class MessageText:
             [name, cell(value), signal.unit]
             for (name, value), signal in zip(document["fields"].items(), self._signals, strict=True)
         ]
-        return [head, *table(("field", "value", "unit"), rows, terminal_width())]
+        return [head, *fitted(("field", "value", "unit"), rows)]

@@ -29,10 +29,10 @@ class Stepped:
 
     def text(self) -> str:
         """Return the same as readable text."""
-        from rack.tools.console.tables import table, terminal_width
+        from rack.tools.console.tables import fitted
 
         rows = [list(level.values()) for level in self.levels]
-        lines = table(["level", "state", "row", "reason"], rows, terminal_width())
+        lines = fitted(["level", "state", "row", "reason"], rows)
         return "\n".join(
             [f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s", *lines]
         )

@@ -20,7 +20,7 @@ from rack.boards.crate.rack import cell_of
 from rack.boards.crate.requests import Preload
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import table, terminal_width
+from rack.tools.console.tables import fitted
 from rack.tools.live.continued import KeptStates, branched, state_at, tick_in
 from rack.tools.live.display import Display, event_line
 from rack.tools.live.folder import folder_of
@@ -151,9 +151,7 @@ class RewoundRun:
             levels = moment.levels(self._ready(), self._states)
             self._levels = self.tick, levels
         rows = [[name, cell(value)] for name, value in _flat(levels[task])]
-        return self._shown(
-            task, levels[task], table(("attribute", "value"), rows, terminal_width())
-        )
+        return self._shown(task, levels[task], fitted(("attribute", "value"), rows))
 
     def events(self, around_s: float) -> Glance:
         """Return the events at most so long before and after this tick."""

@@ -14,7 +14,7 @@ from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
 from rack.levels.level import Executor
 from rack.levels.tables import read_params
 from rack.levels.timing.chains import spanned
-from rack.tools.console.tables import table
+from rack.tools.console.tables import fitted
 
 PATIENCE = (
     "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted:"
@@ -163,7 +163,7 @@ def _network(config: RackConfig) -> dict[str, Any] | None:
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 
 
-def _network_lines(network: dict[str, Any] | None, width: int | None) -> Iterator[str]:
+def _network_lines(network: dict[str, Any] | None) -> Iterator[str]:
     """Yield with whom a rack exchanges what, and what it does while one of them is lost."""
     if network is None:
         return
@@ -181,10 +181,10 @@ def _network_lines(network: dict[str, Any] | None, width: int | None) -> Iterato
         ]
         for e in network["entries"]
     ]
-    yield from table(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows, width)
+    yield from fitted(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows)
 
 
-def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[str]:
+def _host_lines(hosts: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield the boards of the host side: they have no rate, and the timing model leaves them
     out."""
     if hosts:
@@ -198,11 +198,11 @@ def _host_lines(hosts: Sequence[dict[str, Any]], width: int | None) -> Iterator[
             for h in hosts
         ]
         yield ""
-        yield from table(["host side", "program", "writes", "reads"], rows, width, ("program",))
+        yield from fitted(["host side", "program", "writes", "reads"], rows, ("program",))
 
 
-def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator[str]:
-    """Yield an inventory as text for people, the tables fitted to `width`."""
+def inventory_lines(found: dict[str, Any]) -> Iterator[str]:
+    """Yield an inventory as text for people."""
     boards = len({task["slot"] for task in found["tasks"]})
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
     yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
@@ -219,8 +219,8 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
     ]
     head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", *phase, "slice, ms", "trace at"]
     yield ""
-    yield from table(
-        head, [[*clock, *[""] * (len(head) - len(clock))], *rows], width, ("trace at", "slice, ms")
+    yield from fitted(
+        head, [[*clock, *[""] * (len(head) - len(clock))], *rows], ("trace at", "slice, ms")
     )
     rows = [
         [
@@ -236,8 +236,8 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
         ]
         for m in found["mailboxes"]
     ]
-    yield from _host_lines(found["hosts"], width)
-    yield from _network_lines(found["network"], width)
+    yield from _host_lines(found["hosts"])
+    yield from _network_lines(found["network"])
     head = [
         "bus address",
         "mailbox",
@@ -249,7 +249,7 @@ def inventory_lines(found: dict[str, Any], width: int | None = None) -> Iterator
         "written by > read by",
     ]
     yield ""
-    yield from table(head, rows, width, ("slots", "bytes", "message", "protocol"))
+    yield from fitted(head, rows, ("slots", "bytes", "message", "protocol"))
     yield ""
     windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
     yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"

@@ -20,7 +20,7 @@ from rack.levels.operator import Answer, Operation
 from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
-from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
+from rack.tools.console.tables import decimal, fitted, print_wrapped
 from rack.tools.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -139,11 +139,11 @@ class OperatorResponse:
         }
         return {**head, **figures, "levels": self.rows(), "each": commands}
 
-    def text(self, width: int | None = None) -> str:
-        """Return the figures as text for people, the table fitted to `width`."""
-        return "\n".join(self._lines(width))
+    def text(self) -> str:
+        """Return the figures as text for people."""
+        return "\n".join(self._lines())
 
-    def _lines(self, width: int | None) -> Iterator[str]:
+    def _lines(self) -> Iterator[str]:
         yield (
             f"response to {len(self.measured)} operator commands, ms of simulated time: from giving"
             " a command, and"
@@ -171,7 +171,7 @@ class OperatorResponse:
             ]
             for row in self.rows()
         ]
-        yield from table(head, rows, width, ("min", "sum, eq. 3.3", "median"))
+        yield from fitted(head, rows, ("min", "sum, eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
             yield (
                 f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
@@ -291,7 +291,7 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
     if as_json:
         print_json(document)
     else:
-        print_wrapped(f"{response.text(terminal_width())}\n\n{files}")
+        print_wrapped(f"{response.text()}\n\n{files}")
     return response.held
 
 

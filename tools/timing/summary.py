@@ -20,11 +20,7 @@ RESPONSES = "3.2", "3.3"
 
 
 def summary_lines(
-    forecast: Forecast,
-    fitting: Repair,
-    arm: Abilities | None,
-    joints: Sequence[str],
-    width: int | None,
+    forecast: Forecast, fitting: Repair, arm: Abilities | None, joints: Sequence[str]
 ) -> Iterator[str]:
     """Yield it as text for people, with every verdict that fails; `arm` is None where there is
     none."""
@@ -49,7 +45,7 @@ def summary_lines(
         )
     if failing:
         yield ""
-        yield from verdict_table(failing, width)
+        yield from verdict_table(failing)
         yield ""
         yield from fitting.lines()
     else:

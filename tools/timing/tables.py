@@ -14,13 +14,13 @@ from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
 from rack.levels.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
-from rack.tools.console.tables import ms, table
+from rack.tools.console.tables import fitted, ms
 
 TABLED = {*BEYOND} - {PLAN_WITHIN}
 """Criteria that have a table of their own."""
 
 
-def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str]:
+def forecast_lines(forecast: Forecast) -> Iterator[str]:
     """Yield a forecast as text for people."""
     yield from _prediction_lines(forecast.system)
     if forecast.levels:
@@ -29,13 +29,13 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
             f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:",
             "",
         )
-        yield from _levels(forecast.levels, width)
+        yield from _levels(forecast.levels)
     if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
-        yield from verdict_table(paper, width)
+        yield from verdict_table(paper)
     if forecast.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
-        yield from _responses(forecast.responses, width)
+        yield from _responses(forecast.responses)
         yield ""
         loads = (
             f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}"
@@ -44,12 +44,12 @@ def forecast_lines(forecast: Forecast, width: int | None = None) -> Iterator[str
         yield f"load: {', '.join(loads)}"
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
-        yield from _inboxes(forecast.inboxes, width)
-    yield from _schedule_lines(forecast, width)
+        yield from _inboxes(forecast.inboxes)
+    yield from _schedule_lines(forecast)
     yield from forecast.notes
 
 
-def _schedule_lines(forecast: Forecast, width: int | None) -> Iterator[str]:
+def _schedule_lines(forecast: Forecast) -> Iterator[str]:
     """Yield a line per board of every distinct frame of a static schedule, and those that are late
     in theirs."""
     if forecast.schedule is None:
@@ -71,7 +71,7 @@ def _schedule_lines(forecast: Forecast, width: int | None) -> Iterator[str]:
         for alike in forecast.frames
         for place in alike.places
     ]
-    yield from table(head, rows, width, ("until",))
+    yield from fitted(head, rows, ("until",))
     for alike in forecast.frames:
         yield from _late_lines(alike)
 
@@ -115,7 +115,7 @@ def _prediction_lines(system: Prediction) -> Iterator[str]:
         yield f"plan of {level}: available {plan_ms:g} ms after its planner's release"
 
 
-def _levels(levels: Iterable[LevelTiming], width: int | None) -> Iterator[str]:
+def _levels(levels: Iterable[LevelTiming]) -> Iterator[str]:
     """Yield a line per level: its cycle, its parts, and the residual for its planner."""
     head = [
         "level",
@@ -133,34 +133,26 @@ def _levels(levels: Iterable[LevelTiming], width: int | None) -> Iterator[str]:
         "d",
     ]
     rows = _merged([_level_row(level) for level in levels], 0)
-    yield from table([*head, "d R_i"], rows, width, ("C", "R", "W", "U", "P", "d"))
+    yield from fitted([*head, "d R_i"], rows, ("C", "R", "W", "U", "P", "d"))
 
 
-def verdict_table(verdicts: Iterable[EquationVerdict], width: int | None) -> Iterator[str]:
+def verdict_table(verdicts: Iterable[EquationVerdict]) -> Iterator[str]:
     """Yield a line per verdict: both sides, the margin, whether it holds."""
     head = ["eq.", "of", "left", "", "right", "margin", "", "meaning"]
-    yield from table(
-        head,
-        _merged([_verdict_row(verdict) for verdict in verdicts], 1),
-        width,
-        ("meaning", "margin"),
-    )
+    rows = _merged([_verdict_row(verdict) for verdict in verdicts], 1)
+    yield from fitted(head, rows, ("meaning", "margin"))
 
 
-def _responses(responses: Iterable[TaskResponse], width: int | None) -> Iterator[str]:
+def _responses(responses: Iterable[TaskResponse]) -> Iterator[str]:
     """Yield a line per task, core by core: its cost, its blocking, its response and its
     deadline."""
     head = ["core", "task", "FIFO", "computes", "blocked", "response", "deadline", "margin", ""]
     ordered = sorted(responses, key=lambda response: (response.core, -response.priority))
-    yield from table(
-        head,
-        _merged([_response_row(response) for response in ordered], 1),
-        width,
-        ("FIFO", "margin"),
-    )
+    rows = _merged([_response_row(response) for response in ordered], 1)
+    yield from fitted(head, rows, ("FIFO", "margin"))
 
 
-def _inboxes(inboxes: Sequence[Mapping[str, Any]], width: int | None) -> Iterator[str]:
+def _inboxes(inboxes: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield a line per board that messages interrupt: what they cost it, and its worst burst."""
     head = ["board", "interrupted by", "in a cycle", "load", "longest", "wait", "of", ""]
     rows = [
@@ -175,7 +167,7 @@ def _inboxes(inboxes: Sequence[Mapping[str, Any]], width: int | None) -> Iterato
         ]
         for inbox in inboxes
     ]
-    yield from table(head, _merged(rows, 0), width, ("interrupted by",))
+    yield from fitted(head, _merged(rows, 0), ("interrupted by",))
 
 
 def _merged(rows: Sequence[Sequence[str]], named: int) -> list[list[str]]:

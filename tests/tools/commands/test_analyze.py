@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load
+from rack.tools.console import tables
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.timing.analysis.analysis import Analysis
@@ -214,11 +215,13 @@ def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_the_tables_of_an_analysis_fit_the_terminal(
-    small: Path, tmp_path: Path, width: int
+    small: Path, tmp_path: Path, width: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(8)] for name in ("lower", "upper")}
     analysis = Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces))
-    lines = text(analysis, width).splitlines()
+    with monkeypatch.context() as patched:
+        patched.setattr(tables, "terminal_width", lambda: width)
+        lines = text(analysis).splitlines()
     rows = [
         line
         for line in lines

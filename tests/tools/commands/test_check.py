@@ -13,6 +13,7 @@ import pytest
 from rack.boards.config import budgets, load
 from rack.boards.config.files import names
 from rack.levels.timing.forecast import Forecast
+from rack.tools.console import tables
 from rack.tools.timing.inventory import inventory, inventory_lines
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.tables import forecast_lines
@@ -88,11 +89,12 @@ def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
+def test_what_a_check_shows_fits_the_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "terminal_width", lambda: width)
     found = load("nasrem")
     judged = JudgedConfig.of(found)
-    lines = [*inventory_lines(inventory(found, judged.layout, []), width)]
-    lines += forecast_lines(Forecast.of(judged.timing), width)
+    lines = [*inventory_lines(inventory(found, judged.layout, []))]
+    lines += forecast_lines(Forecast.of(judged.timing))
     # Other text is wrapped when it is printed.
     rows = [line for line in lines if "  " in line.strip()]
     assert len(rows) > 50

@@ -93,8 +93,8 @@ class ResponseBench(BenchResult):
         return {**head, **self.response.document(), "twins": plain(self.twins)}
 
     def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield the figures as text for people, the table fitted to `width`."""
-        yield self.response.text(width)
+        """Yield the figures as text for people."""
+        yield self.response.text()
         found = self.response
         yield (
             f"{len(found.beyond)} of {len(found.measured)} beyond a bound, {len(found.off)} not at"

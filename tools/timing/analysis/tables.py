@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.verdicts import EquationVerdict
-from rack.tools.console.tables import decimal, figure, ms, table
+from rack.tools.console.tables import decimal, figure, fitted, ms
 from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.timing.analysis.breaches import Breach, Broken
@@ -43,9 +43,9 @@ EQUATIONS = ["eq.", "of", "predicted", "holds", "measured", "margin", "held", ""
 EQUATIONS_DROPPED = ("meaning", "margin", "predicted", "holds")
 
 
-def text(analysis: Analysis, width: int | None = None) -> str:
-    """Return everything as text for a screen or two, its tables at most `width` wide."""
-    return "\n".join(_lines(analysis, width))
+def text(analysis: Analysis) -> str:
+    """Return everything as text for a screen or two."""
+    return "\n".join(_lines(analysis))
 
 
 def brief(analysis: Analysis) -> str:
@@ -53,7 +53,7 @@ def brief(analysis: Analysis) -> str:
     return "\n".join([*_head(analysis), "--verbose shows every level, task and equation"])
 
 
-def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
+def _lines(analysis: Analysis) -> Iterator[str]:
     yield from _head(analysis)
     yield ""
     yield (
@@ -67,7 +67,7 @@ def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
         for side, of in sides.items()
         if n in of
     ]
-    yield from table(LEVELS, levels, width, ("C", "R", "W", "d"))
+    yield from fitted(LEVELS, levels, ("C", "R", "W", "d"))
     yield ""
     yield from (f"{name}: {summary(analysis, name)}" for name in analysis.config.board)
     yield ""
@@ -79,9 +79,9 @@ def _lines(analysis: Analysis, width: int | None) -> Iterator[str]:
     rows = [_task_row(name, cycles, analysis) for name, cycles in analysis.cycles.items()]
     # In lockstep there is no lateness and no deadline.
     shown = len(TASKS) - len(BY_THE_CLOCK) if analysis.predicted.is_lockstep else len(TASKS)
-    yield from table(TASKS[:shown], [row[:shown] for row in rows], width, TASKS_DROPPED)
+    yield from fitted(TASKS[:shown], [row[:shown] for row in rows], TASKS_DROPPED)
     yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
-    yield from table(EQUATIONS, list(map(_pair_row, analysis.pairs)), width, EQUATIONS_DROPPED)
+    yield from fitted(EQUATIONS, list(map(_pair_row, analysis.pairs)), EQUATIONS_DROPPED)
     yield from _broken_cycles(analysis)
 
 
