@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 from mcap.writer import Writer
 
-from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.tools.recording.parquet import CONFIG, columns_of
+from rack.backplane.layout import MailboxSpec
+from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal
 
@@ -53,7 +53,7 @@ def export(recording: Recording, path: Path, show: Callable[[float], None]) -> i
         writer = Writer(file)
         writer.start(library="nasrem-rack")
         writer.add_metadata("rack", {"name": recording.layout.rack, CONFIG: recording.config})
-        channels = [_channel(writer, box.name, box.message, _schema(box.fields)) for box in found]
+        channels = [_channel(writer, box.name, box.message, _schema(box)) for box in found]
         streams = [_samples(recording, *pair) for pair in zip(found, channels, strict=True)]
         events = _channel(writer, EVENTS, "event", EVENT_SCHEMA)
         for sample in merge(_events(recording, events), *streams):
@@ -72,28 +72,19 @@ def _channel(writer: Writer, topic: str, message: str, schema: dict[str, Any]) -
     return writer.register_channel(topic, "json", made)
 
 
-def _schema(fields: Sequence[FieldSpec]) -> dict[str, Any]:
+def _schema(box: MailboxSpec) -> dict[str, Any]:
     """Return the JSON schema of a message; groups of fields are flattened, as in the parquet
     files."""
     head = {
         "serial": {"type": "integer", "description": "of the message, rising by one"},
         "tick": {"type": "integer", "description": "release of the cycle that wrote it"},
     }
-    box = MailboxSpec("", "", (), "time-slice", 1, 1, 1, "", 1, 0, tuple(fields))
-    meanings = dict(_meanings("", fields))
-    for column in columns_of(box):
-        name = column.name.removeprefix(".")
-        signal = Signal(name, "", column, ())
-        head[name] = _of_shape(signal.json_type, column.shape)
-        head[name]["description"] = f"{meanings[name]} ({signal.unit})".removesuffix(" ()")
+    for signal in Signal.all([box]).values():
+        column = signal.column
+        field = _of_shape(signal.json_type, column.shape)
+        field["description"] = f"{column.meaning} ({signal.unit})".removesuffix(" ()")
+        head[".".join(column.path)] = field
     return {"type": "object", "properties": head}
-
-
-def _meanings(path: str, fields: Sequence[FieldSpec]) -> Iterator[tuple[str, str]]:
-    for field in fields:
-        name = f"{path}{field.name}"
-        yield name, field.meaning
-        yield from _meanings(f"{name}.", field.fields)
 
 
 def _of_shape(kind: str, shape: Sequence[int]) -> dict[str, Any]:
@@ -106,8 +97,8 @@ def _of_shape(kind: str, shape: Sequence[int]) -> dict[str, Any]:
 def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[ChannelMessage]:
     """Yield the messages of a mailbox, oldest first."""
     rows = recording.rows(box.name)
-    signals = [Signal(column.name, box.name, column, ()) for column in columns_of(box)]
-    names = ["serial", "tick", *(signal.name.removeprefix(f"{box.name}.") for signal in signals)]
+    signals = [*Signal.all([box]).values()]
+    names = ["serial", "tick", *(".".join(signal.column.path) for signal in signals)]
     clock_ns = recording.layout.clock_ns
     wall_ns = recording.launch.wall_offset_ns
     for first in range(0, len(rows), BLOCK):

@@ -195,7 +195,8 @@ class Column:
     kind: str
     shape: tuple[int, ...]
     unit: str
-    values: tuple[tuple[str, int], ...] = ()  # names and numbers of an enum
+    values: tuple[tuple[str, int], ...]  # names and numbers of an enum
+    meaning: str
 
     @property
     def label(self) -> str:
@@ -245,4 +246,4 @@ def _columns(
             yield from _columns(mailbox, inner, shape, field.fields)
         else:
             name = ".".join((mailbox, *inner))
-            yield Column(name, inner, field.kind, shape, field.unit, field.values)
+            yield Column(name, inner, field.kind, shape, field.unit, field.values, field.meaning)
