@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
 from rack.backplane.segment import Segment
@@ -19,25 +18,13 @@ if TYPE_CHECKING:
 LOOK_S = 0.001
 
 
-class WatchedRack(Protocol):
+class WatchedRack(AbstractContextManager["WatchedRack"], Protocol):
     """A rack in a context, with its segment as of the last `refresh`; on this machine that is
     always up to date."""
 
     @property
     def segment(self) -> Segment:
         """The rack's segment, or a mirror of it."""
-
-    def __enter__(self) -> Self:
-        """Return it."""
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-        /,
-    ) -> None:
-        """Leave it."""
 
     def refresh(self) -> bool:
         """Bring the segment up to date, or wait a moment; False when the rack is out of reach."""
