@@ -31,7 +31,7 @@ from rack.tools.live.continued import (
     unlike_in,
 )
 from rack.tools.live.launch import Beginning
-from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, dotted
+from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, unlike_values
 from rack.tools.recording.entries import commands_from
 from rack.tools.recording.origin import continued_at
 from rack.tools.recording.recording import Recording
@@ -79,7 +79,7 @@ def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
         is_chance = not all(repeater.does_repeat(run, again[run]) for run in others)
     because: Because = "code" if others else "state"
     return Repetition(
-        attributes=tuple(_unlike(*(again[run].attributes for run in found.runs))),
+        attributes=tuple(unlike_values(*(again[run].attributes for run in found.runs))),
         because="chance" if is_chance else because,
         runs=tuple(str(run.folder) for run in others),
         strays={
@@ -156,10 +156,3 @@ class _Repeater:
 
 def _has_checkpoint(run: Recording, until: int) -> bool:
     return any(at <= until for at in checkpoints(run.folder))
-
-
-def _unlike(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterator[InBoth]:
-    own, other = dict(dotted(here)), dict(dotted(there))
-    for name in dict.fromkeys((*own, *other)):
-        if own.get(name) != other.get(name):
-            yield InBoth(name, own.get(name), other.get(name))

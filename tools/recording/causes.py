@@ -197,12 +197,8 @@ class Divergence:
 
     def _config(self, task: str) -> Iterator[Clue]:
         """Yield the keys of the writer's board that differ; if none does, those of the rack."""
-        here, there = (dict(dotted(tomllib.loads(run.config))) for run in self.runs)
-        differ = [
-            InBoth(key, here.get(key), there.get(key))
-            for key in dict.fromkeys((*here, *there))
-            if here.get(key) != there.get(key) and not key.startswith(OWN)
-        ]
+        tables = (tomllib.loads(run.config) for run in self.runs)
+        differ = [both for both in unlike_values(*tables) if not both.name.startswith(OWN)]
         board = f"board.{task.partition('.')[0]}."
         own = [both for both in differ if both.name.startswith(board)]
         for both in own or differ:
@@ -234,14 +230,23 @@ def _unlike_signal(signal: Signal, here: np.ndarray, there: np.ndarray) -> Itera
     yield InBoth(f"{signal.name}{index}", *plain)
 
 
-def dotted(found: Mapping[str, Any], outer: str = "") -> Iterator[tuple[str, Any]]:
+def unlike_values(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterator[InBoth]:
+    """Yield the values that differ in two tables, by dotted names."""
+    own = dict(_dotted(here))
+    other = dict(_dotted(there))
+    for name in dict.fromkeys((*own, *other)):
+        if own.get(name) != other.get(name):
+            yield InBoth(name, own.get(name), other.get(name))
+
+
+def _dotted(found: Mapping[str, Any], outer: str = "") -> Iterator[tuple[str, Any]]:
     """Yield values with those of tables in them, by dotted names; of lists of tables by number."""
     for name, value in found.items():
         is_tables = isinstance(value, list) and value and isinstance(value[0], dict)
         if isinstance(value, dict):
-            yield from dotted(value, f"{outer}{name}.")
+            yield from _dotted(value, f"{outer}{name}.")
         elif is_tables:
             tables = {f"{name}[{at}]": table for at, table in enumerate(value)}
-            yield from dotted(tables, outer)
+            yield from _dotted(tables, outer)
         else:
             yield f"{outer}{name}", value
