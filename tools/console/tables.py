@@ -118,6 +118,10 @@ class TextTable:
         return markdown_table(self.head, self.rows)
 
 
+Blocks = Iterator[str | TextTable]
+"""A text for people, line by line, with tables in it."""
+
+
 def decimal(value: float | None, digits: int = 3) -> str:
     """Return a number with so many decimals; "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"

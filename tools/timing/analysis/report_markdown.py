@@ -8,10 +8,10 @@ from typing import Any
 from rich.console import Console
 
 from rack.boards.events import Braking, braked_text
-from rack.tools.console.tables import TextTable, figure, table
+from rack.tools.console.tables import Blocks, TextTable, figure, table
 from rack.tools.live.holds import resume_command
 from rack.tools.recording.recording import Gap
-from rack.tools.timing.analysis.report_arm import (
+from rack.tools.timing.analysis.arm_outcome import (
     force_text,
     hand_text,
     motion_text,
@@ -67,7 +67,7 @@ def show(report: Report, terminal: Console) -> None:
     )
 
 
-def _blocks(report: Report) -> Iterator[str | TextTable]:
+def _blocks(report: Report) -> Blocks:
     outcome = report["outcome"] or {"cause": "no outcome recorded", "reason": "", "faults": []}
     why = outcome["reason"] or "; ".join(outcome["faults"])
     yield f"# {report['rack']}: {outcome['cause']}{': ' + why if why else ''}"
@@ -109,7 +109,7 @@ def _blocks(report: Report) -> Iterator[str | TextTable]:
     yield from _network(report["network"])
 
 
-def _holds(report: Report) -> Iterator[str | TextTable]:
+def _holds(report: Report) -> Blocks:
     holds = report["holds"]
     if not holds:
         return
@@ -138,7 +138,7 @@ def _holds(report: Report) -> Iterator[str | TextTable]:
         )
 
 
-def _state_tables(levels: dict[str, list[Report]]) -> Iterator[str | TextTable]:
+def _state_tables(levels: dict[str, list[Report]]) -> Blocks:
     """Yield one line a level: the table, how many rows fired, and those that fired first and
     last."""
     if not levels:
@@ -201,7 +201,7 @@ def _against(against: Report | None) -> Iterator[str]:
     yield from (f"  - {line}" for line in against["why"])
 
 
-def _faults(report: Report) -> Iterator[str | TextTable]:
+def _faults(report: Report) -> Blocks:
     faults = report["faults"]
     unexplained = report["unexplained"]
     restarts = report["restarts"]
@@ -271,7 +271,7 @@ def _interrupts(boards: Sequence[Report]) -> Iterator[str]:
         )
 
 
-def _entries(entries: list[Report]) -> Iterator[str | TextTable]:
+def _entries(entries: list[Report]) -> Blocks:
     """Yield what passed between the two sides; nothing for a rack without bus adapters."""
     if not entries:
         return
@@ -290,7 +290,7 @@ def _passed(rows: Sequence[Report], dropped: Sequence[str]) -> TextTable:
     return TextTable([*counts, *(f"age {key}" for key in ages)], cells, dropped)
 
 
-def _network(network: Report | None) -> Iterator[str | TextTable]:
+def _network(network: Report | None) -> Blocks:
     """Yield what passed over the network, and how often other racks were lost; nothing without a
     network adapter."""
     if network is None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from rack.tools.console.tables import TextTable, decimal, figure
+from rack.tools.console.tables import Blocks, TextTable, decimal, figure
 from rack.tools.recording.history import counted
 
 Report = dict[str, Any]
@@ -30,7 +30,7 @@ def the_most(rows: Sequence[Any], which: str) -> str:
     return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
 
 
-def times_text(report: Report) -> Iterator[str | TextTable]:
+def times_text(report: Report) -> Blocks:
     """Yield the table of cycles, without what means nothing in lockstep."""
     is_lockstep = report["mode"] == "lockstep"
     yield from ("", "## Cycles, ms", "")
@@ -64,7 +64,7 @@ def _times_row(name: str, task: Report) -> dict[str, str]:
     return row
 
 
-def misses_text(report: Report) -> Iterator[str | TextTable]:
+def misses_text(report: Report) -> Blocks:
     """Yield the first missed and skipped cycles, and why they are fewer than tasks counted."""
     misses = report["misses"]
     if not misses:
@@ -95,7 +95,7 @@ def misses_text(report: Report) -> Iterator[str | TextTable]:
     yield TextTable(("tick", "task", "what", "started late, ms", "took, ms"), rows)
 
 
-def response_text(response: Report | None) -> Iterator[str | TextTable]:
+def response_text(response: Report | None) -> Blocks:
     """Yield the responses of all chains of levels against their bounds, and what is beyond."""
     if response is None:
         return
@@ -104,7 +104,7 @@ def response_text(response: Report | None) -> Iterator[str | TextTable]:
         yield from _response_along(found)
 
 
-def _response_along(response: Report) -> Iterator[str | TextTable]:
+def _response_along(response: Report) -> Blocks:
     yield ""
     bounds = (
         f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
