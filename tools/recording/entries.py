@@ -100,21 +100,17 @@ def _issued(recording: Recording, layout: Layout) -> list[Request]:
 def _check(
     box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording, asked: str
 ) -> None:
-    if recorded is None or (recorded.message, recorded.version, recorded.size) != (
-        box.message,
-        box.version,
-        box.size,
-    ):
-        what = (
-            "no such mailbox"
-            if recorded is None
-            else f"{recorded.message} {recorded.version}, {recorded.size} bytes"
-        )
-        wanted = f"{box.message} {box.version}, {box.size} bytes"
-        raise Failure(f"{asked}: {box.name}: {what}; needed: {wanted}", 2)
+    needed = _type_of(box)
+    found = "no such mailbox" if recorded is None else _type_of(recorded)
+    if found != needed:
+        raise Failure(f"{asked}: {box.name}: {found}; needed: {needed}", 2)
     if recording.kept:
         raise Failure(f"{asked}: {recording.kept_text}", 2)
     _check_whole(box, recording, asked)
+
+
+def _type_of(box: MailboxSpec) -> str:
+    return f"{box.message} {box.version}, {box.size} bytes"
 
 
 def _check_whole(box: MailboxSpec, recording: Recording, asked: str) -> None:

@@ -338,10 +338,7 @@ class Recording:
         fields."""
         found = np.zeros(len(self.signal(box.name, "tick")), message_dtype(box.fields, box.size))
         for column in columns_of(box):
-            part = found
-            for key in column.path[:-1]:
-                part = part[key]
-            part[column.path[-1]] = self.signal(box.name, column.label)
+            column.of(found)[...] = self.signal(box.name, column.label)
         return found
 
     def rows(self, name: str) -> np.ndarray:
