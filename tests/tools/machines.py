@@ -14,6 +14,7 @@ from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
 from rack.boards.config import RackConfig, load, wire
 from rack.levels.peer import DRIFT_PPM, Presence, peer_port
+from rack.tools.recording.cores import UNMEASURED
 from rack.tools.recording.parquet import CyclesFile, SignalTables
 from rack.tools.recording.recording import Recording
 from tests.boards.lan.racks import rack_text
@@ -88,7 +89,7 @@ def recorded(
     for name in ("release_ns", "start_ns", "read_ns", "process_ns", "end_ns"):
         rows[name] = machine.epoch_ns + rows["tick"] * machine.period_ns
     cycles.add("pulse", rows)
-    cycles.close({})
+    cycles.close({}, UNMEASURED, (), ())
     signals = SignalTables(folder / "signals", layout)
     for other in others:
         box = layout.mailbox(f"lan.{peer_port(other.rack)}")

@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
 from rack.boards.config.timing import tick_ns
+from rack.tools.recording.cores import UNMEASURED
 from rack.tools.recording.parquet import CyclesFile, SignalTables
 from rack.tools.recording.recording import Recording
 
@@ -67,7 +69,7 @@ def recorded(
     (folder / "config.toml").write_text(config.text())
     (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
     layout = wire(config)
-    cycles = CyclesFile(folder / "cycles.parquet", layout)
+    cycles = CyclesFile(folder / "cycles.parquet", layout, Launch(EPOCH_NS, EPOCH_NS))
     signals = SignalTables(folder / "signals", layout)
     for task, trace in traces.items():
         rows = [
@@ -76,6 +78,6 @@ def recorded(
         cycles.add(task, np.array(rows, RECORD))
     for mailbox, rows in (messages or {}).items():
         signals.add(mailbox, rows)
-    cycles.close({})
+    cycles.close({}, UNMEASURED, (), ())
     signals.close()
     return Recording(folder)

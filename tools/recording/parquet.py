@@ -25,7 +25,7 @@ from xxhash import xxh3_64_hexdigest
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.backplane.segment import Launch
 from rack.backplane.trace import FIELDS
-from rack.tools.recording.cores import UNMEASURED, CoreRecord
+from rack.tools.recording.cores import CoreRecord
 
 TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
 CONFIG = "config.toml"
@@ -54,11 +54,14 @@ def config_check(folder: Path) -> str:
 class CyclesFile:
     """cycles.parquet, being written."""
 
-    def __init__(self, path: Path, layout: Layout, launch: Launch | None = None) -> None:
+    def __init__(self, path: Path, layout: Layout, launch: Launch) -> None:
         self._waiting: list[tuple[str, np.ndarray]] = []
         self._rows = 0
-        metadata = {"layout": json.dumps(asdict(layout)), "config": config_check(path.parent)}
-        metadata |= {} if launch is None else {"launch": json.dumps(launch)}
+        metadata = {
+            "layout": json.dumps(asdict(layout)),
+            "config": config_check(path.parent),
+            "launch": json.dumps(launch),
+        }
         self._schema = pa.schema(TRACE_FIELDS, metadata=metadata)
         self._writer = pq.ParquetWriter(
             path, self._schema, compression="zstd", use_dictionary=["task"]
@@ -89,15 +92,19 @@ class CyclesFile:
     def close(
         self,
         lost: Mapping[str, int],
-        cores: CoreRecord = UNMEASURED,
-        gaps: Sequence[tuple[str, int, int]] = (),
-        kept: Sequence[tuple[int, int]] = (),
+        cores: CoreRecord,
+        gaps: Sequence[tuple[str, int, int]],
+        kept: Sequence[tuple[int, int]],
     ) -> None:
         """Finish the file; store as metadata the rows lost by task and by mailbox, what the machine
         did to its cores, the gaps, and the ticks of the stretches that a flight recorder kept."""
         self._flush()
-        metadata = {"lost": json.dumps(lost), "cores": cores.text(), "gaps": json.dumps(gaps)}
-        metadata |= {"kept": json.dumps(kept)}
+        metadata = {
+            "lost": json.dumps(lost),
+            "cores": cores.text(),
+            "gaps": json.dumps(gaps),
+            "kept": json.dumps(kept),
+        }
         self._writer.add_key_value_metadata(metadata)
         self._writer.close()
 
@@ -214,7 +221,7 @@ class Column:
         )
 
     def of(self, messages: np.ndarray) -> np.ndarray:
-        """Return the field in a block of messages, shape (rows, *shape)."""
+        """Return the field in a block of messages, shape (rows, *shape): a view."""
         for key in self.path:
             messages = messages[key]
         return messages

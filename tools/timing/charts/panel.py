@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from rack.levels.timing.schedule import Chart, Job, Span
@@ -46,8 +46,8 @@ class Panel:
     kind: Literal["schedule", "measured"]
     chart: Chart
     lanes: tuple[Lane, ...]
-    patterns: Mapping[str, Patterns] = field(default_factory=dict)
-    counts: Mapping[str, Count] = field(default_factory=dict)
+    patterns: Mapping[str, Patterns]
+    counts: Mapping[str, Count]
     frame_ns: int = 0
 
     @property

@@ -45,7 +45,7 @@ class Lane:
     priority: int
     cycle_ns: int
     slice_ns: int
-    phase_ns: int = 0
+    phase_ns: int
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -65,7 +65,7 @@ def test_what_another_board_cuts_in_pieces_is_told_once() -> None:
     assert dict(counted([EXECUTOR, cutting], "a", 8000).cycles) == {"R X W -": 10}
 
 
-LANE = Lane(1, "a", "a", None, 80, 1000, 1000)
+LANE = Lane(1, "a", "a", None, 80, 1000, 1000, 0)
 
 
 def order(*stretches: tuple[str, int, int], detail: Detail) -> str:
