@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import date
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json
 from rack.tools.lab.claims import (
@@ -126,8 +126,8 @@ def _compared(found: Repeated) -> Iterator[str]:
     yield f"  now: {found.now:g} {claim.unit}{ratio}: {verdict}"
 
 
-def _document(one: Standing) -> dict[str, Any]:
-    found: dict[str, Any] = asdict(one)
+def _document(one: Standing) -> Document:
+    found: Document = asdict(one)
     return {
         **found.pop("claim"),
         "date": str(one.claim.date),

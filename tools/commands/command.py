@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rack.tools.console.address import OPERATOR, Asker
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import (
     AnyRackName,
@@ -155,7 +155,7 @@ def command(
         print(f"in force until: {resume_command(rack, level)}")
 
 
-def _attend(desk: LiveDesk, given: dict[str, Any], as_json: bool) -> None:
+def _attend(desk: LiveDesk, given: Document, as_json: bool) -> None:
     """Give a command under a lease, and stay while it is in force."""
 
     def tell(reply: Reply) -> None:

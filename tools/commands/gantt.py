@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, Settings
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
@@ -121,7 +121,7 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _answer(text: str, document: dict[str, Any], pictures: list[Path], as_json: bool) -> None:
+def _answer(text: str, document: Document, pictures: list[Path], as_json: bool) -> None:
     paths = [str(path) for path in pictures]
     files = f"pictures: {', '.join(paths)}" if paths else NO_PICTURES
     print_answer({**document, "pictures": paths}, f"{text}\n\n{files}", as_json)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, Timeout, check_timeout, named
 from rack.tools.console.tables import fitted
 
@@ -119,7 +119,7 @@ def inject(
     if withdraw is not None:
         answer = live.withdraw(withdraw)
     else:
-        given: dict[str, Any] = {
+        given: Document = {
             "board": board,
             "kind": kind,
             "for": lasts,
@@ -184,7 +184,7 @@ def kinds_text() -> Iterator[str]:
     yield from fitted(["kind", "parameter", "unit", "default", "range", "meaning"], numbers)
 
 
-def kinds_document() -> list[dict[str, Any]]:
+def kinds_document() -> list[Document]:
     """Return the kinds as plain data."""
     from rack.boards.faults import KINDS
 

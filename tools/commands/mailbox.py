@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import nullcontext
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -13,7 +13,7 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, System
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console, fitted
 from rack.tools.live.message_text import MessageText
@@ -89,7 +89,7 @@ def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
                 print(*messages.lines(found[-1]), "", sep="\n", flush=True)
 
 
-def _row(segment: Segment, box: MailboxSpec) -> dict[str, Any]:
+def _row(segment: Segment, box: MailboxSpec) -> Document:
     return {
         "mailbox": box.name,
         "message": f"{box.message} {box.version}",
@@ -112,7 +112,7 @@ class Messages:
         self._text = MessageText(box, segment.layout.clock_ns)
         self.lines = self._text.lines
 
-    def new(self) -> Iterator[dict[str, Any]]:
+    def new(self) -> Iterator[Document]:
         """Yield the messages written since the last look; at the first one the newest alone."""
         rows = self._ring.drain().rows
         if not self._has_looked:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -16,7 +16,7 @@ from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.commands.replay import merge
 from rack.tools.console.address import OPERATOR, Asker
-from rack.tools.console.answer import Failure, fail, print_answer
+from rack.tools.console.answer import Document, Failure, fail, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import AskAs, Certificates, Json, RackName, View
 from rack.tools.live.folder import folder_of
@@ -121,7 +121,7 @@ def _end_at_once(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _saved(rack: WatchedRack, folder: Path) -> tuple[dict[str, Any], str]:
+def _saved(rack: WatchedRack, folder: Path) -> tuple[Document, str]:
     """Save what is recorded of a running rack; return the answer, as data and as a line."""
     segment = rack.segment
     name = segment.layout.rack

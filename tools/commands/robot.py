@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rack.boards.config import load, names
 from rack.levels.errors import RobotError
-from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json
 from rack.tools.console.tables import fitted
 
@@ -161,7 +161,7 @@ def _examined(given: str, folder: Path) -> tuple[Examined, str]:
     return examine(config.robot, config.scene, config.clock_ns), config.name
 
 
-def _report(found: dict[str, Any]) -> Iterator[str]:
+def _report(found: Document) -> Iterator[str]:
     head = list(found["joints"][0])
     rows = [[str(row[key]) for key in head] for row in found["joints"]]
     yield from fitted(head, rows)
@@ -209,7 +209,7 @@ def _numbers(text: str, option: str) -> tuple[float, ...]:
         raise Failure(f"{option} = {text}: not numbers, as in 80,80,12", 2) from None
 
 
-def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> dict[str, Any]:
+def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> Document:
     """Write the folder of an arm, asking for more if `asks`; return what it is. Raises
     `Failure`."""
     from rack.tools.robot.assignment import lay_out
@@ -234,7 +234,7 @@ def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> d
     return document(made, layout, folder, name)
 
 
-def _lines(made: dict[str, Any], folder: Path, name: str) -> Iterator[str]:
+def _lines(made: Document, folder: Path, name: str) -> Iterator[str]:
     yield f"{folder}: {len(made['joints'])} joints, {', '.join(made['joints'])}; {made['task']}"
     yield from made["notes"]
     for key, why in made["guessed"].items():

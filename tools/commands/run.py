@@ -6,13 +6,13 @@ import sys
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rack.boards.config.files import assembled, named_classes
 from rack.boards.crate.requests import Preload
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Faults, Json, Settings, View, config_names
 
@@ -215,7 +215,7 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
     from rack.tools.timing.analysis.report import unrecorded, write_report
     from rack.tools.timing.analysis.stored import print_report
 
-    report: tuple[dict[str, Any], str] | None = None
+    report: tuple[Document, str] | None = None
     try:
         report = write_report(folder) if folder is not None else None
     except (Failure, OSError) as error:

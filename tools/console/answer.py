@@ -10,6 +10,8 @@ from typing import Any, NoReturn
 
 from rack.boards.errors import one_line
 
+Document = dict[str, Any]
+"""Plain data, as `--json` prints it and a run's folder holds it."""
 MAX_LINE = 1300
 """Characters of one line of an error message, at most."""
 

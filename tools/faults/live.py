@@ -22,7 +22,7 @@ from rack.boards.faults.config import FaultConfig, condition_text
 from rack.boards.faults.describe import describe, document
 from rack.boards.faults.kind import KINDS
 from rack.boards.faults.tasks import act_on_core
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.console.held import waits
 from rack.tools.console.tables import fitted
 
@@ -44,7 +44,7 @@ class LiveRack:
 
     def inject(
         self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None
-    ) -> dict[str, Any]:
+    ) -> Document:
         """Inject a fault; return it as plain data when it has begun, or, with a tick, a condition
         or on a rack that is held, when it is armed.
 
@@ -67,7 +67,7 @@ class LiveRack:
             self._await_end(entry, timeout_s)
         return {**self._document(entry), "message": self._state(entry)}
 
-    def withdraw(self, number: int) -> dict[str, Any]:
+    def withdraw(self, number: int) -> Document:
         """Withdraw a fault that waits for its tick or condition; return it as plain data. Raises
         `Failure`."""
         waiting = {entry.index: entry for entry in self._table.staged((Stage.WAITING,))}
@@ -85,7 +85,7 @@ class LiveRack:
             raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
         return {**answer, "stage": "free", "message": f"{answer['text']}: withdrawn"}
 
-    def faults(self) -> list[dict[str, Any]]:
+    def faults(self) -> list[Document]:
         """Return the faults injected so far, as plain data."""
         injected = self._table.staged((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
         return [self._document(entry) for entry in injected]
@@ -105,7 +105,7 @@ class LiveRack:
         rows = [[_cell(fault[key]) for key in columns.values()] for fault in self.faults()]
         return fitted(list(columns), rows)
 
-    def _fault(self, given: dict[str, Any]) -> FaultConfig:
+    def _fault(self, given: Document) -> FaultConfig:
         """Return a fault as in a config. Raises `ConfigError`."""
         # Two faults of one run must not draw the same random numbers.
         given.setdefault("seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS)
@@ -199,7 +199,7 @@ class LiveRack:
         when = (entry[Entry.WHEN_BOX], entry[Entry.WHEN_FIELD], entry[Entry.WHEN_VALUE])
         return condition_text(when, self._segment.layout)
 
-    def _document(self, entry: FaultEntry) -> dict[str, Any]:
+    def _document(self, entry: FaultEntry) -> Document:
         """Return a fault as plain data; `waits_for` is empty once it has begun."""
         waits_for = self._awaited(entry) if entry.stage == Stage.WAITING else ""
         return {**document(entry, self._segment.layout, self._joints), "waits_for": waits_for}

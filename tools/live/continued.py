@@ -14,7 +14,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from rack.boards.config.resolved import validated
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.wiring import Entries, Keeping
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.launch import Beginning
 from rack.tools.recording.divergence import ticks_of
@@ -64,7 +64,7 @@ class RunState:
     of its levels, by task."""
 
     begins: Beginning
-    attributes: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    attributes: Mapping[str, Document] = field(default_factory=dict)
 
 
 class KeptStates:
@@ -289,7 +289,7 @@ def _is_kept(keeping: Keeping) -> bool:
     return keeping.at is None or (keeping.folder / NAME.format(keeping.at)).is_file()
 
 
-def attributes_in(folder: Path) -> dict[str, dict[str, Any]]:
+def attributes_in(folder: Path) -> dict[str, Document]:
     """Return the attributes of levels next to a checkpoint, by task."""
     return {found.stem: json.loads(found.read_bytes()) for found in folder.glob(f"*{ATTRIBUTES}")}
 

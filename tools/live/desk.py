@@ -27,7 +27,7 @@ from rack.boards.config.wiring import commandable
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
 from rack.levels.operator import EFFECTS, Operation
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.console.held import waits
 from rack.tools.console.tables import fitted
 from rack.tools.live.holds import resume_command
@@ -212,7 +212,7 @@ class LiveDesk:
         return Operation(seen.value.standing).name.lower()
 
 
-def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
+def goal_of(what: str, words: Sequence[str]) -> Document:
     """Return what follows the verb, as in a `[[command]]` table.
 
     Typed as `home`, key=numbers, NAME on|off, or the name of a table or command. Raises `Failure`.
@@ -225,7 +225,7 @@ def goal_of(what: str, words: Sequence[str]) -> dict[str, Any]:
         return {"name": words[0], "on": words[1] == "on"}
     if what in ("table", "do", "set"):
         return {"name": " ".join(words)}
-    goal: dict[str, Any] = {}
+    goal: Document = {}
     for word in words:
         key, is_given, values = word.partition("=")
         if key in goal:

@@ -8,10 +8,10 @@ import time
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from rack.boards.events import Event
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.live.display import Display
 
 RUNS = Path("runs")
@@ -59,7 +59,7 @@ class EventLog:
         self._waiting = []
         self._put("".join(waiting))
 
-    def end(self, outcome: dict[str, Any]) -> None:
+    def end(self, outcome: Document) -> None:
         """Write the outcome and close the file."""
         self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
@@ -71,7 +71,7 @@ class EventLog:
             with suppress(OSError):
                 self._file.close()
 
-    def _write(self, entry: dict[str, Any]) -> None:
+    def _write(self, entry: Document) -> None:
         line = json.dumps(entry) + "\n"
         if self._file is None:
             self._waiting.append(line)

@@ -4,7 +4,7 @@ run."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from rack.backplane.mailbox.interrupt import how_sent, sent_ns
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.levels.timing.trace_times import distribution
+from rack.tools.console.answer import Document
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
@@ -120,7 +121,7 @@ def replayed(recording: Recording, slot: int) -> BoardInterrupts:
     )
 
 
-def interrupts(recording: Recording) -> list[dict[str, Any]]:
+def interrupts(recording: Recording) -> list[Document]:
     """Return what interrupted every board in a run: messages served and lost, the most that waited,
     latencies.
 

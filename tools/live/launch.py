@@ -8,7 +8,6 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
@@ -20,7 +19,7 @@ from rack.boards.crate.line import CrateLine
 from rack.boards.errors import UNKEPT
 from rack.boards.events import Event, Outcome, braked_text
 from rack.boards.wiring import Entries, Keeping
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, strikes
 from rack.tools.live.display import Display
@@ -100,7 +99,7 @@ class RunResult:
             f" {'; '.join(end.faults) or end.reason or f'after {end.ticks} ticks'}"
         )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return everything as plain data."""
         return {**asdict(self), "worked": self.worked}
 

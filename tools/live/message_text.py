@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
+from rack.tools.console.answer import Document
 from rack.tools.console.tables import fitted
 from rack.tools.live.signals import cell
 from rack.tools.recording.parquet import HEAD
@@ -21,7 +20,7 @@ class MessageText:
         self._clock_ns = clock_ns
         self._signals = [*Signal.all([box]).values()]
 
-    def document(self, row: np.ndarray, tick: int) -> dict[str, Any]:
+    def document(self, row: np.ndarray, tick: int) -> Document:
         """Return a message, a row of the mailbox's ring, as a document, as of `tick`."""
         message = row["message"][None]
         return {
@@ -34,7 +33,7 @@ class MessageText:
             },
         }
 
-    def lines(self, document: dict[str, Any]) -> list[str]:
+    def lines(self, document: Document) -> list[str]:
         """Return a message as lines for people."""
         age_ms = document["age_ticks"] * self._clock_ns * 1e-6
         head = (

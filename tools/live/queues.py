@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.queue import queues_of, taken_name
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
+from rack.tools.console.answer import Document
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
@@ -61,7 +62,7 @@ def _last(counts: np.ndarray) -> int:
     return int(counts[-1]) if len(counts) else 0
 
 
-def queues(recording: Recording) -> list[dict[str, Any]]:
+def queues(recording: Recording) -> list[Document]:
     """Return what went through every queue: messages `sent`, `refused` (None: not recorded), most
     that ever waited.
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 
 LOOK_S = 0.001
 
@@ -23,7 +22,7 @@ class Stepped:
     time_s: float
     levels: tuple[dict[str, str], ...]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return everything as plain data."""
         return asdict(self)
 

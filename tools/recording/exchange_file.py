@@ -11,11 +11,12 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from heapq import merge
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mcap.writer import Writer
 
 from rack.backplane.layout import MailboxSpec
+from rack.tools.console.answer import Document
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal
@@ -67,12 +68,12 @@ def export(recording: Recording, path: Path, show: Callable[[float], None]) -> i
     return count
 
 
-def _channel(writer: Writer, topic: str, message: str, schema: dict[str, Any]) -> int:
+def _channel(writer: Writer, topic: str, message: str, schema: Document) -> int:
     made = writer.register_schema(message, ENCODING, json.dumps(schema).encode())
     return writer.register_channel(topic, "json", made)
 
 
-def _schema(box: MailboxSpec) -> dict[str, Any]:
+def _schema(box: MailboxSpec) -> Document:
     """Return the JSON schema of a message; groups of fields are flattened, as in the parquet
     files."""
     head = {
@@ -87,8 +88,8 @@ def _schema(box: MailboxSpec) -> dict[str, Any]:
     return {"type": "object", "properties": head}
 
 
-def _of_shape(kind: str, shape: Sequence[int]) -> dict[str, Any]:
-    found: dict[str, Any] = {"type": kind}
+def _of_shape(kind: str, shape: Sequence[int]) -> Document:
+    found: Document = {"type": kind}
     for _ in shape:
         found = {"type": "array", "items": found}
     return found

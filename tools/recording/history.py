@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from rack.backplane.layout import TaskSpec
 from rack.backplane.message import State
 from rack.levels.operator import Operation
 from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
+from rack.tools.console.answer import Document
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
@@ -20,7 +21,7 @@ OWN = "holding"
 """`by` of a hold whose reason comes from the level itself."""
 
 
-def misses(recording: Recording) -> list[dict[str, Any]]:
+def misses(recording: Recording) -> list[Document]:
     """Return every miss in the trace, earliest first: task, tick, `what` ("late" or "skipped"),
     count, times.
 
@@ -34,7 +35,7 @@ def misses(recording: Recording) -> list[dict[str, Any]]:
     return sorted(found, key=lambda miss: (miss["tick"], miss["task"]))
 
 
-def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
+def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
     rows = cycles[is_missed(cycles) | (skipped(cycles) > 0)]
     found = []
     columns = (
@@ -62,7 +63,7 @@ def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[dict[str, Any]]:
     return found
 
 
-def counted(found: Sequence[dict[str, Any]]) -> tuple[int, int]:
+def counted(found: Sequence[Document]) -> tuple[int, int]:
     """Return how many cycles of `misses` ended late, and how many were skipped."""
     late, left_out = (
         sum(miss["count"] for miss in found if miss["what"] == what) for what in ("late", "skipped")
@@ -70,7 +71,7 @@ def counted(found: Sequence[dict[str, Any]]) -> tuple[int, int]:
     return late, left_out
 
 
-def steal(recording: Recording) -> dict[str, Any]:
+def steal(recording: Recording) -> Document:
     """Return the time stolen by the hypervisor, by core: ms, and `percent` of the run's time.
 
     In lockstep, and where the kernel does not count it, steal is not `measured`.
@@ -86,7 +87,7 @@ def frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
     return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
 
 
-def holds(recording: Recording) -> list[dict[str, Any]]:
+def holds(recording: Recording) -> list[Document]:
     """Return every hold, the earliest first; `until_s` is None where it lasted to the end of the
     run.
 
@@ -102,7 +103,7 @@ def holds(recording: Recording) -> list[dict[str, Any]]:
     return sorted(found, key=lambda hold: (hold["since_s"], hold["level"]))
 
 
-def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
+def fired_rows(recording: Recording) -> dict[str, list[Document]]:
     """Return, by level with state tables, the rows that fired: table, row, name, cycles, and when
     first."""
     found = {}
@@ -133,7 +134,7 @@ def fired_rows(recording: Recording) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def _holds_of(recording: Recording, level: str) -> Iterator[dict[str, Any]]:
+def _holds_of(recording: Recording, level: str) -> Iterator[Document]:
     mailbox = f"{level}.status"
     tick_s = recording.layout.clock_ns * 1e-9
     fields = recording.fields(mailbox)

@@ -9,10 +9,10 @@ import json
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from rack.boards.events import CONTINUES
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.recorder_process import ORIGIN
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Origin:
         """Write it into the folder of the later run. Raises `OSError`."""
         (folder / ORIGIN).write_text(json.dumps(asdict(self)) + "\n")
 
-    def document(self, clock_ns: int) -> dict[str, Any]:
+    def document(self, clock_ns: int) -> Document:
         """Return it as plain data, with its simulated time, s."""
         return {**asdict(self), "time_s": round(self.tick * clock_ns * 1e-9, 9)}
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +24,7 @@ from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, loads
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import (
     CONFIG,
@@ -135,7 +135,7 @@ class Recording:
         return self.folder / name
 
     @cached_property
-    def events(self) -> list[dict[str, Any]]:
+    def events(self) -> list[Document]:
         """The events of the run, oldest first. Raises `Failure` when a line is not an event."""
         path = self.folder / "events.jsonl"
         if not path.is_file():
@@ -148,7 +148,7 @@ class Recording:
         return found
 
     @cached_property
-    def ended(self) -> dict[str, Any]:
+    def ended(self) -> Document:
         """Counts at the end of the run, as in `rack.tools.live.launch.RunResult`; empty where they
         are not recorded."""
         return next((event for event in self.events if event["kind"] == "outcome"), {})
@@ -385,7 +385,7 @@ def _naming(path: Path) -> Iterator[None]:
         ) from None
 
 
-def _event(line: str, place: str) -> dict[str, Any]:
+def _event(line: str, place: str) -> Document:
     """Return an event from its line. Raises `Failure`."""
     try:
         event = json.loads(line)

@@ -11,7 +11,6 @@ clock. It shows no more, and needs a ring of its own.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from rack.backplane.trace import Flag
 from rack.boards.config.layout import obtained_core
 from rack.boards.config.timing import tick_ns
 from rack.levels.timing.trace_times import STAMPS, Occupation, is_missed, skipped
+from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 
 QUOTA_NS = 100_000_000
@@ -126,7 +126,7 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
 
 
 def _late_clock(
-    events: list[dict[str, Any]], rows: np.ndarray, grid_ns: int
+    events: list[Document], rows: np.ndarray, grid_ns: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return since when the clock's board was away, due at a grid point, and until when; `rows` are
     on its grid."""

@@ -27,6 +27,7 @@ from rack.levels.task.actions import LEANING_RESTARTS, rehearse
 from rack.levels.task.grasps import FULL_ORIENTATION, QUARTERS
 from rack.levels.task.program import DOWN, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
+from rack.tools.console.answer import Document
 from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, poses
 from rack.tools.robot.fingertips import Fingertips
 
@@ -73,7 +74,7 @@ class Assignment:
     """A scene and a program for it."""
 
     scene: SceneConfig
-    actions: list[dict[str, Any]]
+    actions: list[Document]
     kind: str
 
 
@@ -105,7 +106,7 @@ def _pick_and_place(made: Draft, jaws: Fingertips) -> Assignment | str:
         added = _furnish(made.spec, scene, spot, half, reach)
         made.write_model()
         height = round(spot.top + half[2], 4)
-        actions: list[dict[str, Any]] = [
+        actions: list[Document] = [
             {
                 "do": "transfer",
                 "object": name,
@@ -223,7 +224,7 @@ class _Hurried(MotionPlanner):
         return super().plan(*args, **wishes)
 
 
-def _rehearse(made: Draft, scene: SceneConfig, actions: list[dict[str, Any]]) -> Rehearsal:
+def _rehearse(made: Draft, scene: SceneConfig, actions: list[Document]) -> Rehearsal:
     """Plan a whole program. Raises `Refused`, or `RobotError` for a start in contact."""
     cell = made.cell(scene)
     check_start(cell, made.robot, "home", cell.home)
@@ -238,7 +239,7 @@ def _tour(made: Draft) -> Assignment:
     check_start(cell, made.robot, "home", cell.home)
     planner = MotionPlanner(cell, NOTHING, SEED)
     statics = Statics(cell)
-    actions: list[dict[str, Any]] = []
+    actions: list[Document] = []
     for q in poses(cell):
         wanted = {"do": "goto", "joints": q.round(3).tolist()}
         try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,6 +17,7 @@ from rack.levels.robot.cell import Cell, check_fingers, unchecked_cell
 from rack.levels.robot.model import load_spec
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from rack.levels.task.program import DOWN
+from rack.tools.console.answer import Document
 from rack.tools.robot.draft import touching
 
 MOST_TURN = 0.5
@@ -38,7 +38,7 @@ class Examined:
     """An arm, examined."""
 
     cell: Cell
-    joints: list[dict[str, Any]]
+    joints: list[Document]
     able: Abilities
     findings: list[Observation]
 
@@ -51,7 +51,7 @@ def examine(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Examined:
     return Examined(cell, list(_joints(cell, robot)), able, findings)
 
 
-def _joints(cell: Cell, robot: RobotConfig) -> Iterator[dict[str, Any]]:
+def _joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
     data = cell.start()
     left, _ = Statics(cell).held(cell.home)
     for k, name in enumerate(robot.joints):

@@ -19,7 +19,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.boards.config import loads
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.events import Event
-from rack.tools.console.answer import Failure, as_failure
+from rack.tools.console.answer import Document, Failure, as_failure
 from rack.tools.faults.live import LiveRack
 from rack.tools.live import pausing
 from rack.tools.live.desk import LiveDesk
@@ -101,9 +101,7 @@ class AttachedRack:
         return _accepted(self._desk.set_param(f"{key}={value}"))
 
     @as_failure()
-    def inject(
-        self, board: str, kind: str, wait_s: float | None = None, **fields: Any
-    ) -> dict[str, Any]:
+    def inject(self, board: str, kind: str, wait_s: float | None = None, **fields: Any) -> Document:
         """Inject a fault, as in `inject("servo", "sensor-bias", joint=2, size=0.05, lasts=0.2)`.
 
         Return it, as the command's JSON, when it has begun; with `wait_s` when it is over.

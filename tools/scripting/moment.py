@@ -11,7 +11,7 @@ from rack.backplane.words import Run, System
 from rack.boards import Rack
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.rack import LAUNCH_S
-from rack.tools.console.answer import Failure, as_failure
+from rack.tools.console.answer import Document, Failure, as_failure
 from rack.tools.live.continued import KeptStates, branched, state_at
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
@@ -65,7 +65,7 @@ class RecordedMoment:
 
     def levels(
         self, crate: CrateLine | None = None, states: KeptStates | None = None
-    ) -> dict[str, dict[str, Any]]:
+    ) -> dict[str, Document]:
         """Return the attributes of the levels' own objects, by task, in plain data. A `crate` that
         was started earlier saves time, as do `states` found before."""
         run = self._recording

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rack.boards.events import Event
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.live.continued import tick_in
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
@@ -50,7 +50,7 @@ class RecordedRun:
         return [Event(**event) for event in found if event["kind"] != "outcome"]
 
     @cached_property
-    def report(self) -> dict[str, Any]:
+    def report(self) -> Document:
         """The report, as in report.json, which is written if it is missing or older than the
         run."""
         return newest_report(self.folder)[0]

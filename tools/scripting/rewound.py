@@ -19,7 +19,7 @@ from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.rack import cell_of
 from rack.boards.crate.requests import Preload
 from rack.boards.events import Event
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.console.tables import fitted
 from rack.tools.live.continued import KeptStates, branched, state_at, tick_in
 from rack.tools.live.display import Display, event_line
@@ -39,7 +39,7 @@ from rack.tools.timing.analysis.report import write_report
 class Glance:
     """What a step of going through a run found: for programs, and as lines for people."""
 
-    document: dict[str, Any]
+    document: Document
     lines: Iterable[str]
 
 
@@ -56,7 +56,7 @@ class RewoundRun:
         self._signals = Signal.all(self._layout.timed)
         self._boxes = {box.name: box for box in self._layout.timed}
         self._tasks = [task.name for task in self._layout.tasks]
-        self._levels: tuple[int, Mapping[str, dict[str, Any]]] = -1, {}
+        self._levels: tuple[int, Mapping[str, Document]] = -1, {}
         self._crate: WarmCrate | None = None
         self._states = KeptStates()
 

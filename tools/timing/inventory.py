@@ -4,7 +4,6 @@ arm does without torques."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
@@ -14,6 +13,7 @@ from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
 from rack.levels.level import Executor
 from rack.levels.tables import read_params
 from rack.levels.timing.chains import spanned
+from rack.tools.console.answer import Document
 from rack.tools.console.tables import fitted
 
 PATIENCE = (
@@ -27,7 +27,7 @@ MONITORS = (
 )
 
 
-def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str, Any]:
+def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
     """Return the inventory of a config as plain data; addresses and sizes in bytes.
 
     Of a task `slice_ms` is the time from its release until its messages are visible, of a mailbox
@@ -83,7 +83,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> dict[str,
     }
 
 
-def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
+def _patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
     """Yield how long an arm, or hand, goes on without a new torque, and what it does meanwhile,
     joint by joint."""
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
@@ -102,7 +102,7 @@ def _patience(config: RackConfig, layout: Layout) -> Iterator[dict[str, Any]]:
         }
 
 
-def _monitors(config: RackConfig) -> Iterator[dict[str, Any]]:
+def _monitors(config: RackConfig) -> Iterator[Document]:
     """Yield what the sensors of an arm may be off by before it is braked, joint by joint."""
     robot = config.robot
     if robot is None:
@@ -128,7 +128,7 @@ def _monitors(config: RackConfig) -> Iterator[dict[str, Any]]:
         }
 
 
-def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:
+def _host(name: str, host: HostConfig, layout: Layout) -> Document:
     return {
         "board": name,
         "program": host.program,
@@ -138,7 +138,7 @@ def _host(name: str, host: HostConfig, layout: Layout) -> dict[str, Any]:
     }
 
 
-def _network(config: RackConfig) -> dict[str, Any] | None:
+def _network(config: RackConfig) -> Document | None:
     """Return with whom a rack exchanges what; None: with nobody."""
     table = config.adapter.lan
     if table is None:
@@ -163,7 +163,7 @@ def _network(config: RackConfig) -> dict[str, Any] | None:
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 
 
-def _network_lines(network: dict[str, Any] | None) -> Iterator[str]:
+def _network_lines(network: Document | None) -> Iterator[str]:
     """Yield with whom a rack exchanges what, and what it does while one of them is lost."""
     if network is None:
         return
@@ -184,7 +184,7 @@ def _network_lines(network: dict[str, Any] | None) -> Iterator[str]:
     yield from fitted(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows)
 
 
-def _host_lines(hosts: Sequence[dict[str, Any]]) -> Iterator[str]:
+def _host_lines(hosts: Sequence[Document]) -> Iterator[str]:
     """Yield the boards of the host side: they have no rate, and the timing model leaves them
     out."""
     if hosts:
@@ -201,7 +201,7 @@ def _host_lines(hosts: Sequence[dict[str, Any]]) -> Iterator[str]:
         yield from fitted(["host side", "program", "writes", "reads"], rows, ("program",))
 
 
-def inventory_lines(found: dict[str, Any]) -> Iterator[str]:
+def inventory_lines(found: Document) -> Iterator[str]:
     """Yield an inventory as text for people."""
     boards = len({task["slot"] for task in found["tasks"]})
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
@@ -255,13 +255,13 @@ def inventory_lines(found: dict[str, Any]) -> Iterator[str]:
     yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
 
 
-def arm_lines(found: dict[str, Any]) -> Iterator[str]:
+def arm_lines(found: Document) -> Iterator[str]:
     """Yield what an arm does while no torque comes, and what its monitors take for good."""
     yield from (PATIENCE.format(**one) for one in found["patience"])
     yield from (MONITORS.format(**one) for one in found["monitors"])
 
 
-def _protocol(mailbox: dict[str, Any]) -> str:
+def _protocol(mailbox: Document) -> str:
     """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
     if mailbox["capacity"]:
         return f"{mailbox['protocol']} of {mailbox['capacity']}"

@@ -22,6 +22,7 @@ from rack.levels.timing.verdicts import (
     system_verdicts,
     verdicts,
 )
+from rack.tools.console.answer import Document
 
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values; None removes a key."""
@@ -154,7 +155,7 @@ class Change:
         """The change in one line, with its numbers."""
         return f"board '{self.board}': {', '.join(self._parts())}"
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return it as plain data."""
         return {
             "board": self.board,

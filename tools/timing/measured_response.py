@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
@@ -21,13 +20,14 @@ from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import mailboxes_along
 from rack.levels.timing.trace_times import counts, distribution
 from rack.levels.timing.verdicts import response_subject
+from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 
 LOSSES = ("died", "hang")
 """Codes of the events of a lost board."""
 
 
-def system_response(recording: Recording) -> dict[str, Any] | None:
+def system_response(recording: Recording) -> Document | None:
     """Return the response down (commands) and up (statuses), in ticks and ms; None without a
     hierarchy.
 
@@ -47,7 +47,7 @@ def system_response(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> dict[str, Any]:
+def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> Document:
     cycles = chains.cycles
     tick_ms = rack.clock_ns * 1e-6
     return {
@@ -64,7 +64,7 @@ def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) ->
 
 def _way(
     recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
-) -> dict[str, Any]:
+) -> Document:
     """Judge the response along all of these chains, from their first board's release to the last
     one's cycle.
 
@@ -98,7 +98,7 @@ def _way(
 
 def _along(
     recording: Recording, boards: Sequence[str], boxes: Sequence[MailboxSpec], bound_ms: float
-) -> tuple[np.ndarray, list[dict[str, Any]], int]:
+) -> tuple[np.ndarray, list[Document], int]:
     """Return the responses along one chain by its mailboxes, ms, those beyond the bound, and the
     number unseen.
 

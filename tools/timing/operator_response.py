@@ -18,7 +18,7 @@ import numpy as np
 from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
 from rack.levels.timing.command_path import CommandPath, command_paths
-from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.answer import Document, Failure, print_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
 from rack.tools.console.tables import decimal, fitted, print_wrapped
 from rack.tools.recording.recording import Recording
@@ -102,12 +102,12 @@ class OperatorResponse:
         tick."""
         return not self.beyond and not (self.lockstep and self.off)
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[Document]:
         """Return the figures of every level that was commanded, ms of simulated time, as plain
         data."""
         return [self._row(level, path) for level, path in self.paths.items()]
 
-    def _row(self, level: str, path: CommandPath) -> dict[str, Any]:
+    def _row(self, level: str, path: CommandPath) -> Document:
         own = [c for c in self.measured if c.level == level]
         ms = np.array([self.ticks(c) for c in own]) * self.tick_ms
         reading_ms = np.array([self.ticks(c) + c.given - c.sampled for c in own]) * self.tick_ms
@@ -125,7 +125,7 @@ class OperatorResponse:
             "off_prediction": sum(c.level == level for c in self.off),
         }
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return everything as plain data."""
         commands = [
             asdict(c) | {"ticks": self.ticks(c) if c.acts is not None else None}

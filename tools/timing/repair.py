@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rack.backplane.layout import Protocol
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import EquationVerdict
+from rack.tools.console.answer import Document
 from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
 
 MAX_CYCLES = 10_000
@@ -69,7 +70,7 @@ class Repair:
             found.append(f"no change helps with {failing}; tried: {tried}")
         return found
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return it as plain data."""
         return {
             "steps": [[change.document() for change in changes] for changes in self.steps],

@@ -10,12 +10,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from rack.backplane.layout import Layout
 from rack.boards.config import wire
 from rack.boards.config.schema import RackConfig
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
 from rack.tools.faults.campaigns.base import BaseRun
@@ -62,7 +61,7 @@ class Order:
     loads: tuple[bool, ...] = (False, True)
     seconds: float | None = None
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return the order as plain data: equal for campaigns that are the same."""
         return {**vars(self), "config": self.config.text()}
 

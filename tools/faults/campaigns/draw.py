@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from random import Random
-from typing import Any
 
 from rack.backplane.fault_table import Injection
 from rack.boards.faults.clock_board import PHASES
 from rack.boards.faults.drawing import Drawing, swept
+from rack.tools.console.answer import Document
 from rack.tools.faults.campaigns.plan import Kill, Plan, Purpose, Target, Targets
 from rack.tools.faults.ending import EXTERNAL, record_of
 
@@ -111,11 +111,11 @@ class Card:
             held = self.parameters.get("by", 0) * self.target.cycle
         return self.window - self.ticks - round(held)
 
-    def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> dict[str, Any]:
+    def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> Document:
         """Return the fault as a `[[fault]]` table that begins at `tick`."""
         target = self.target
         kind = target.record
-        table: dict[str, Any] = {"kind": kind.name, "board": target.board}
+        table: Document = {"kind": kind.name, "board": target.board}
         if kind.where != "start":
             table["tick"] = tick
         if self.ticks and not kind.once:
@@ -195,7 +195,7 @@ def _packed(
     while waiting:
         chosen = _chosen(rack, waiting)
         starts = _starts(rack, [card.window for card in chosen], rng)
-        faults = list[dict[str, Any]]()
+        faults = list[Document]()
         kills = list[Kill]()
         for card, start in zip(chosen, starts, strict=True):
             if card.target.kind == EXTERNAL:

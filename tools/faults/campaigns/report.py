@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, get_args
 
 from rack.boards.faults.kind import KINDS
+from rack.tools.console.answer import Document
 from rack.tools.console.tables import markdown_table
 from rack.tools.faults.campaigns.campaign import Campaign
 from rack.tools.faults.campaigns.results import Ended, Results, TrialResult
@@ -100,7 +101,7 @@ class CampaignReport:
         """Return the judgements of a kind, in all trials."""
         return [fault for fault in self.results.faults if fault.kind == kind]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return all results as plain data."""
         run = self.results.nominal
         return {
@@ -261,7 +262,7 @@ def _shortfalls(results: Results) -> list[str]:
     return lines + results.lacking
 
 
-def _trial(run: TrialResult) -> dict[str, Any]:
+def _trial(run: TrialResult) -> Document:
     return {
         "number": run.plan.number,
         "purpose": run.plan.purpose,

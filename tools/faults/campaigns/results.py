@@ -7,12 +7,13 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import TypeAdapter
 
 from rack.boards.events import Event
 from rack.boards.faults.kind import KINDS
+from rack.tools.console.answer import Document
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.statistics import EventRate, rate
 from rack.tools.faults.campaigns.trial import Trial
@@ -130,7 +131,7 @@ class Faultless:
             total.update(run.misses)
         return dict(total)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return the figures as plain data."""
         an_hour = asdict(self.rate) if self.rate else None
         return {

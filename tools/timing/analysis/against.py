@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
 
 from rack.backplane.address_map import CLOCK
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.live.cycle_again import Repetition, repeated
 from rack.tools.live.signals import cell
 from rack.tools.recording.causes import Clue, Divergence, InBoth, UnlikeCycle
@@ -23,7 +22,7 @@ OF_CONFIG = ("config", "outside")
 """Kinds of clues that leave open whether a level's state was equal."""
 
 
-def compared(recording: Recording, asked: OtherRun) -> dict[str, Any]:
+def compared(recording: Recording, asked: OtherRun) -> Document:
     """Return where two runs diverge, and why. Raises `Failure` when they cannot be compared."""
     found = Divergence(recording, Recording(asked.folder))
     missed = min((miss["tick"] for run in found.runs for miss in misses(run)), default=None)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from math import ceil
-from typing import Any
 
 import numpy as np
 
@@ -14,12 +13,12 @@ from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import counts, distribution, gaps_ns, lateness_ns, response_ns
 from rack.levels.timing.verdicts import EquationVerdict
+from rack.tools.console.answer import Document
 from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.timing.analysis.breaches import Breach, brief_ms
 from rack.tools.timing.analysis.rules import slice_ns
 
-Document = dict[str, Any]
 MS = 1e-6
 UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "plan", "U": "update"}
 """Unit functions, and the names of their times in `LevelTiming`."""

@@ -8,9 +8,8 @@ import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from rack.tools.console.answer import print_json
+from rack.tools.console.answer import Document, print_json
 from rack.tools.recording.recorder_process import SPOOL
 
 FILES = ("report.json", "report.md")
@@ -18,7 +17,7 @@ RECORDED = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
 PROGRAM = Path(__file__).resolve().parents[3]
 
 
-def stored_report(folder: Path) -> tuple[dict[str, Any], str] | None:
+def stored_report(folder: Path) -> tuple[Document, str] | None:
     """Return the report in the folder of a run, as data and as text; None if it must be made
     anew."""
     try:
@@ -44,7 +43,7 @@ def _changed_ns() -> Iterator[int]:
             )
 
 
-def newest_report(folder: Path) -> tuple[dict[str, Any], str]:
+def newest_report(folder: Path) -> tuple[Document, str]:
     """Return the report of a run: the one in its folder if that is still right, otherwise a new
     one."""
     report = stored_report(folder)
@@ -60,7 +59,7 @@ def show_report(run: str | Path, as_json: bool) -> None:
     print_report(*newest_report(Path(run)), as_json)
 
 
-def print_report(data: dict[str, Any], text: str, as_json: bool) -> None:
+def print_report(data: Document, text: str, as_json: bool) -> None:
     """Print a report: as one JSON document; on a terminal as much as fits; elsewhere, or of no
     recording, `text`."""
     if as_json:

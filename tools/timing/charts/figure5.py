@@ -7,11 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import log10
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rack.boards.config import RackConfig
 from rack.boards.config.timing import tick_ns
 from rack.levels.timing.chains import spanned
+from rack.tools.console.answer import Document
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.timing.charts.letters import label_row
 
@@ -138,7 +139,7 @@ def lines(config: RackConfig) -> Iterator[str]:
     yield from (f"{level.level}, {duration(level.cycle_s)}: {level.remark}" for level in found)
 
 
-def document(config: RackConfig) -> dict[str, Any]:
+def document(config: RackConfig) -> Document:
     """Return the figure as plain data; the last region has no end."""
     regions = [
         {"name": r.words, "to_s": None if r.to_s == float("inf") else r.to_s} for r in REGIONS

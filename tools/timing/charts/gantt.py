@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, budgets, load, wire
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Document, Failure
 from rack.tools.live.folder import RUNS
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.charts.letters import column_for, lines
@@ -72,7 +71,7 @@ class Gantt:
         ]
         return "\n\n".join([*panels, *self.notes])
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return the chart as plain data."""
         panels = [panel.document() for panel in self.panels]
         return {"rack": self.rack, "panels": panels, "notes": list(self.notes)}

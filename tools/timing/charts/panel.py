@@ -6,9 +6,10 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from rack.levels.timing.schedule import Chart, Job, Span
+from rack.tools.console.answer import Document
 from rack.tools.timing.charts.patterns import Lane, Patterns, Stretch
 
 NS_PER_MS = 1_000_000
@@ -76,7 +77,7 @@ class Panel:
         )
         yield from without((self.chart.start_ns, self.chart.end_ns), busy)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return everything as plain data; times are ms."""
         return {
             "kind": self.kind,
@@ -101,7 +102,7 @@ class Panel:
             "counts": {task: vars(count) for task, count in self.counts.items()},
         }
 
-    def _jobs(self) -> Iterator[dict[str, Any]]:
+    def _jobs(self) -> Iterator[Document]:
         late = {(job.task, job.release_ns) for lane in self.lanes for job in self.late(lane)}
         for job in self.chart.jobs:
             yield {
@@ -111,7 +112,7 @@ class Panel:
             }
 
 
-def _lane(lane: Lane) -> dict[str, Any]:
+def _lane(lane: Lane) -> Document:
     times = _in_ms(lane, "cycle", "slice")
     return {"core": lane.core, "board": lane.board, "tasks": list(lane.tasks), **times}
 
