@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -156,18 +156,13 @@ def state_at(
         yield RunState(Beginning(kept_there, entries=before.entries, origin=this), attributes)
 
 
-def tick_of(text: str, clock_ns: int) -> int:
-    """Return the tick of a time, s; -1 for what is no time."""
-    try:
-        return round(float(text) * 1e9 / clock_ns)
-    except (ValueError, OverflowError):
-        return -1
-
-
 def tick_in(recording: Recording, text: str, asked: str = "") -> int:
     """Return the tick of a time, s, in a recorded run. Raises `Failure`, which begins with what was
     `asked`, for one outside, or between two stretches that were kept."""
-    tick = tick_of(text, recording.layout.clock_ns)
+    tick = -1
+    # What is no time is outside, too.
+    with suppress(ValueError, OverflowError):
+        tick = round(float(text) * 1e9 / recording.layout.clock_ns)
     is_kept = any(first <= tick < end for first, end in recording.kept or [(0, tick + 1)])
     begins, ends = ticks_of(recording)
     if not (begins <= tick < ends and is_kept):
@@ -234,20 +229,13 @@ def _commanded(recording: Recording, begins: int, asked: str) -> tuple[Request, 
 def _kept_in(recording: Recording, origin: Path, tick: int) -> Keeping:
     """Return what goes on from the state of a run at `tick`, in this file."""
     ran = recording.rack_config
+    died = (event for event in recording.events if event["kind"] == "died")
     return Keeping(
         origin=origin,
         packages=ran.python_path,
         faults=len(ran.fault),
         commands=len(ran.command),
-        losses=_losses(recording, tick),
-    )
-
-
-def _losses(recording: Recording, tick: int) -> tuple[tuple[str, int], ...]:
-    return tuple(
-        (event["board"], event["tick"])
-        for event in recording.events
-        if event["kind"] == "died" and event["tick"] < tick
+        losses=tuple((one["board"], one["tick"]) for one in died if one["tick"] < tick),
     )
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.layout import Layout
 from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, alarm_ring
@@ -70,7 +69,11 @@ class Occasions:
         owners = (CLOCK, *(task.name for task in layout.tasks))
         self._alarms = [alarm_ring(segment, owner) for owner in owners]
         self._tasks = {task.name for task in layout.tasks}
-        self._holding = dict.fromkeys(_with_state(layout), False)
+        self._holding = {
+            box.name: False
+            for box in layout.timed
+            if box.name.endswith(".status") and any(field.name == "state" for field in box.fields)
+        }
 
     def alarms(self) -> Iterator[int]:
         """Yield those of the alarms since the last call; of the first one, all that are left."""
@@ -88,11 +91,3 @@ class Occasions:
             before = np.concatenate(([self._holding[ring]], holding[:-1]))
             self._holding[ring] = bool(holding[-1])
             yield from ticks[holding != before].tolist()
-
-
-def _with_state(layout: Layout) -> Iterable[str]:
-    return (
-        box.name
-        for box in layout.timed
-        if box.name.endswith(".status") and any(field.name == "state" for field in box.fields)
-    )
