@@ -175,8 +175,12 @@ def kinds_text() -> Iterator[str]:
     yield ""
     numbers = [
         [
-            *(kind.name, p.name, p.unit, "none" if p.default is None else f"{p.default:g}"),
-            *(f"{p.least:g} to {p.most:g}", p.meaning),
+            kind.name,
+            p.name,
+            p.unit,
+            "none" if p.default is None else f"{p.default:g}",
+            f"{p.least:g} to {p.most:g}",
+            p.meaning,
         ]
         for kind in KINDS
         for p in kind.parameters

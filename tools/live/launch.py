@@ -32,8 +32,18 @@ from rack.tools.recording.origin import Origin
 from rack.tools.recording.recorder_process import RecorderProcess
 
 COUNTED = (
-    *("CYCLES", "PLANS", "MISSED", "SKIPPED", "PRIORITY", "CORE"),
-    *("READS", "READ_BYTES", "WRITES", "WRITE_BYTES", "CORRUPT", "BUS_ERRORS"),
+    "CYCLES",
+    "PLANS",
+    "MISSED",
+    "SKIPPED",
+    "PRIORITY",
+    "CORE",
+    "READS",
+    "READ_BYTES",
+    "WRITES",
+    "WRITE_BYTES",
+    "CORRUPT",
+    "BUS_ERRORS",
 )
 """Words of a task's control block that a result keeps."""
 NO_TIME = "no time for the report: 'rack report {}' makes it"

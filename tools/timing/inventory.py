@@ -212,8 +212,11 @@ def inventory_lines(found: Document) -> Iterator[str]:
     rows = [
         [
             *map(str, (t["slot"], t["task"], t["core"], t["priority"] or "-")),
-            *(f"{t['rate_hz']:g}", str(t["every_ticks"]), *(str(t[key]) for key in phase.values())),
-            *(f"{t['slice_ms']:g}", _hex(t["trace_address"])),
+            f"{t['rate_hz']:g}",
+            str(t["every_ticks"]),
+            *(str(t[key]) for key in phase.values()),
+            f"{t['slice_ms']:g}",
+            _hex(t["trace_address"]),
         ]
         for t in found["tasks"]
     ]
@@ -224,15 +227,14 @@ def inventory_lines(found: Document) -> Iterator[str]:
     )
     rows = [
         [
-            *(
-                _hex(m["address"]),
-                m["mailbox"],
-                m["message"],
-                str(m["size"]),
-                str(m["depth"]),
-                _protocol(m),
-            ),
-            *(f"{m['delay_ms']:g}", f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}"),
+            _hex(m["address"]),
+            m["mailbox"],
+            m["message"],
+            str(m["size"]),
+            str(m["depth"]),
+            _protocol(m),
+            f"{m['delay_ms']:g}",
+            f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}",
         ]
         for m in found["mailboxes"]
     ]

@@ -27,8 +27,15 @@ from rack.tools.console.answer import Document
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values; None removes a key."""
 CHANGEABLE = (
-    *("priority", "planner_priority", "within_cycles", "coupling"),
-    *("planner_slot", "planner_core", "core", "every", "rate_hz"),
+    "priority",
+    "planner_priority",
+    "within_cycles",
+    "coupling",
+    "planner_slot",
+    "planner_core",
+    "core",
+    "every",
+    "rate_hz",
 )
 """Keys of a board's table that a change may set."""
 

@@ -162,12 +162,11 @@ class OperatorResponse:
         ]
         rows = [
             [
-                *(
-                    row["level"],
-                    str(row["commands"]),
-                    *(decimal(row[f"{name}_ms"], 1) for name in names),
-                ),
-                *(str(row["beyond"]), str(row["off_prediction"])),
+                row["level"],
+                str(row["commands"]),
+                *(decimal(row[f"{name}_ms"], 1) for name in names),
+                str(row["beyond"]),
+                str(row["off_prediction"]),
             ]
             for row in self.rows()
         ]

@@ -64,9 +64,14 @@ def _schedule_lines(forecast: Forecast) -> Iterator[str]:
     head = ["core", "frames", "board", "offset", "budget", "slack", "until", ""]
     rows = [
         [
-            *(str(alike.core), _numbers(alike.frames, count), place.board),
-            *(ms(place.offset_ns), ms(place.job_ns), ms(place.slack_ns)),
-            *(place.until or "end of frame", _result(place.slack_ns >= 0)),
+            str(alike.core),
+            _numbers(alike.frames, count),
+            place.board,
+            ms(place.offset_ns),
+            ms(place.job_ns),
+            ms(place.slack_ns),
+            place.until or "end of frame",
+            _result(place.slack_ns >= 0),
         ]
         for alike in forecast.frames
         for place in alike.places
@@ -157,13 +162,14 @@ def _inboxes(inboxes: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     head = ["board", "interrupted by", "in a cycle", "load", "longest", "wait", "of", ""]
     rows = [
         [
-            *(inbox["task"], spanned([name.partition(".")[0] for name in inbox["mailboxes"]])),
-            *(ms(inbox["cycle_cost_ns"]), f"{inbox['load']:.3f}", ms(inbox["longest_ns"])),
-            *(
-                "-" if inbox["waiting"] is None else str(inbox["waiting"]),
-                str(inbox["depth"]),
-                _result(inbox["fits"]),
-            ),
+            inbox["task"],
+            spanned([name.partition(".")[0] for name in inbox["mailboxes"]]),
+            ms(inbox["cycle_cost_ns"]),
+            f"{inbox['load']:.3f}",
+            ms(inbox["longest_ns"]),
+            "-" if inbox["waiting"] is None else str(inbox["waiting"]),
+            str(inbox["depth"]),
+            _result(inbox["fits"]),
         ]
         for inbox in inboxes
     ]

@@ -125,10 +125,32 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     """Return the report of a run that was not recorded: the same keys, null where only a recording
     could tell."""
     unknown = (
-        *("misses", "steal", "stalls", "frequency_mhz", "notes", "holds", "state_tables"),
-        *("faults", "unexplained", "restarts", "system_response", "entries", "network"),
-        *("task", "motion", "hand", "force", "queues", "interrupts", "continues"),
-        *("rows_lost", "gaps", "untraced", "kept", "bytes", "bytes_per_s"),
+        "misses",
+        "steal",
+        "stalls",
+        "frequency_mhz",
+        "notes",
+        "holds",
+        "state_tables",
+        "faults",
+        "unexplained",
+        "restarts",
+        "system_response",
+        "entries",
+        "network",
+        "task",
+        "motion",
+        "hand",
+        "force",
+        "queues",
+        "interrupts",
+        "continues",
+        "rows_lost",
+        "gaps",
+        "untraced",
+        "kept",
+        "bytes",
+        "bytes_per_s",
     )
     layout = wire(config)
     tasks = {

@@ -19,8 +19,17 @@ BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation",
 USED = ("exec p50", "exec p99", "exec max", "comm p99", "proc p99", "plan age max")
 JUDGED = {True: "ok", False: "FAILS", None: "-"}
 DROPPED = (
-    *("deviation", "comm p99", "proc p99", "late p50", "exec p50", "alpha", "late p99", "exec p99"),
-    *("plan age max", "R", "cycles"),
+    "deviation",
+    "comm p99",
+    "proc p99",
+    "late p50",
+    "exec p50",
+    "alpha",
+    "late p99",
+    "exec p99",
+    "plan age max",
+    "R",
+    "cycles",
 )
 """Columns that a narrow terminal leaves out, the first of them first."""
 
