@@ -540,6 +540,11 @@ class RackConfig(Table):
         return round(self.clock.period_ms * 1e6)
 
     @property
+    def tick_ns(self) -> int:
+        """One tick, in ns of the wall clock."""
+        return round(self.clock_ns / self.clock.speed)
+
+    @property
     def joints(self) -> tuple[str, ...]:
         """Names of the arm's joints; none in a rack without an arm."""
         return () if self.robot is None else self.robot.joints

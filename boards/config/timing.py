@@ -46,7 +46,7 @@ def rack_timing(
         speed=config.clock.speed,
         clock_ns=config.clock_ns,
         clock=TimedTask(
-            CLOCK, CLOCK, "clock", config.clock.core, config.clock.priority, tick_ns(config), parts
+            CLOCK, CLOCK, "clock", config.clock.core, config.clock.priority, config.tick_ns, parts
         ),
         boards={name: _board(config, layout, name, found.get(name)) for name in config.board},
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
@@ -131,17 +131,12 @@ def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
     return {writer: max(grid for other, grid in own if other == writer) for writer, _ in own}
 
 
-def tick_ns(config: RackConfig) -> int:
-    """Return one tick of the wall clock, ns."""
-    return round(config.clock_ns / config.clock.speed)
-
-
 def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
     """Return what a board that computes so long in `every` ticks reserves of its processor, ms;
     None: it asks for a priority."""
     if config.clock.scheduler == "fixed-priority" or config.clock.mode == "lockstep" or not busy_ms:
         return None
-    period_ns = every * tick_ns(config)
+    period_ns = every * config.tick_ns
     return Reservation(min(round(RESERVED * busy_ms * NS_PER_MS), period_ns), period_ns)
 
 

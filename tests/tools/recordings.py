@@ -12,7 +12,6 @@ import numpy as np
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
-from rack.boards.config.timing import tick_ns
 from rack.tools.recording.cores import UNMEASURED
 from rack.tools.recording.parquet import CyclesFile, SignalTables
 from rack.tools.recording.recording import Recording
@@ -72,9 +71,7 @@ def recorded(
     cycles = CyclesFile(folder / "cycles.parquet", layout, Launch(EPOCH_NS, EPOCH_NS))
     signals = SignalTables(folder / "signals", layout)
     for task, trace in traces.items():
-        rows = [
-            cycle.row(tick_ns(config)) if isinstance(cycle, Cycle) else cycle for cycle in trace
-        ]
+        rows = [cycle.row(config.tick_ns) if isinstance(cycle, Cycle) else cycle for cycle in trace]
         cycles.add(task, np.array(rows, RECORD))
     for mailbox, rows in (messages or {}).items():
         signals.add(mailbox, rows)

@@ -18,7 +18,6 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.driver import LATE_PART
 from rack.backplane.trace import Flag
 from rack.boards.config.layout import obtained_core
-from rack.boards.config.timing import tick_ns
 from rack.levels.timing.trace_times import STAMPS, Occupation, is_missed, skipped
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
@@ -79,7 +78,7 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     """
     config = recording.rack_config
     tasks = recording.layout.tasks
-    grid_ns = tick_ns(config)
+    grid_ns = config.tick_ns
     home = obtained_core(config.clock.core)
     traces = [recording.trace(task.name) for task in tasks]
     rows = np.concatenate(traces)

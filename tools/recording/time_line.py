@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.boards.config.timing import tick_ns
 from rack.levels.peer import DRIFT_PPM, PEER, Presence, peer_port
 from rack.tools.console.answer import Failure
 from rack.tools.recording.divergence import unlike_messages
@@ -41,7 +40,7 @@ class RackGrid:
         self.rack = recording.layout.rack
         self.is_lockstep = config.clock.mode == "lockstep"
         self.clock_ns = recording.layout.clock_ns
-        self.period_ns = tick_ns(config)
+        self.period_ns = config.tick_ns
         self.launch = recording.launch
         cycles = [rows for rows in recording.cycles.values() if len(rows)]
         if not cycles:

@@ -16,7 +16,6 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, loads, rack_timing
-from rack.boards.config.timing import tick_ns
 from rack.levels.messages import (
     ARM_STATE,
     MOVE_PLAN,
@@ -105,7 +104,7 @@ class RackWriter:
                     of_mailbox[box.name].append(marks.write)
                 of_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
-        period_ns = tick_ns(config)
+        period_ns = config.tick_ns
         speed = 1.0 if lockstep else layout.clock_ns / period_ns
         colours = colours_of(layout)
         boards = boards_of(layout)

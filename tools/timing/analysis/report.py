@@ -13,7 +13,6 @@ import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config import RackConfig, wire
-from rack.boards.config.timing import tick_ns
 from rack.levels.peer import Presence, peer_port
 from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
@@ -193,7 +192,7 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
     layout = recording.layout
     cycles = recording.trace(task.name)
     stretches = recording.stretch_of(cycles["tick"])
-    period_ns = layout.clock_ns if is_lockstep else tick_ns(config)
+    period_ns = layout.clock_ns if is_lockstep else config.tick_ns
     entry: Report = {
         **_about(task, layout),
         **recording.ended.get("tasks", {}).get(task.name, {}),

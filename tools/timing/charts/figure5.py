@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rack.boards.config import RackConfig
-from rack.boards.config.timing import tick_ns
 from rack.levels.timing.chains import spanned
 from rack.tools.console.answer import Document
 from rack.tools.console.pictures import paths_of, picture
@@ -86,7 +85,7 @@ class Placed:
 
 def placed(config: RackConfig) -> list[Placed]:
     """Return the levels of a rack with their regions, the fastest first."""
-    tick_s = tick_ns(config) * 1e-9
+    tick_s = config.tick_ns * 1e-9
     cycles = {name: config.every(name) * tick_s for name in config.board}
     found = []
     for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1]):

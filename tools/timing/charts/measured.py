@@ -11,7 +11,6 @@ from functools import cached_property
 import numpy as np
 
 from rack.boards.config import RackConfig, rack_timing
-from rack.boards.config.timing import tick_ns
 from rack.levels.timing.schedule import Chart, Job, Span
 from rack.levels.timing.tasks import Budget, TimedTask, Unit
 from rack.levels.timing.trace_times import UNITS, plans, response_ns, skipped, waking_ns
@@ -77,8 +76,8 @@ class TracedRun:
         """Return the first release of a task, or of its plans, in the second half of the run; 0
         without one."""
         ticks = self._records[task.name][0]["tick"]
-        at = int(np.searchsorted(ticks, self.end_ns // self._tick_ns // 2))
-        return int(ticks[at]) * self._tick_ns if at < len(ticks) else 0
+        at = int(np.searchsorted(ticks, self.end_ns // self.config.tick_ns // 2))
+        return int(ticks[at]) * self.config.tick_ns if at < len(ticks) else 0
 
     @cached_property
     def end_ns(self) -> int:
@@ -88,16 +87,13 @@ class TracedRun:
         lasts = [
             int(rows["tick"][-1]) + layout.task(task).every for task, rows in traces if len(rows)
         ]
-        return max(lasts, default=0) * self._tick_ns
-
-    @property
-    def _tick_ns(self) -> int:
-        return tick_ns(self.config)
+        return max(lasts, default=0) * self.config.tick_ns
 
     def chart(self, start_ns: int, end_ns: int) -> Chart:
         """Return the chart of the time from `start_ns` to `end_ns`."""
         traced = [
-            _Traced(task, self._cut(task, start_ns, end_ns), self._tick_ns) for task in self.tasks
+            _Traced(task, self._cut(task, start_ns, end_ns), self.config.tick_ns)
+            for task in self.tasks
         ]
         spans: list[Span] = []
         for core in {task.core for task in self.tasks}:
@@ -116,8 +112,8 @@ class TracedRun:
         rows, longest_ns = self._records[task.name]
         # A skipped release is in the record of the next one.
         bounds = (
-            (start_ns - longest_ns) // self._tick_ns,
-            (end_ns + task.every_ns) // self._tick_ns + 1,
+            (start_ns - longest_ns) // self.config.tick_ns,
+            (end_ns + task.every_ns) // self.config.tick_ns + 1,
         )
         first, last = np.searchsorted(rows["tick"], bounds).tolist()
         found: np.ndarray = rows[first:last]
