@@ -1,8 +1,8 @@
 """The messages of the default rack: commands go down, statuses come up, plans stay within a level.
 
-Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (MuJoCo's
-integration state). Quaternions are w, x, y, z. Poses are in the world frame. Simulated time is tick
-times the clock's period.
+Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (of a simulated
+cell, see `rack.levels.robot.state`). Quaternions are w, x, y, z. Poses are in the world frame.
+Simulated time is tick times the clock's period.
 """
 
 from __future__ import annotations
@@ -392,7 +392,7 @@ ARM_STATE = MessageType(
         ),
         Field("error", "u2", Error, "latched fault; 0: none"),
         Field("reason", "S120", "ASCII", "that fault, readable"),
-        Field("state", "f8", "", "mjSTATE_INTEGRATION of the simulated cell", ("state",)),
+        Field("state", "f8", "", "of the simulated cell, see rack.levels.robot.state", ("state",)),
     ),
 )
 

@@ -130,9 +130,14 @@ def _put_data(thing: Any, found: tuple[bytes, ...]) -> None:
     """Put a MjData back where it is, since others know its addresses."""
     import mujoco
 
+    from rack.levels.robot.engine import mj_update_sleep
+
     source = mujoco.MjData.__new__(mujoco.MjData)
     source.__setstate__(thing.model.__getstate__().join(found))
     mujoco.mj_copyData(thing, thing.model, source)
+    if (thing.tree_asleep >= 0).any():
+        # The state has who sleeps, but not how many are awake.
+        mj_update_sleep(thing.model._address, thing._address)
 
 
 def _fields(slots: tuple[str, ...], again: tuple[str, ...], thing: Any) -> dict[str, Any]:

@@ -49,8 +49,7 @@ class Plant:
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
 
-        A simulation adds its state: `state.state` has room for MuJoCo's integration state of the
-        cell.
+        A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.state`.
         """
         state.tick = self.tick
         seldom = (

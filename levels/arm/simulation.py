@@ -4,6 +4,7 @@ itself in it."""
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -13,7 +14,7 @@ from rack.levels.algebra import Array, norm
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
 from rack.levels.arm.plant import Plant
 from rack.levels.arm.substeps import advance, copy_state, substeps
-from rack.levels.robot.cell import STATE
+from rack.levels.robot.state import restore_state, sleeping
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
@@ -28,19 +29,24 @@ class Simulation(Plant):
     `_simulate`.
     """
 
+    sleeps: ClassVar[bool] = True
+    """Whether its bodies may sleep: nothing but MuJoCo moves them."""
+
     def begin(self, scene: SceneConfig, clock_ns: int) -> None:
         """Prepare the steps of a tick of `clock_ns`, and what judges them."""
         cell = self.cell
         d = self._data
-        self._model = cell.model
+        self._model = sleeping(cell.model, scene) if self.sleeps else cell.model
         self._clock_ns = clock_ns
-        self._steps = substeps(cell, d, round(clock_ns * 1e-9 / cell.model.opt.timestep))
+        self._poses = self._poses._replace(model=self._model._address)  # else all would wake
+        steps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
+        self._steps = substeps(cell, self._model, d, steps)
         self._state = (
             self._steps.seen[-1, 0],
             self._steps.seen[-1, 1],
         )  # (joints,): true positions and velocities
         self._refresh()
-        self._addresses = self._steps.model, self._steps.data
+        self._saving = self._steps.model, self._steps.data, self._steps.asleep  # for `copy_state`
         self._contacts = ContactMonitor(cell)
         self._limits = LimitMonitor(cell, self._steps)
         obstacles = zip(
@@ -84,12 +90,12 @@ class Simulation(Plant):
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE`."""
         super().save(state)
-        self._copy_state(*self._addresses, state.state)
+        self._copy_state(*self._saving, state.state)
 
     def restore(self, state: Message) -> None:
         """Continue, bit for bit, from an `ARM_STATE`."""
         super().restore(state)
-        mujoco.mj_setState(self._model, self._data, state.state, STATE)
+        restore_state(self._model, self._data, state.state)
         self._contacts.count = state.touches
         self._limits.count = state.violations
         self._limits.pushed = state.pushed
@@ -133,7 +139,7 @@ class Simulation(Plant):
             self.struck = STRUCK_TICKS if broken else self.struck - 1
         self.fault = self._broken()
         if self.fault:
-            mujoco.mj_setState(self._model, self._data, self._steps.states[0], STATE)
+            restore_state(self._model, self._data, self._steps.states[0])
             self._refresh()
         self._data.time = self._after_s
         contacts = self._contacts

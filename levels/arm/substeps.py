@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
-from rack.levels.robot.cell import STATE, Cell
-from rack.levels.robot.engine import contact_views, mj_get_state, mj_set_state, mj_step, one_view
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.engine import (
+    INTEGRATION,
+    contact_views,
+    mj_get_state,
+    mj_set_state,
+    mj_step,
+    one_view,
+)
+from rack.levels.robot.state import state_size
 
 TIME = int(mujoco.mjtState.mjSTATE_TIME)
 PHYSICS = int(mujoco.mjtState.mjSTATE_PHYSICS)
@@ -28,7 +36,8 @@ class Substeps(NamedTuple):
     memory: Array  # MuJoCo's
     # (2 + substeps, 3, joints): lowest, highest and, after each step, position, velocity, torque
     judged: Array
-    states: Array  # (2, state): MuJoCo's before the tick; after it, as far as the steps change it
+    asleep: NDArray[np.int32]  # (trees,), see `copy_state`
+    states: Array  # (2, state): before the tick; after it, as far as the steps change it
     warnings: NDArray[np.int32]  # (kinds,), how often MuJoCo has raised each
     contacts: NDArray[np.int32]  # (1,), their number
     geoms: NDArray[np.int32]  # (room, 2), of the contacts
@@ -41,8 +50,9 @@ class Substeps(NamedTuple):
         return self.judged[2:]
 
 
-def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
-    """Return the arguments of `advance` for `data` of a cell, `steps` steps a tick."""
+def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> Substeps:
+    """Return the arguments of `advance` for `data` of a cell, whose `model` makes `steps` steps a
+    tick."""
     bounds = cell.bounds
     high = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
     low = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
@@ -50,16 +60,26 @@ def substeps(cell: Cell, data: mujoco.MjData, steps: int) -> Substeps:
         data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied
     )
     return Substeps(
-        cell.model._address,
+        model._address,
         data._address,
         np.stack((qpos + cell.qpos, qvel + cell.dof, motors + cell.dof, brakes + cell.dof)),
         memory,
         np.stack((low, high, *np.zeros((steps, *low.shape)))),
-        np.zeros((2, mujoco.mj_stateSize(cell.model, STATE))),
+        data.tree_asleep,
+        np.zeros((2, state_size(model))),
         data.warning.number,
-        *contact_views(cell.model, data),
+        *contact_views(model, data),
         cell.touch,
     )
+
+
+@compiled
+def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -> None:
+    """Fill `state` as `save_state` does; `asleep` is MuJoCo's `tree_asleep`."""
+    mj_get_state(model, data, state.ctypes.data, INTEGRATION)
+    first = len(state) - len(asleep)
+    for tree in range(len(asleep)):
+        state[first + tree] = asleep[tree]
 
 
 @compiled
@@ -71,6 +91,7 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     places: NDArray[np.int64],
     memory: Array,
     judged: Array,
+    asleep: NDArray[np.int32],
     states: Array,
     warnings: NDArray[np.int32],
     contacts: NDArray[np.int32],
@@ -90,7 +111,7 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     high = judged[1]
     seen = judged[2:]
     if begin == 0:
-        mj_get_state(model, data, before.ctypes.data, STATE)
+        copy_state(model, data, asleep, before)
     for step in range(begin, len(seen)):
         mj_step(model, data)
         sound = True
@@ -115,20 +136,14 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     return len(seen)
 
 
-@compiled
-def copy_state(model: int, data: int, state: Array) -> None:
-    """Fill `state` with MuJoCo's integration state."""
-    mj_get_state(model, data, state.ctypes.data, STATE)
-
-
 def preload() -> None:
     """Load this module's compiled functions."""
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     data = mujoco.MjData(model)
     table = np.zeros((3, 3, 0))
     touch = np.zeros((0, 0), dtype=bool)
-    states = np.zeros((2, mujoco.mj_stateSize(model, STATE)))
-    own: list[Any] = [np.zeros((4, 0), dtype=int), np.zeros(0), table, states, data.warning.number]
-    own += [*contact_views(model, data), touch]
+    states = np.zeros((2, state_size(model)))
+    own: list[Any] = [np.zeros((4, 0), dtype=int), np.zeros(0), table, data.tree_asleep]
+    own += [states, data.warning.number, *contact_views(model, data), touch]
     advance.load()(1, 0.0, model._address, data._address, *own)
-    copy_state.load()(model._address, data._address, states[0])
+    copy_state.load()(model._address, data._address, data.tree_asleep, states[0])

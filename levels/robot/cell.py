@@ -25,6 +25,7 @@ from rack.levels.robot.limits import (
 )
 from rack.levels.robot.linkage import Linkage, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
+from rack.levels.robot.state import state_size
 from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
@@ -32,8 +33,6 @@ TOUCHING_M = 5e-5
 """Geoms closer than this at home touch: rounding decides."""
 SETTLING_S = 1.0
 """Time in which the fingers of a gripper come to rest."""
-STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-"""Everything the next step depends on: a simulation restored from it continues bit for bit."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def sizes(cell: Cell) -> dict[str, int]:
     found = {
         "joints": len(cell.qpos),
         "bodies": max(1, len(cell.bodies)),
-        "state": mujoco.mj_stateSize(cell.model, STATE),
+        "state": state_size(cell.model),
     }
     return found if cell.hand is None else {**found, "fingers": len(cell.hand.names)}
 

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.compiled import compiled
-from rack.levels.robot.cell import STATE
 
+INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 LIBRARY = Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionString()}")
 
 
@@ -71,6 +71,7 @@ mj_get_state = native("mj_getState", 4)
 mju_mat_to_quat = native("mju_mat2Quat", 2)
 mju_mul_quat = native("mju_mulQuat", 3)
 mj_set_state = native("mj_setState", 4)
+mj_update_sleep = native("mj_updateSleep", 2)
 
 
 def one_view(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -104,8 +105,8 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     The bindings give a copy of their number, and views of the contacts of one moment. But contacts
     always begin the arena, and their number follows warnings and timers (mjdata.h).
     """
-    state = np.zeros(mujoco.mj_stateSize(model, STATE))
-    mujoco.mj_getState(model, data, state, STATE)
+    state = np.zeros(mujoco.mj_stateSize(model, INTEGRATION))
+    mujoco.mj_getState(model, data, state, INTEGRATION)
     warnings = data.warning.number
     timers = data.timer.number
     end = warnings.ctypes.data - warnings.itemsize + len(warnings) * warnings.strides[0]
@@ -129,7 +130,7 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
         _view(distance.ctypes.data, np.float64, (room,), strides[:1]),
     )
     mujoco.mj_forward(model, data)  # without the contact added
-    mujoco.mj_setState(model, data, state, STATE)
+    mujoco.mj_setState(model, data, state, INTEGRATION)
     return views
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
+from rack.levels.robot.state import SLEEP
 from rack.levels.tables import FollowConfig, GripperConfig, RobotConfig, ToolConfig
 
 GRID_CELLS = 4_000_000
@@ -96,10 +97,9 @@ def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
     option.timestep = clock_ns * 1e-9 / robot.substeps
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    # A reset to t = 0 would hide a broken state; a sleeping body keeps state outside
-    # mjSTATE_INTEGRATION.
+    # A reset to t = 0 would hide a broken state.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    option.enableflags &= ~SLEEP
     for name in robot.joints:
         joint = spec.joint(name)
         if joint.type == mujoco.mjtJoint.mjJNT_HINGE:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from rack.boards.events import Event
 from rack.levels.algebra import Array
 from rack.levels.messages import SegmentKind, Verb
-from rack.levels.robot.cell import STATE, Cell
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.state import view_state
 from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import worded
 from rack.tools.viewer.shapes import shape_of, xyzw
@@ -106,11 +107,6 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
         stream.static((FRAMES, name), pose)
 
 
-def set_state(cell: Cell, data: mujoco.MjData, state: np.ndarray) -> None:
-    """Set `data` to the state in an `ARM_STATE`."""
-    mujoco.mj_setState(cell.model, data, np.ascontiguousarray(state), STATE)
-
-
 class Poses:
     """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the path
     of the tool."""
@@ -141,7 +137,7 @@ class Poses:
         quaternions = np.empty((len(chosen), count, 4))
         tool = np.empty((len(chosen), 3))
         for row, state in enumerate(block.messages["state"][chosen]):
-            set_state(self._cell, data, state)
+            view_state(self._cell.model, data, state)
             mujoco.mj_kinematics(self._cell.model, data)
             positions[row, : len(bodies)] = data.xpos[bodies]
             quaternions[row, : len(bodies)] = data.xquat[bodies]
@@ -174,7 +170,7 @@ class Pushes:
         data = self._data
         bodies = self._cell.bodies
         for row in self._sampled.rows(block.ticks):
-            set_state(self._cell, data, block.messages["state"][row])
+            view_state(self._cell.model, data, block.messages["state"][row])
             forces = data.xfrc_applied[bodies, :3]
             pushed = forces.any(axis=1)
             if self._is_empty and not pushed.any():

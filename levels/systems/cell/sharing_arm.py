@@ -24,6 +24,8 @@ class SharingArm(SimulatedArm):
     Rows are those of the world model.
     """
 
+    sleeps = False  # an object that is put elsewhere would not wake
+
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:

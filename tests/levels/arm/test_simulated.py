@@ -135,7 +135,7 @@ def test_an_arm_without_commands_stands_still(name: str) -> None:
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Watch) -> None:
     arm, made = arm_of(name)
-    made.model.opt.disableflags |= int(
+    arm._model.opt.disableflags |= int(
         mujoco.mjtDisableBit.mjDSBL_CONTACT
     )  # a contact would stop the arm
     extremes, rng = watched(arm), np.random.default_rng(7)
@@ -157,7 +157,7 @@ def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(
     watched: Watch,
 ) -> None:
     arm, made = arm_of("puma560")
-    made.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    arm._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     extremes, torque = watched(arm), made.bounds.torque * [1, -1, 1, 1, -1, 1]
     for missed in (1, 3, 10, 1, 80):
         for _ in range(60):
@@ -208,7 +208,7 @@ def test_a_broken_simulation_is_a_fault_that_leaves_the_last_sound_state(
     arm, made = arm_of("puma560")
     arm.step(5)
     sound = saved(arm, made)
-    made.model.dof_damping[0] = np.nan
+    arm._model.dof_damping[0] = np.nan
     arm.step(3)
     assert "MuJoCo warning mjWARN_BAD" in arm.fault
     assert arm.tick == 8

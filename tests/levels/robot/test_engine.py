@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.robot.cell import STATE
 from rack.levels.robot.engine import contact_views, mj_step
+from rack.levels.robot.state import save_state, state_size
 from tests.levels.arms import cell
 
 
@@ -30,11 +30,11 @@ def test_asking_for_views_changes_no_motion() -> None:
     one, other = made.start(), made.start()
     contact_views(made.model, one)
     assert one.ncon == other.ncon
-    states = np.zeros((2, mujoco.mj_stateSize(made.model, STATE)))
+    states = np.zeros((2, state_size(made.model)))
     for data, state in zip((one, other), states, strict=True):
         for _ in range(50):
             mujoco.mj_step(made.model, data)
-        mujoco.mj_getState(made.model, data, state, STATE)
+        save_state(made.model, data, state)
     assert np.array_equal(*states)
 
 

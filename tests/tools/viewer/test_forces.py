@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 import rerun.blueprint as rrb
@@ -13,6 +12,7 @@ from rack.backplane.message import MessageType
 from rack.backplane.segment import Launch
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.state import save_state
 from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
 from rack.tools.viewer.cell import Poses
 from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of
@@ -65,7 +65,7 @@ def test_the_arrows_frame_is_at_the_tool_and_turns_with_the_world(
     tmp_path: Path, cell: Cell
 ) -> None:
     data, state = cell.start(), np.zeros(sizes(cell)["state"])
-    mujoco.mj_getState(cell.model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    save_state(cell.model, data, state)
     written = Written(tmp_path)
     written.write(
         ARM_STATE,

@@ -10,7 +10,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from rack.boards.config import load, loads
-from rack.levels.robot.cell import STATE, Cell, build_cell
+from rack.levels.robot.cell import Cell, build_cell
+from rack.levels.robot.state import view_state
 from rack.tools.recording.recording import Recording
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
@@ -73,7 +74,7 @@ def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
     places = read(file, "/frames", "Transform3D:translation").values[:, 0]
     turns = read(file, "/frames", "Transform3D:quaternion").values[:, 0]
     for tick in np.unique(frames.ticks)[::37]:
-        mujoco.mj_setState(cell.model, data, states[tick], STATE)
+        view_state(cell.model, data, states[tick])
         mujoco.mj_kinematics(cell.model, data)
         for row in np.flatnonzero(frames.ticks == tick):
             body = data.body(frames.values[row, 0].removeprefix("body/"))

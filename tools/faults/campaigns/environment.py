@@ -84,13 +84,13 @@ def examine(config: RackConfig) -> None:
     it is not counted.
     """
     # Only here: a process of the load needs none of them.
-    import mujoco
     from numpy import isfinite
 
     from rack.backplane.message import Message
     from rack.levels.arm import SimulatedArm
     from rack.levels.messages import ARM_STATE
-    from rack.levels.robot.cell import STATE, build_cell, sizes
+    from rack.levels.robot.cell import build_cell, sizes
+    from rack.levels.robot.state import save_state
 
     if config.robot is None:
         return
@@ -103,7 +103,7 @@ def examine(config: RackConfig) -> None:
         state = Message(ARM_STATE.dtype(sizes(cell)))
         arm.save(state)
         data.qvel[dof] = FACTOR * limit
-        mujoco.mj_getState(cell.model, data, state.state, STATE)
+        save_state(cell.model, data, state.state)
         arm.restore(state)
         arm.step(1)
         if not arm.violations:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +17,8 @@ import mujoco
 import numpy as np
 
 from rack.boards.config.cell import built_cell
-from rack.levels.robot.cell import STATE, Cell
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.state import restore_state, sleeping
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.harness import pinned
 from rack.tools.recording.recording import Recording
@@ -56,6 +57,7 @@ class Replay:
         in it."""
         config = recording.rack_config
         cell = built_cell(config)
+        cell = replace(cell, model=sleeping(cell.model, config.scene))
         first, last = _stretch(recording)
         status = f"{SERVO}.status"
         state = f"{SERVO}.state"
@@ -82,7 +84,7 @@ class Replay:
         """
         model = self.cell.model
         data = mujoco.MjData(self.cell.model)
-        mujoco.mj_setState(model, data, self.start, STATE)
+        restore_state(model, data, self.start)
         found: list[float] = []
         alone = pinned(pace.core, pace.priority) if pace.priority else nullcontext()
         with alone:
@@ -103,7 +105,7 @@ class Replay:
 
     def _check(self, data: mujoco.MjData) -> None:
         recorded = mujoco.MjData(self.cell.model)
-        mujoco.mj_setState(self.cell.model, recorded, self.end, STATE)
+        restore_state(self.cell.model, recorded, self.end)
         if not (
             np.array_equal(data.qpos, recorded.qpos) and np.array_equal(data.qvel, recorded.qvel)
         ):

@@ -10,7 +10,8 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import ARM_STATE
-from rack.levels.robot.cell import STATE, build_cell, sizes
+from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.robot.state import state_size
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.systems.hand.simulated import SimulatedHand
 from rack.levels.tables import SensorConfig
@@ -172,7 +173,7 @@ def test_state_of_the_simulation_holds_what_valves_remember() -> None:
         one.step(EVERY)
     assert hand.sense().tension[FLEXOR, INDEX1] > 16.0
     assert np.array_equal(again.sense().tension, hand.sense().tension)
-    assert saved(hand).state.shape == (mujoco.mj_stateSize(hand.cell.model, STATE),)
+    assert saved(hand).state.shape == (state_size(hand.cell.model),)
 
 
 def test_encoders_of_a_hand_may_be_coarse() -> None:

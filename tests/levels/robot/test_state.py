@@ -1,0 +1,126 @@
+"""What lies at rest sleeps, wakes when it is moved, and is saved and restored as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+
+from rack.backplane.message import Message
+from rack.boards.checkpoint.kinds import part_kind
+from rack.levels.arm import SimulatedArm
+from rack.levels.messages import ARM_STATE
+from rack.levels.robot.cell import sizes
+from rack.levels.robot.state import SLEEP, sleeping
+from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
+from tests.levels.arms import CLOCK_NS, cell, config
+
+PUSH = PushConfig(body="block1", at=0.5, seconds=0.1, force=(0.0, 2.0, 0.0))
+PUSHED_TICK = 200
+END_TICK = 400
+FALLING_ASLEEP_TICK = 4
+
+
+class Sleepless(SimulatedArm):
+    sleeps = False
+
+
+def arm_of(kind: type[SimulatedArm] = SimulatedArm) -> SimulatedArm:
+    """Return an arm that stands still above a block that is pushed once."""
+    _, scene = config("puma560")
+    return kind(cell("puma560"), scene.model_copy(update={"push": (PUSH,)}), CLOCK_NS)
+
+
+def saved(arm: SimulatedArm) -> Message:
+    message = Message(ARM_STATE.dtype(sizes(arm.cell)))
+    arm.save(message)
+    return message
+
+
+def state(arm: SimulatedArm) -> list[float]:
+    found: list[float] = saved(arm).state.tolist()
+    return found
+
+
+def asleep(arm: SimulatedArm) -> list[bool]:
+    """Return, by tree of bodies, the arm first, whether it sleeps."""
+    return [tree >= 0 for tree in state(arm)[-arm.cell.model.ntree :]]
+
+
+def places(arm: SimulatedArm) -> np.ndarray:
+    rows = arm.cell.object_qpos[:, None] + np.arange(3)
+    return np.array(arm._data.qpos[rows])
+
+
+def test_objects_sleep_and_the_arm_does_not_until_one_is_pushed() -> None:
+    arm = arm_of()
+    assert asleep(arm) == [False] * 4
+    arm.step(PUSHED_TICK)
+    assert asleep(arm) == [False, True, True, True]
+    arm.step(1)
+    assert asleep(arm) == [False, False, True, True]
+    arm.step(END_TICK - PUSHED_TICK - 1)
+    assert asleep(arm) == [False, True, True, True]
+
+
+def test_objects_end_where_they_would_without_sleep() -> None:
+    arm, other = arm_of(), arm_of(Sleepless)
+    start = places(arm)
+    for each in (arm, other):
+        each.step(END_TICK)
+    assert asleep(other) == [False] * 4
+    assert np.abs(places(arm) - start).max() > 0.08
+    assert places(arm) == pytest.approx(places(other), abs=0.005)
+
+
+def by_message(arm: SimulatedArm, again: SimulatedArm) -> None:
+    again.restore(saved(arm))
+
+
+def by_checkpoint(arm: SimulatedArm, again: SimulatedArm) -> None:
+    kind = part_kind(mujoco.MjData)
+    assert kind.contents is not None
+    assert kind.put is not None
+    by_message(arm, again)
+    kind.put(again._data, kind.contents(arm._data))
+
+
+@pytest.mark.parametrize("restore", [by_message, by_checkpoint])
+@pytest.mark.parametrize("tick", [FALLING_ASLEEP_TICK, 100, PUSHED_TICK + 5, END_TICK - 60])
+def test_a_restored_cell_continues_bit_for_bit_asleep_or_awake(
+    tick: int, restore: Callable[[SimulatedArm, SimulatedArm], None]
+) -> None:
+    arm, again = arm_of(), arm_of()
+    arm.step(tick)
+    again.step(PUSHED_TICK + 3)  # where others are awake
+    restore(arm, again)
+    assert state(again) == state(arm)
+    for each in (arm, again):
+        each.step(END_TICK - tick)
+    assert state(again) == state(arm)
+
+
+def test_nothing_sleeps_where_an_obstacle_moves() -> None:
+    made = cell("puma560_crossing")
+    _, scene = config("puma560_crossing")
+    (name, *_) = scene.obstacles
+    moving = SceneConfig(
+        obstacles=(name,), motion=(MotionConfig(body=name, at=0.0, to=(0.0, 0.0, 0.0), speed=0.1),)
+    )
+    assert not sleeping(made.model, moving).opt.enableflags & SLEEP
+    assert sleeping(made.model, SceneConfig()).opt.enableflags & SLEEP
+    assert not made.model.opt.enableflags & SLEEP
+
+
+def test_nothing_sleeps_in_a_model_that_mujoco_would_end_the_process_for() -> None:
+    tied = mujoco.MjModel.from_xml_string("""
+        <mujoco><worldbody>
+          <body><joint name="a"/><geom size=".1"/></body>
+          <body pos="1 0 0"><joint name="b"/><geom size=".1"/></body>
+        </worldbody>
+        <tendon><fixed name="t"><joint joint="a" coef="1"/></fixed>
+          <fixed name="u"><joint joint="b" coef="1"/></fixed></tendon>
+        <equality><tendon tendon1="t" tendon2="u"/></equality></mujoco>""")
+    assert not sleeping(tied, SceneConfig()).opt.enableflags & SLEEP
