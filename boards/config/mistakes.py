@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from rack.boards.errors import Mistake
+from rack.levels.tables import keys_of
 
 HINTS = {
     "robot": (
@@ -98,7 +99,7 @@ def _declared(
         if is_name:  # the name of a table among tables of one type, as in [board.servo]
             is_name = False
             continue
-        known = {f.alias or name: f for kind in models for name, f in kind.model_fields.items()}
+        known = {name: f for kind in models for name, f in keys_of(kind).items()}
         field = known.get(key)
         models = list(_models(field.annotation)) if field is not None else []
         is_name = field is not None and get_origin(field.annotation) is dict

@@ -19,35 +19,26 @@ MOST_UNREAD = 4096
 class InterruptConfig(Table):
     """`[protocol.interrupt]`: the cost of messages that interrupt the boards that read them."""
 
-    fixed_us: Microseconds = Field(
-        50.0, description="time of the interrupt handler for a message of no words, us"
-    )
-    word_us: Microseconds = Field(1.0, description="its time for every word of 4 bytes, us")
-    depth: int = Field(
-        16,
-        ge=1,
-        le=MOST_UNREAD,
-        description="largest number of interrupts that wait at one board; others are lost",
-    )
+    fixed_us: Microseconds = 50.0
+    """time of the interrupt handler for a message of no words, us"""
+    word_us: Microseconds = 1.0
+    """its time for every word of 4 bytes, us"""
+    depth: int = Field(16, ge=1, le=MOST_UNREAD)
+    """largest number of interrupts that wait at one board; others are lost"""
 
 
 class ProtocolConfig(Table):
     """`[protocol]`: how mailboxes are shared."""
 
-    default: Sampled = Field(
-        "time-slice", description="protocol of every mailbox not listed under mailbox"
-    )
-    mailbox: dict[MailboxName, Protocol] = Field(
-        {},
-        description=(
-            "protocol by mailbox; queue: its one reader gets every message, in order; interrupt:"
-            " every message interrupts the boards that read it"
-        ),
-    )
-    interrupt: InterruptConfig = Field(
-        InterruptConfig(), description="protocol interrupt: its cost"
-    )
-    strict: bool = Field(False, description="refuse whatever makes a run depend on timing")
+    default: Sampled = "time-slice"
+    """protocol of every mailbox not listed under mailbox"""
+    mailbox: dict[MailboxName, Protocol] = {}
+    """protocol by mailbox; queue: its one reader gets every message, in order; interrupt: every
+    message interrupts the boards that read it"""
+    interrupt: InterruptConfig = InterruptConfig()
+    """protocol interrupt: its cost"""
+    strict: bool = False
+    """refuse whatever makes a run depend on timing"""
     depth: dict[MailboxName, Annotated[int, Field(ge=1, le=MOST_UNREAD)]] = Field(
         {}, description=f"largest number of unread messages, by queue; default: {UNREAD}"
     )

@@ -18,17 +18,14 @@ class RecordConfig(Table):
     a run, and for good what surrounds a fault, a detection, a miss, a hold, a restart or a lost
     row."""
 
-    checkpoint_s: Span = Field(
-        5.0, description="between checkpoints in lockstep, s; simulated time; 0: none are taken"
-    )
-    keep: Stretch | None = Field(
-        None,
-        description=(
-            'last stretch kept, s; simulated time; also as in "10 min" or "30 s"; default: all'
-        ),
-    )
-    before: Span = Field(5.0, description='kept before each of these, s; also as in "5 s"')
-    after: Span = Field(5.0, description='kept after each of these, s; also as in "5 s"')
+    checkpoint_s: Span = 5.0
+    """between checkpoints in lockstep, s; simulated time; 0: none are taken"""
+    keep: Stretch | None = None
+    """last stretch kept, s; simulated time; also as in "10 min" or "30 s"; default: all"""
+    before: Span = 5.0
+    """kept before each of these, s; also as in "5 s" """
+    after: Span = 5.0
+    """kept after each of these, s; also as in "5 s" """
 
     @model_validator(mode="after")
     def _remembers(self) -> Self:

@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
+from pydantic_core.core_schema import ModelSchema
 
 from rack.boards.config.files import EXTENDS
 from rack.boards.config.rules.mailboxes import exchange, ports
@@ -20,6 +22,7 @@ from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.wiring import Wiring
 from rack.boards.errors import ConfigError, shown
 from rack.boards.faults.kind import KINDS, Parameter
+from rack.levels.tables import keys_of
 
 UNIT = re.compile(
     r", ((?:kg m2|N s/m|N/\(m s\)|N/m|N m/rad|N"
@@ -73,6 +76,17 @@ class Place(NamedTuple):
         return f"{text} with {self.variant}" if self.variant else text
 
 
+class DescribedSchema(GenerateJsonSchema):
+    """The JSON schema of a table, with the descriptions of its keys."""
+
+    def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
+        """Return the schema of one table."""
+        found = super().model_schema(schema)
+        for key, field in keys_of(schema["cls"]).items():
+            found["properties"][key]["description"] = field.description or ""
+        return found
+
+
 def key_tables(config: RackConfig) -> list[KeyTable]:
     """Return every table that a config of these boards may contain. Raises `ConfigError` for a
     missing class."""
@@ -116,7 +130,7 @@ def _within(name: str, known: Iterable[str]) -> list[str]:
 
 
 def _tables(model: type[BaseModel], name: str, place: Place) -> Iterator[KeyTable]:
-    schema = model.model_json_schema()
+    schema = model.model_json_schema(schema_generator=DescribedSchema)
     yield from _walk(schema, schema.get("$defs", {}), name, place)
 
 

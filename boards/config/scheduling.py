@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
-
 from rack.levels.tables import Table
 
 Scheduler = Literal["fixed-priority", "earliest-deadline-first"]
@@ -18,15 +16,9 @@ lets whoever uses more wait for the next cycle."""
 class Scheduling(Table):
     """Which scheduling boards ask for, and what happens if it is refused."""
 
-    scheduler: Scheduler = Field(
-        "fixed-priority",
-        description=(
-            "fixed-priority: SCHED_FIFO, by the boards' priority; earliest-deadline-first: in real"
-            " time SCHED_DEADLINE, by their cycles, with twice their budgets reserved; on any core"
-            " where the kernel refuses theirs"
-        ),
-    )
-    on_no_realtime: OnNoRealtime = Field(
-        "warn",
-        description="if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch",
-    )
+    scheduler: Scheduler = "fixed-priority"
+    """fixed-priority: SCHED_FIFO, by the boards' priority; earliest-deadline-first: in real time
+    SCHED_DEADLINE, by their cycles, with twice their budgets reserved; on any core where the kernel
+    refuses theirs"""
+    on_no_realtime: OnNoRealtime = "warn"
+    """if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch"""

@@ -71,104 +71,66 @@ LONGEST_EVERY = 1_000_000
 class ClockConfig(Scheduling):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
-    period_ms: float = Field(
-        ge=SHORTEST_MS,
-        le=1000,
-        allow_inf_nan=False,
-        description="tick period, ms; a whole number of ns",
-    )
-    mode: Mode = Field(
-        "realtime",
-        description=(
-            "realtime: ticks follow wall-clock time; lockstep: each tick comes once every task is"
-            " done"
-        ),
-    )
-    speed: float = Field(
-        1.0,
-        ge=0.001,
-        le=1000,
-        allow_inf_nan=False,
-        description="simulated time divided by real time; 2 runs twice as fast",
-    )
-    wake: Wake = Field(
-        "timer",
-        description=(
-            "how boards wait for their next cycle: timer: each sleeps to its own grid point;"
-            " signal: until the clock wakes them; poll: busy-wait"
-        ),
-    )
-    idle_cores: Literal["sleep", "awake"] = Field(
-        "sleep",
-        description=(
-            "in real time, idle cores sleep or are held awake, which root alone may do; awake:"
-            " wake-ups are earlier by some 20 us on bare metal; a virtual machine may lose its"
-            " cores for ms; see rack bench clock"
-        ),
-    )
-    core: Core = Field(0, description="core of the system controller")
-    priority: Priority = Field(
-        0, description="SCHED_FIFO priority of the system controller; 0: ordinary scheduling"
-    )
+    period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False)
+    """tick period, ms; a whole number of ns"""
+    mode: Mode = "realtime"
+    """realtime: ticks follow wall-clock time; lockstep: each tick comes once every task is done"""
+    speed: float = Field(1.0, ge=0.001, le=1000, allow_inf_nan=False)
+    """simulated time divided by real time; 2 runs twice as fast"""
+    wake: Wake = "timer"
+    """how boards wait for their next cycle: timer: each sleeps to its own grid point; signal: until
+    the clock wakes them; poll: busy-wait"""
+    idle_cores: Literal["sleep", "awake"] = "sleep"
+    """in real time, idle cores sleep or are held awake, which root alone may do; awake: wake-ups
+    are earlier by some 20 us on bare metal; a virtual machine may lose its cores for ms; see rack
+    bench clock"""
+    core: Core = 0
+    """core of the system controller"""
+    priority: Priority = 0
+    """SCHED_FIFO priority of the system controller; 0: ordinary scheduling"""
 
 
 class TimingConfig(Table):
     """`[timing]`: assumptions of the timing model about the processors."""
 
-    context_switch_ms: Milliseconds = Field(
-        0.1, description="time of one context switch (t_cs), ms; the paper takes 0.1"
-    )
-    response_ms: float | None = Field(
-        None,
-        ge=SHORTEST_MS,
-        le=1e9,
-        description=(
-            "goal for the response time R_s of the system (eqs 3.2, 3.3), ms; simulated time; R_max"
-            " is R_s / n"
-        ),
-    )
-    clock_ms: Milliseconds = Field(
-        0.0, description="processor time of the system clock's board per tick, ms"
-    )
-    small_share: float = Field(
-        0.1,
-        gt=0,
-        le=1,
-        description="largest fraction of a cycle that counts as much smaller than it (eq. 3.10)",
-    )
+    context_switch_ms: Milliseconds = 0.1
+    """time of one context switch (t_cs), ms; the paper takes 0.1"""
+    response_ms: float | None = Field(None, ge=SHORTEST_MS, le=1e9)
+    """goal for the response time R_s of the system (eqs 3.2, 3.3), ms; simulated time; R_max is R_s
+    / n"""
+    clock_ms: Milliseconds = 0.0
+    """processor time of the system clock's board per tick, ms"""
+    small_share: float = Field(0.1, gt=0, le=1)
+    """largest fraction of a cycle that counts as much smaller than it (eq. 3.10)"""
 
 
 class ScheduleConfig(Table):
     """`[schedule]`: a static cyclic schedule, in which every board has its place; see
     `rack.levels.timing.frames`."""
 
-    minor_ms: Positive = Field(
-        description=(
-            "minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"
-        )
-    )
-    major_ms: Positive = Field(
-        description=(
-            "major frame, ms; a multiple of the minor one, which every board's cycle divides"
-        )
-    )
+    minor_ms: Positive
+    """minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"""
+    major_ms: Positive
+    """major frame, ms; a multiple of the minor one, which every board's cycle divides"""
 
 
 class BudgetConfig(Table):
     """`[board.<name>.budget]`: the level's worst-case processor times, for the timing model."""
 
-    read_ms: Milliseconds = Field(0.0, description="R: read commands and statuses, per cycle, ms")
-    process_ms: Milliseconds = Field(0.0, description="X: process, per cycle, ms")
-    write_ms: Milliseconds = Field(0.0, description="W: write commands and statuses, per cycle, ms")
-    exchange_ms: Milliseconds = Field(0.0, description="C: read the plan, per cycle, ms")
-    plan_ms: Milliseconds = Field(0.0, description="P: plan, per plan, ms")
-    update_ms: Milliseconds = Field(0.0, description="U: write the plan, per plan, ms")
-    plan_within_ms: float | None = Field(
-        None,
-        gt=0,
-        le=1e7,
-        description="longest acceptable time for a new plan, ms; an upper limit on within_cycles",
-    )
+    read_ms: Milliseconds = 0.0
+    """R: read commands and statuses, per cycle, ms"""
+    process_ms: Milliseconds = 0.0
+    """X: process, per cycle, ms"""
+    write_ms: Milliseconds = 0.0
+    """W: write commands and statuses, per cycle, ms"""
+    exchange_ms: Milliseconds = 0.0
+    """C: read the plan, per cycle, ms"""
+    plan_ms: Milliseconds = 0.0
+    """P: plan, per plan, ms"""
+    update_ms: Milliseconds = 0.0
+    """U: write the plan, per plan, ms"""
+    plan_within_ms: float | None = Field(None, gt=0, le=1e7)
+    """longest acceptable time for a new plan, ms; an upper limit on within_cycles"""
 
     @property
     def cycle_ms(self) -> float:
@@ -180,148 +142,97 @@ class TransferConfig(Table):
     """`[board.<name>.transfer]`: minimum processor times of bus accesses, to emulate a slower
     bus."""
 
-    read_ms: Milliseconds = Field(
-        0.0, description="R: the executor reads commands and statuses, per cycle, ms"
-    )
-    write_ms: Milliseconds = Field(
-        0.0, description="W: the executor writes commands and statuses, per cycle, ms"
-    )
-    exchange_ms: Milliseconds = Field(
-        0.0, description="C: the executor reads the plan, per cycle, ms"
-    )
-    update_ms: Milliseconds = Field(0.0, description="U: the planner writes its plan, ms")
+    read_ms: Milliseconds = 0.0
+    """R: the executor reads commands and statuses, per cycle, ms"""
+    write_ms: Milliseconds = 0.0
+    """W: the executor writes commands and statuses, per cycle, ms"""
+    exchange_ms: Milliseconds = 0.0
+    """C: the executor reads the plan, per cycle, ms"""
+    update_ms: Milliseconds = 0.0
+    """U: the planner writes its plan, ms"""
 
 
 class ExchangeConfig(Table):
     """`[board.<name>.exchange.<port>]`: when the executor reads one of its ports; default: in every
     cycle."""
 
-    every: int = Field(
-        1,
-        ge=1,
-        le=LONGEST_EVERY,
-        description="read in every n-th cycle; in between, the last message stays",
-    )
-    phase: int = Field(
-        0, ge=0, description="number, less than every, of the first cycle that reads it, cycles"
-    )
-    asynchronous: bool = Field(
-        False,
-        description=(
-            "read the newest message as soon as it is written; in real time, runs then differ"
-        ),
-    )
+    every: int = Field(1, ge=1, le=LONGEST_EVERY)
+    """read in every n-th cycle; in between, the last message stays"""
+    phase: int = Field(0, ge=0)
+    """number, less than every, of the first cycle that reads it, cycles"""
+    asynchronous: bool = False
+    """read the newest message as soon as it is written; in real time, runs then differ"""
 
 
 class SupervisionConfig(Table):
     """`[supervision]`: restarts of boards that die or hang. When none are left, the brakes stay
     engaged."""
 
-    restarts: Restarts = Field(
-        5, description="maximum number of restarts of one task within within_s; 0: never restart"
-    )
-    within_s: Positive = Field(
-        10.0, description="time window in which restarts are counted, s; simulated time"
-    )
-    lockstep_restart_s: Positive = Field(
-        0.5,
-        description=(
-            "in lockstep, simulated time until a lost task returns, s; in real time it returns when"
-            " ready"
-        ),
-    )
+    restarts: Restarts = 5
+    """maximum number of restarts of one task within within_s; 0: never restart"""
+    within_s: Positive = 10.0
+    """time window in which restarts are counted, s; simulated time"""
+    lockstep_restart_s: Positive = 0.5
+    """in lockstep, simulated time until a lost task returns, s; in real time it returns when
+    ready"""
 
 
 class BoardConfig(Table):
     """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
 
-    slot: Slot = Field(description="slot in the crate; slot 1 is the clock's")
-    core: Core = Field(
-        0, description="core of the board; if the machine lacks it, another core is used"
-    )
-    rate_hz: Positive | None = Field(
-        None,
-        ge=1e-6,
-        description=(
-            "rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"
-        ),
-    )
-    every: int | None = Field(
-        None,
-        ge=1,
-        le=LONGEST_EVERY,
-        description="instead of rate_hz: period of the executor, ticks",
-    )
-    phase: int = Field(
-        0,
-        ge=0,
-        description=(
-            "first tick of the board, less than its period; its releases follow every period, ticks"
-        ),
-    )
-    priority: Priority = Field(
-        0, description="SCHED_FIFO priority of the executor; 0: ordinary scheduling"
-    )
-    wake: Wake | None = Field(
-        None, description="how this board waits for its next cycle; default: clock.wake"
-    )
-    above: Neighbours = Field(
-        (), description="board of the level above, whose commands this level reads; or a list"
-    )
-    below: Neighbours = Field(
-        (), description="board of the level below, whose status this level reads; or a list"
-    )
-    executor: ClassName = Field(description="class of the executor, package.module:Class")
-    planner: ClassName | None = Field(
-        None, description="class of the planner, package.module:Class"
-    )
-    coupling: Coupling = Field(
-        "none",
-        description="tight: planner on this board; loose: on its own board; none: no planner",
-    )
-    within_cycles: int = Field(1, ge=1, le=10_000, description="time allowed for one plan, cycles")
-    planner_slot: Slot | None = Field(None, description="slot of a loosely coupled planner")
-    planner_core: Core | None = Field(
-        None, description="core of a loosely coupled planner; default: the board's"
-    )
-    planner_priority: Priority = Field(
-        0, description="SCHED_FIFO priority of the planner; 0: ordinary scheduling"
-    )
-    reads: dict[str, Sources] = Field(
-        {}, description="mailbox by port of the executor, or a list; overrides the level's own"
-    )
-    planner_reads: dict[str, Sources] = Field(
-        {}, description="mailbox by port of the planner, likewise"
-    )
-    exchange: dict[str, ExchangeConfig] = Field(
-        {},
-        description=(
-            "when the executor reads a port, by port; also records the ages of all its messages"
-        ),
-    )
-    params: dict[str, Any] = Field({}, description="parameters of the level, declared by its class")
-    budget: BudgetConfig | None = Field(
-        None, description="worst-case processor times, for the timing model"
-    )
-    transfer: TransferConfig = Field(
-        TransferConfig(), description="emulation of a slower bus for this board"
-    )
-    ends_run: bool = Field(
-        False, description="end the run when this level's status is done or error"
-    )
-    restarts: Restarts | None = Field(
-        None, description="overrides supervision.restarts for this board's tasks"
-    )
-    restarts_within_s: Positive | None = Field(
-        None, description="overrides supervision.within_s for this board's tasks, s"
-    )
-    on_loss: OnLoss = Field(
-        "hold",
-        description=(
-            "while this board is lost: hold: the level below holds; stop: the arm ramps to rest,"
-            " then brakes; brake: the arm brakes at once"
-        ),
-    )
+    slot: Slot
+    """slot in the crate; slot 1 is the clock's"""
+    core: Core = 0
+    """core of the board; if the machine lacks it, another core is used"""
+    rate_hz: Positive | None = Field(None, ge=1e-6)
+    """rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"""
+    every: int | None = Field(None, ge=1, le=LONGEST_EVERY)
+    """instead of rate_hz: period of the executor, ticks"""
+    phase: int = Field(0, ge=0)
+    """first tick of the board, less than its period; its releases follow every period, ticks"""
+    priority: Priority = 0
+    """SCHED_FIFO priority of the executor; 0: ordinary scheduling"""
+    wake: Wake | None = None
+    """how this board waits for its next cycle; default: clock.wake"""
+    above: Neighbours = ()
+    """board of the level above, whose commands this level reads; or a list"""
+    below: Neighbours = ()
+    """board of the level below, whose status this level reads; or a list"""
+    executor: ClassName
+    """class of the executor, package.module:Class"""
+    planner: ClassName | None = None
+    """class of the planner, package.module:Class"""
+    coupling: Coupling = "none"
+    """tight: planner on this board; loose: on its own board; none: no planner"""
+    within_cycles: int = Field(1, ge=1, le=10_000)
+    """time allowed for one plan, cycles"""
+    planner_slot: Slot | None = None
+    """slot of a loosely coupled planner"""
+    planner_core: Core | None = None
+    """core of a loosely coupled planner; default: the board's"""
+    planner_priority: Priority = 0
+    """SCHED_FIFO priority of the planner; 0: ordinary scheduling"""
+    reads: dict[str, Sources] = {}
+    """mailbox by port of the executor, or a list; overrides the level's own"""
+    planner_reads: dict[str, Sources] = {}
+    """mailbox by port of the planner, likewise"""
+    exchange: dict[str, ExchangeConfig] = {}
+    """when the executor reads a port, by port; also records the ages of all its messages"""
+    params: dict[str, Any] = {}
+    """parameters of the level, declared by its class"""
+    budget: BudgetConfig | None = None
+    """worst-case processor times, for the timing model"""
+    transfer: TransferConfig = TransferConfig()
+    """emulation of a slower bus for this board"""
+    ends_run: bool = False
+    """end the run when this level's status is done or error"""
+    restarts: Restarts | None = None
+    """overrides supervision.restarts for this board's tasks"""
+    restarts_within_s: Positive | None = None
+    """overrides supervision.within_s for this board's tasks, s"""
+    on_loss: OnLoss = "hold"
+    """while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then
+    brakes; brake: the arm brakes at once"""
 
 
 LAN = "lan"
@@ -332,25 +243,20 @@ class LanConfig(LanTable):
     """`[adapter.lan]`: the board that exchanges mailboxes with other racks: see
     `rack.boards.lan.adapter`."""
 
-    slot: Slot = Field(description="slot in the crate; slot 1 is the clock's")
-    core: Core = Field(
-        0, description="core of the board; if the machine lacks it, another core is used"
-    )
-    rate_hz: Positive = Field(
-        50.0, ge=1e-6, description="rate of the board, Hz; must divide the clock rate"
-    )
-    priority: Priority = Field(
-        0, description="SCHED_FIFO priority, above the other boards' of its core; 0: ordinary"
-    )
-    budget: BudgetConfig | None = Field(
-        None, description="worst-case processor times, for the timing model"
-    )
-    restarts: Restarts | None = Field(
-        None, description="overrides supervision.restarts for this board"
-    )
-    restarts_within_s: Positive | None = Field(
-        None, description="overrides supervision.within_s for this board, s"
-    )
+    slot: Slot
+    """slot in the crate; slot 1 is the clock's"""
+    core: Core = 0
+    """core of the board; if the machine lacks it, another core is used"""
+    rate_hz: Positive = Field(50.0, ge=1e-6)
+    """rate of the board, Hz; must divide the clock rate"""
+    priority: Priority = 0
+    """SCHED_FIFO priority, above the other boards' of its core; 0: ordinary"""
+    budget: BudgetConfig | None = None
+    """worst-case processor times, for the timing model"""
+    restarts: Restarts | None = None
+    """overrides supervision.restarts for this board"""
+    restarts_within_s: Positive | None = None
+    """overrides supervision.within_s for this board, s"""
 
     def board(self) -> BoardConfig:
         """Return the board."""
@@ -369,89 +275,63 @@ class LanConfig(LanTable):
 class AdapterConfig(Table):
     """`[adapter]`: ways out of the rack."""
 
-    lan: LanConfig | None = Field(
-        None, description="exchange of mailboxes with other racks over a network"
-    )
+    lan: LanConfig | None = None
+    """exchange of mailboxes with other racks over a network"""
 
 
 class HostConfig(Table):
     """`[host.<name>]`: one board of the host side, without slot, rate and priority: see
     `rack.levels.host_program`."""
 
-    program: ClassName = Field(description="class of the program, package.module:Class")
-    external: bool = Field(
-        False, description="the rack does not start it: it is run by 'rack prompt'"
-    )
-    below: Neighbours = Field(
-        (), description="bus adapter through which it reaches the levels; or a list"
-    )
-    reads: dict[str, Sources] = Field(
-        {}, description="mailbox by port; overrides the program's own"
-    )
-    params: dict[str, Any] = Field(
-        {}, description="parameters of the program, declared by its class"
-    )
-    computing_ms: float = Field(
-        0.0,
-        ge=0.0,
-        le=1e9,
-        description=(
-            "in lockstep, simulated time from a wake-up until what it sends is passed on and it may"
-            " be woken again, ms; in real time its computing takes as long as it takes"
-        ),
-    )
-    restarts: Restarts | None = Field(
-        None, description="overrides supervision.restarts for this board"
-    )
-    restarts_within_s: Positive | None = Field(
-        None, description="overrides supervision.within_s for this board, s"
-    )
+    program: ClassName
+    """class of the program, package.module:Class"""
+    external: bool = False
+    """the rack does not start it: it is run by 'rack prompt'"""
+    below: Neighbours = ()
+    """bus adapter through which it reaches the levels; or a list"""
+    reads: dict[str, Sources] = {}
+    """mailbox by port; overrides the program's own"""
+    params: dict[str, Any] = {}
+    """parameters of the program, declared by its class"""
+    computing_ms: float = Field(0.0, ge=0.0, le=1e9)
+    """in lockstep, simulated time from a wake-up until what it sends is passed on and it may be
+    woken again, ms; in real time its computing takes as long as it takes"""
+    restarts: Restarts | None = None
+    """overrides supervision.restarts for this board"""
+    restarts_within_s: Positive | None = None
+    """overrides supervision.within_s for this board, s"""
 
 
 class CommandConfig(Table):
     """`[[command]]`: one operator command to one level."""
 
-    level: str = Field(description="board whose level is commanded, as in servo or task")
-    what: Literal[Motion, Power] = Field(
-        description=(
-            "hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there;"
-            " modify: put a control modification in or take it out; table: decide by another state"
-            " table; do: do one of the level's own commands; set: set a live parameter of"
-            " the level; enable, disable: give torque to the"
-            " arm, or take it; reset: clear a fault of its drives; release: end robot.bring_up"
-        )
-    )
-    tick: int | None = Field(
-        None,
-        ge=0,
-        le=LAST_TICK,
-        description="tick at which the command is issued; give at most one of tick, at",
-    )
-    at: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = Field(
-        None, description="instead of tick: simulated time, s"
-    )
-    joints: tuple[Finite, ...] | None = Field(None, description="goal: one position per joint, rad")
-    position: Vector | None = Field(
-        None, description="goal: tool position, m; with quaternion or direction"
-    )
-    quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
-        None, description="goal: tool orientation as w, x, y, z"
-    )
-    direction: Vector | None = Field(
-        None,
-        description=(
-            "goal: direction of the tool's z axis, rotation about it left free; default: down"
-        ),
-    )
-    home: bool = Field(False, description="goal: the arm's start position")
-    name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = Field(
-        None,
-        description=(
-            "control modification to put in or take out; name of a table; command to do, as in pick"
-            " block1; parameter to set, as in bandwidth=80"
-        ),
-    )
-    on: bool | None = Field(None, description="true: put it in; false: take it out")
+    level: str
+    """board whose level is commanded, as in servo or task"""
+    what: Literal[Motion, Power]
+    """hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify:
+    put a control modification in or take it out; table: decide by another state table; do: do one
+    of the level's own commands; set: set a live parameter of the level; enable, disable: give
+    torque to the arm, or take it; reset: clear a fault of its drives; release: end
+    robot.bring_up"""
+    tick: int | None = Field(None, ge=0, le=LAST_TICK)
+    """tick at which the command is issued; give at most one of tick, at"""
+    at: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = None
+    """instead of tick: simulated time, s"""
+    joints: tuple[Finite, ...] | None = None
+    """goal: one position per joint, rad"""
+    position: Vector | None = None
+    """goal: tool position, m; with quaternion or direction"""
+    quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
+    """goal: tool orientation as w, x, y, z"""
+    direction: Vector | None = None
+    """goal: direction of the tool's z axis, rotation about it left free; default: down"""
+    home: bool = False
+    """goal: the arm's start position"""
+    name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = None
+    """control modification to put in or take out; name of a table; command to do, as in pick
+    block1; parameter to set, as in bandwidth=80"""
+    on: bool | None = None
+    """true: put it in; false: take it out"""
 
     @property
     def said(self) -> Operation:
@@ -482,45 +362,43 @@ class TaskPlace(NamedTuple):
 class RackConfig(Table):
     """A rack: everything that a run depends on."""
 
-    format: int = Field(
-        1,
-        ge=1,
-        le=FORMAT,
-        description="2: as described here; 1, without this key: from before rack 0.2, whose changes"
-        " a launch tells",
-    )
-    name: RackName = Field(
-        description="name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40"
-    )
-    seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of all random numbers")
-    python_path: tuple[Annotated[Path, Field(strict=False)], ...] = Field(
-        (),
-        description="folders with your own levels, added to the import path; relative to this file",
-    )
-    clock: ClockConfig = Field(description="the system clock")
-    protocol: ProtocolConfig = Field(ProtocolConfig(), description="how mailboxes are shared")
-    timing: TimingConfig = Field(
-        TimingConfig(), description="assumptions of the timing model about the processors"
-    )
-    schedule: ScheduleConfig | None = Field(
-        None, description="static cyclic schedule of all boards, if they have one"
-    )
-    robot: RobotConfig | None = Field(None, description="the arm; required by levels that move one")
-    scene: SceneConfig = Field(SceneConfig(), description="the cell around the arm")
-    task: dict[str, Any] = Field({}, description="program of the task level, declared by its class")
-    board: dict[str, BoardConfig] = Field(
-        min_length=1, description="boards by name; each runs the level of that name"
-    )
-    adapter: AdapterConfig = Field(AdapterConfig(), description="ways out of the rack: the network")
-    host: dict[str, HostConfig] = Field(
-        {}, description="boards of the host side by name, without real time"
-    )
-    supervision: SupervisionConfig = Field(
-        SupervisionConfig(), description="restarts of lost boards"
-    )
-    record: RecordConfig = Field(RecordConfig(), description="what is kept of a run")
-    fault: tuple[FaultConfig, ...] = Field((), description="faults injected into the run")
-    command: tuple[CommandConfig, ...] = Field((), description="operator commands, each at a tick")
+    format: int = Field(1, ge=1, le=FORMAT)
+    """2: as described here; 1, without this key: from before rack 0.2, whose changes a launch
+    tells"""
+    name: RackName
+    """name of the rack and of its shared memory: a-z, 0-9, - and _, at most 40"""
+    seed: int = Field(0, ge=0, le=2**31 - 1)
+    """seed of all random numbers"""
+    python_path: tuple[Annotated[Path, Field(strict=False)], ...] = ()
+    """folders with your own levels, added to the import path; relative to this file"""
+    clock: ClockConfig
+    """the system clock"""
+    protocol: ProtocolConfig = ProtocolConfig()
+    """how mailboxes are shared"""
+    timing: TimingConfig = TimingConfig()
+    """assumptions of the timing model about the processors"""
+    schedule: ScheduleConfig | None = None
+    """static cyclic schedule of all boards, if they have one"""
+    robot: RobotConfig | None = None
+    """the arm; required by levels that move one"""
+    scene: SceneConfig = SceneConfig()
+    """the cell around the arm"""
+    task: dict[str, Any] = {}
+    """program of the task level, declared by its class"""
+    board: dict[str, BoardConfig] = Field(min_length=1)
+    """boards by name; each runs the level of that name"""
+    adapter: AdapterConfig = AdapterConfig()
+    """ways out of the rack: the network"""
+    host: dict[str, HostConfig] = {}
+    """boards of the host side by name, without real time"""
+    supervision: SupervisionConfig = SupervisionConfig()
+    """restarts of lost boards"""
+    record: RecordConfig = RecordConfig()
+    """what is kept of a run"""
+    fault: tuple[FaultConfig, ...] = ()
+    """faults injected into the run"""
+    command: tuple[CommandConfig, ...] = ()
+    """operator commands, each at a tick"""
 
     @model_validator(mode="after")
     def _with_adapters(self) -> Self:

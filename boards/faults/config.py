@@ -41,58 +41,26 @@ class FaultConfig(Table):
     model_config = ConfigDict(extra="allow", frozen=True)
     __pydantic_extra__: dict[str, Parameter]
 
-    kind: str = Field(description="kind of fault; 'rack inject --help' lists the kinds")
-    board: str = Field(
-        description="task to strike: a board (servo), its planner (servo.planner), or clock"
-    )
-    tick: int | None = Field(
-        None,
-        ge=0,
-        le=LAST_TICK,
-        description="first tick; give at most one of tick, at, when; default: the first of the run",
-    )
-    at: float | None = Field(
-        None,
-        ge=0,
-        le=1e9,
-        allow_inf_nan=False,
-        description="instead of tick: start in simulated time, s",
-    )
-    when: str | None = Field(
-        None,
-        description=(
-            'instead of tick: start once this holds, as in "elemental_move.status.verb == grasp"'
-        ),
-    )
-    lasts: Seconds | None = Field(
-        None,
-        alias="for",
-        description='duration in simulated time, as in "0.5s", "20ms" or 0.5 (s); or give cycles',
-    )
-    cycles: int | None = Field(
-        None, ge=1, le=10**6, description="instead of for: duration in cycles of the task"
-    )
-    phase: float = Field(
-        0.0,
-        ge=0,
-        lt=1,
-        description="fraction of the first tick that passes before it strikes; real time only",
-    )
-    mailbox: str | None = Field(
-        None,
-        description=(
-            "mailbox to affect; default: all that the task writes; for masquerade, the first"
-        ),
-    )
-    seed: int | None = Field(
-        None,
-        ge=0,
-        le=2**31 - 1,
-        description=(
-            "seed of its random choices; default: derived from the rack's seed and the fault's"
-            " place"
-        ),
-    )
+    kind: str
+    """kind of fault; 'rack inject --help' lists the kinds"""
+    board: str
+    """task to strike: a board (servo), its planner (servo.planner), or clock"""
+    tick: int | None = Field(None, ge=0, le=LAST_TICK)
+    """first tick; give at most one of tick, at, when; default: the first of the run"""
+    at: float | None = Field(None, ge=0, le=1e9, allow_inf_nan=False)
+    """instead of tick: start in simulated time, s"""
+    when: str | None = None
+    """instead of tick: start once this holds, as in "elemental_move.status.verb == grasp" """
+    lasts: Seconds | None = Field(None, alias="for")
+    """duration in simulated time, as in "0.5s", "20ms" or 0.5 (s); or give cycles"""
+    cycles: int | None = Field(None, ge=1, le=10**6)
+    """instead of for: duration in cycles of the task"""
+    phase: float = Field(0.0, ge=0, lt=1)
+    """fraction of the first tick that passes before it strikes; real time only"""
+    mailbox: str | None = None
+    """mailbox to affect; default: all that the task writes; for masquerade, the first"""
+    seed: int | None = Field(None, ge=0, le=2**31 - 1)
+    """seed of its random choices; default: derived from the rack's seed and the fault's place"""
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -55,23 +55,16 @@ ENTRY = MessageType(
 class EntryConfig(Table):
     """`[board.<name>.params.pass.<port>]`: one mailbox that a bus adapter passes across."""
 
-    source: str = Key(
-        alias="from",
-        description="mailbox to pass, as in program.requests; its side is the direction",
-    )
-    every: int = Key(
-        1, ge=1, le=LAST_TICK, description="exchange in every n-th cycle of the bridge, cycles"
-    )
-    phase: int = Key(0, ge=0, description="with every: which of the n cycles, cycles")
-    asynchronous: bool = Key(
-        False, description="pass each message as it comes, once; default: the newest, repeatedly"
-    )
-    most: int = Key(
-        8,
-        ge=1,
-        le=256,
-        description="messages of a host board looked at in one cycle; the others wait",
-    )
+    source: str = Key(alias="from")
+    """mailbox to pass, as in program.requests; its side is the direction"""
+    every: int = Key(1, ge=1, le=LAST_TICK)
+    """exchange in every n-th cycle of the bridge, cycles"""
+    phase: int = Key(0, ge=0)
+    """with every: which of the n cycles, cycles"""
+    asynchronous: bool = False
+    """pass each message as it comes, once; default: the newest, repeatedly"""
+    most: int = Key(8, ge=1, le=256)
+    """messages of a host board looked at in one cycle; the others wait"""
 
     @model_validator(mode="after")
     def _has_one_mode(self) -> Self:
@@ -91,9 +84,8 @@ class EntryConfig(Table):
 class AdapterParams(Table):
     """`[board.<name>.params]` of a bus adapter."""
 
-    entries: dict[str, EntryConfig] = Key(
-        {}, alias="pass", description="mailboxes to pass, by port of the bridge"
-    )
+    entries: dict[str, EntryConfig] = Key({}, alias="pass")
+    """mailboxes to pass, by port of the bridge"""
 
     @model_validator(mode="after")
     def _has_ports(self) -> Self:

@@ -37,28 +37,24 @@ ENDPOINT_NOTE = (
 class ExportConfig(Table):
     """`[adapter.lan.export.<port>]`: one mailbox of this rack that others may import."""
 
-    source: Local = Field(
-        alias="from", description="mailbox, as in task.status; others import it as RACK/task.status"
-    )
-    rate_hz: float = Field(
-        10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's"
-    )
+    source: Local = Field(alias="from")
+    """mailbox, as in task.status; others import it as RACK/task.status"""
+    rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
+    """rate of the exchange, Hz; divides the adapter's"""
 
 
 class ImportConfig(Table):
     """`[adapter.lan.import.<port>]`: one mailbox of another rack, which levels here read as
     `lan.<port>`."""
 
-    source: Remote = Field(alias="from", description="rack and mailbox, as in cell/task.orders")
-    type: TypeName = Field(description="message type of that mailbox, package.module:TYPE")
-    rate_hz: float = Field(
-        10.0, gt=0, le=FASTEST_HZ, description="rate of the exchange, Hz; divides the adapter's"
-    )
-    max_age_ms: Positive = Field(
-        description=(
-            "age from which a message is old and its writer counts as lost, ms; simulated time"
-        )
-    )
+    source: Remote = Field(alias="from")
+    """rack and mailbox, as in cell/task.orders"""
+    type: TypeName
+    """message type of that mailbox, package.module:TYPE"""
+    rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
+    """rate of the exchange, Hz; divides the adapter's"""
+    max_age_ms: Positive
+    """age from which a message is old and its writer counts as lost, ms; simulated time"""
 
     @property
     def rack(self) -> str:
@@ -89,58 +85,31 @@ class LanTable(Table):
     connect: tuple[EndpointText, ...] = Field(
         (), description=f"endpoints of other racks, {ENDPOINT_NOTE}"
     )
-    certificates: str | None = Field(
-        None,
-        description=(
-            "folder with this rack's certificate and key; see rack lan certificates --help"
-        ),
-    )
-    insecure: bool = Field(
-        False,
-        description="permit endpoints without TLS beyond loopback, or without certificates on it",
-    )
-    lease_ms: float = Field(
-        500.0, ge=20, le=60_000, description="real time of silence from which a peer is lost, ms"
-    )
-    on_peer_loss: OnPeerLoss = Field(
-        "hold",
-        description=(
-            "while a rack that was there is lost: hold: levels find what it writes lost at once,"
-            " and hold, until its first message after that; stop: the same, and the arm ramps to"
-            " rest, then brakes, until it is back; go on: levels keep its last message, however old"
-        ),
-    )
-    peers: tuple[PeerName, ...] = Field(
-        (),
-        description=(
-            "racks with which this one works, besides those from which it imports: they may import,"
-            " and lockstep waits for them"
-        ),
-    )
-    launch: tuple[str, ...] = Field(
-        (),
-        description=(
-            "configs of racks that `rack run` launches with this one, on this machine; each in a"
-            " process of its own"
-        ),
-    )
-    permit: dict[PeerName, Rights] = Field(
-        {},
-        description=(
-            "what others may do besides exchanging mailboxes, by name, which certificates prove;"
-            " watch: read status and signals; command: command levels; stop: set the emergency"
-            " stop"
-        ),
-    )
-    most_bytes: int = Field(
-        16_384, ge=64, le=1 << 20, description="length of the longest message taken; bytes"
-    )
-    exports: dict[PortName, ExportConfig] = Field(
-        {}, alias="export", description="mailboxes that others may import"
-    )
-    imports: dict[PortName, ImportConfig] = Field(
-        {}, alias="import", description="mailboxes of other racks, by port"
-    )
+    certificates: str | None = None
+    """folder with this rack's certificate and key; see rack lan certificates --help"""
+    insecure: bool = False
+    """permit endpoints without TLS beyond loopback, or without certificates on it"""
+    lease_ms: float = Field(500.0, ge=20, le=60_000)
+    """real time of silence from which a peer is lost, ms"""
+    on_peer_loss: OnPeerLoss = "hold"
+    """while a rack that was there is lost: hold: levels find what it writes lost at once, and hold,
+    until its first message after that; stop: the same, and the arm ramps to rest, then brakes,
+    until it is back; go on: levels keep its last message, however old"""
+    peers: tuple[PeerName, ...] = ()
+    """racks with which this one works, besides those from which it imports: they may import, and
+    lockstep waits for them"""
+    launch: tuple[str, ...] = ()
+    """configs of racks that `rack run` launches with this one, on this machine; each in a process
+    of its own"""
+    permit: dict[PeerName, Rights] = {}
+    """what others may do besides exchanging mailboxes, by name, which certificates prove; watch:
+    read status and signals; command: command levels; stop: set the emergency stop"""
+    most_bytes: int = Field(16_384, ge=64, le=1 << 20)
+    """length of the longest message taken; bytes"""
+    exports: dict[PortName, ExportConfig] = Field({}, alias="export")
+    """mailboxes that others may import"""
+    imports: dict[PortName, ImportConfig] = Field({}, alias="import")
+    """mailboxes of other racks, by port"""
 
     @property
     def endpoints(self) -> Iterator[tuple[str, Endpoint]]:
