@@ -47,10 +47,11 @@ that takes none passes `operator` on, down and into its status: without it the s
 an operator cannot be measured.
 
 Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check`
-then reports every mistake before the launch. Executor and planner of a board share one table. A
-field with `json_schema_extra=LIVE`, which the executor alone reads, may be set while the level runs
-if it takes `Operation.SET`: on that command call `set_live`. A level that reads a program from
-`[task]` declares `program = MyProgram`, a `Program`, likewise.
+then reports every mistake before the launch. The text below a field says what it means, with its
+unit: `rack schema` shows it. Executor and planner of a board share one table. A field with
+`json_schema_extra=LIVE`, which the executor alone reads, may be set while the level runs if it
+takes `Operation.SET`: on that command call `set_live`. A level that reads a program from `[task]`
+declares `program = MyProgram`, a `Program`, likewise.
 
 A servo level of your own
 - reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0`

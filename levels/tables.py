@@ -176,27 +176,20 @@ class SensorConfig(Table):
     Velocities have ten times as much of both, in rad/s; see `rack.levels.robot.limits.Encoders`.
     """
 
-    resolution: NotNegative | tuple[NotNegative, ...] = Field(
-        0.0, description="step of a joint position as sensed, rad"
-    )
-    noise: NotNegative | tuple[NotNegative, ...] = Field(
-        0.0, description="standard deviation of a joint position as sensed, rad"
-    )
+    resolution: NotNegative | tuple[NotNegative, ...] = 0.0
+    """step of a joint position as sensed, rad"""
+    noise: NotNegative | tuple[NotNegative, ...] = 0.0
+    """standard deviation of a joint position as sensed, rad"""
 
 
 class CalibrationConfig(Table):
     """`[robot.calibration]`: how the drives' samples become positions of the joints."""
 
-    offset: tuple[Finite, ...] | None = Field(
-        None, description="added to every position that the drives give, rad; default: nothing"
-    )
-    homing: bool = Field(
-        False,
-        description=(
-            "the drives find their reference while they are being enabled, and know no position"
-            " before that"
-        ),
-    )
+    offset: tuple[Finite, ...] | None = None
+    """added to every position that the drives give, rad; default: nothing"""
+    homing: bool = False
+    """the drives find their reference while they are being enabled, and know no position before
+    that"""
 
 
 DAMPING_S = 0.03
@@ -209,42 +202,35 @@ class FollowConfig(Table):
     """`[[robot.gripper.follow]]`: a joint that the gripper moves, though the model couples it to
     nothing. Its own actuator is removed."""
 
-    joint: str = Field(description="MJCF joint that follows the driven one")
-    ratio: Finite = Field(
-        1.0,
-        description="its motion per motion of the driven joint, from the model's reference pose",
-    )
+    joint: str
+    """MJCF joint that follows the driven one"""
+    ratio: Finite = 1.0
+    """its motion per motion of the driven joint, from the model's reference pose"""
 
 
 class GripperConfig(Table):
     """A gripper driven by one actuator along one joint."""
 
-    actuator: str = Field(description="MJCF actuator that drives the gripper")
-    joint: str = Field(description="MJCF joint whose position is the opening")
-    open: Finite = Field(description="joint position when open, m or rad")
-    closed: Finite = Field(description="joint position when closed on nothing, m or rad")
-    force: Positive = Field(description="largest force or torque of the actuator, N or N m")
-    stiffness: Positive | None = Field(
-        None,
-        description=(
-            "position loop, N/m or N m/rad; default: all of the force at half of the way to closed"
-        ),
-    )
-    damping: Positive | None = Field(
-        None,
-        description="position loop, N s/m or N m s/rad; default: 30 ms times the stiffness",
-    )
-    follow: tuple[FollowConfig, ...] = Field(
-        (), description="joints that follow the driven one, where the model does not say so"
-    )
-    residual: Positive = Field(
-        0.012,
-        description=(
-            "how far fingers may settle from where planning poses them, because soft couplings"
-            " yield, or a loop may stay open, m; by default less than the 15 mm that planned motion"
-            " keeps from everything"
-        ),
-    )
+    actuator: str
+    """MJCF actuator that drives the gripper"""
+    joint: str
+    """MJCF joint whose position is the opening"""
+    open: Finite
+    """joint position when open, m or rad"""
+    closed: Finite
+    """joint position when closed on nothing, m or rad"""
+    force: Positive
+    """largest force or torque of the actuator, N or N m"""
+    stiffness: Positive | None = None
+    """position loop, N/m or N m/rad; default: all of the force at half of the way to closed"""
+    damping: Positive | None = None
+    """position loop, N s/m or N m s/rad; default: 30 ms times the stiffness"""
+    follow: tuple[FollowConfig, ...] = ()
+    """joints that follow the driven one, where the model does not say so"""
+    residual: Positive = 0.012
+    """how far fingers may settle from where planning poses them, because soft couplings yield, or a
+    loop may stay open, m; by default less than the 15 mm that planned motion keeps from
+    everything"""
 
     @model_validator(mode="after")
     def _opens(self) -> GripperConfig:
@@ -273,183 +259,122 @@ class WristConfig(Table):
     """`[robot.wrist]`: a force/torque sensor between arm and tool, and the arm's limits on
     contact."""
 
-    force: str = Field(description="MJCF force sensor; its cutoff is its range, N")
-    torque: str = Field(
-        description="MJCF torque sensor at the same site; its cutoff is its range, N m"
-    )
-    most_force: Positive = Field(
-        description="force of a contact at which the arm stops, N; within the range"
-    )
-    most_torque: Positive = Field(
-        description="torque of a contact at which the arm stops, N m; within the range"
-    )
-    noise: NotNegative = Field(
-        0.0, description="standard deviation of a force as sensed, N; of a torque a tenth, N m"
-    )
+    force: str
+    """MJCF force sensor; its cutoff is its range, N"""
+    torque: str
+    """MJCF torque sensor at the same site; its cutoff is its range, N m"""
+    most_force: Positive
+    """force of a contact at which the arm stops, N; within the range"""
+    most_torque: Positive
+    """torque of a contact at which the arm stops, N m; within the range"""
+    noise: NotNegative = 0.0
+    """standard deviation of a force as sensed, N; of a torque a tenth, N m"""
 
 
 class FingerConfig(Table):
     """`[[robot.hand.finger]]`: one finger."""
 
-    name: str = Field(description="name of the finger")
-    tip: str = Field(description="MJCF site at its tip")
-    joints: tuple[str, ...] = Field(
-        min_length=1, description="its joints, base to tip; of robot.joints"
-    )
+    name: str
+    """name of the finger"""
+    tip: str
+    """MJCF site at its tip"""
+    joints: tuple[str, ...] = Field(min_length=1)
+    """its joints, base to tip; of robot.joints"""
 
 
 class HandConfig(Table):
     """`[robot.hand]`: a hand whose joints are driven by pairs of tendons, which can only pull. One
     value per joint."""
 
-    finger: tuple[FingerConfig, ...] = Field(min_length=1, description="the fingers")
-    flexors: tuple[str, ...] = Field(
-        description="MJCF actuators on the tendons that turn a joint in positive direction"
-    )
-    extensors: tuple[str, ...] = Field(
-        description="MJCF actuators on the tendons that turn it back"
-    )
-    least: Positive = Field(description="tension below which a tendon is slack, N")
-    rest: Positive = Field(
-        description="mean tension of a pair at rest, N; it stiffens nothing in a linear tendon"
-    )
-    closed: NotNegative = Field(
-        0.0,
-        description=(
-            "stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its"
-            " tension"
-        ),
-    )
+    finger: tuple[FingerConfig, ...] = Field(min_length=1)
+    """the fingers"""
+    flexors: tuple[str, ...]
+    """MJCF actuators on the tendons that turn a joint in positive direction"""
+    extensors: tuple[str, ...]
+    """MJCF actuators on the tendons that turn it back"""
+    least: Positive
+    """tension below which a tendon is slack, N"""
+    rest: Positive
+    """mean tension of a pair at rest, N; it stiffens nothing in a linear tendon"""
+    closed: NotNegative = 0.0
+    """stiffness of a tendon whose valve is closed, by the air in it, N/m; 0: it keeps its
+    tension"""
 
 
 class ToolConfig(Table):
     """`[robot.tool_offset]`: the tool's frame on a body, for a model without a site for it."""
 
-    position: Vector = Field((0.0, 0.0, 0.0), description="of the tool in the body's frame, m")
-    quaternion: tuple[Finite, Finite, Finite, Finite] = Field(
-        (1.0, 0.0, 0.0, 0.0),
-        description="of the tool in the body's frame, as w, x, y, z; its z axis approaches",
-    )
+    position: Vector = (0.0, 0.0, 0.0)
+    """of the tool in the body's frame, m"""
+    quaternion: tuple[Finite, Finite, Finite, Finite] = (1.0, 0.0, 0.0, 0.0)
+    """of the tool in the body's frame, as w, x, y, z; its z axis approaches"""
 
 
 class RobotConfig(Table):
     """`[robot]`: an arm, by its MJCF file and the data missing there. Lists have one value per
     joint."""
 
-    model: Path = Field(
-        strict=False, description="MJCF file of the arm and its cell; relative to the config"
-    )
-    joints: tuple[str, ...] = Field(
-        (),
-        min_length=1,
-        max_length=16,
-        description=(
-            "MJCF joints of the arm, base to tool; default: those with an actuator, without the"
-            " gripper's"
-        ),
-    )
-    tool: str = Field(
-        "",
-        min_length=1,
-        description=(
-            "MJCF site whose pose is the tool's, or a body; default: the last site that the arm"
-            " carries, else its last body"
-        ),
-    )
-    tool_offset: ToolConfig | None = Field(
-        None, description="pose of the tool on the body that `tool` names; default: the body's own"
-    )
-    home: tuple[Finite, ...] = Field(
-        (),
-        min_length=1,
-        description=(
-            "joint positions to which tasks return, and the simulated start, rad; default: those of"
-            " the first keyframe"
-        ),
-    )
-    start: tuple[Finite, ...] | None = Field(
-        None, description="where the simulated arm starts, rad; default: home"
-    )
-    velocity: tuple[Positive, ...] = Field(description="velocity limits, rad/s")
-    acceleration: tuple[Positive, ...] = Field(
-        description="acceleration limits of planned motion, rad/s2"
-    )
-    jerk: tuple[Positive, ...] = Field(description="jerk limits of planned motion, rad/s3")
-    torque: tuple[Positive, ...] | None = Field(
-        None, description="torque limits, N m; default: the model's actuator limits"
-    )
-    position: tuple[tuple[Finite, Finite], ...] | None = Field(
-        None, description="position limits, rad; default: the model's joint ranges"
-    )
-    interface: Interface = Field(
-        "torque",
-        description=(
-            "what the drives take in every cycle: torques, or set points of position or velocity,"
-            " which they follow by loops of their own; the simulated arm's drives are such, too"
-        ),
-    )
-    exclude: tuple[tuple[str, str], ...] = Field(
-        (), description="pairs of MJCF bodies whose contacts do not count, beside the model's own"
-    )
-    gripper: GripperConfig | None = Field(None, description="gripper, if the arm has one")
-    sensors: SensorConfig | None = Field(
-        None,
-        description=(
-            "resolution and noise of the joints' encoders; default: exact if they are simulated,"
-            " 1e-4 and 5e-5 rad otherwise, see `rack.levels.arm.Arm.sensors`"
-        ),
-    )
-    calibration: CalibrationConfig = Field(
-        CalibrationConfig(), description="from the drives' samples to positions"
-    )
-    latency_ticks: int = Field(
-        0,
-        ge=0,
-        le=20,
-        description=(
-            "age of the newest sample when a cycle reads it, ticks, as a bus to the drives has it;"
-            " the simulated arm's samples are that old, too"
-        ),
-    )
-    wrist: WristConfig | None = Field(None, description="force/torque sensor, if the arm has one")
-    hand: HandConfig | None = Field(
-        None, description="tendons and fingers, for a hand in place of an arm"
-    )
-    patience_ms: Positive | None = Field(
-        None,
-        le=100.0,
-        description=(
-            "time without a new torque for which motors keep the last one, ms; then the brakes"
-            " engage; rounded down to whole torque cycles, at least one; default: by what the arm"
-            " does in it, see `rack check --verbose`"
-        ),
-    )
-    substeps: int = Field(5, ge=1, le=50, description="MuJoCo steps in one servo cycle")
-    min_armature: Finite = Field(
-        0.05, ge=0, description="least drive inertia of every joint, kg m2: light wrists need it"
-    )
-    enable: Literal["at-start", "by-command"] | None = Field(
-        None,
-        description=(
-            "when drives are asked for torque: at the start, or by `rack command RACK servo"
-            " enable`; default: at-start for the simulated arm, by-command for every other"
-        ),
-    )
-    bring_up: Positive | None = Field(
-        None,
-        le=1.0,
-        description=(
-            "part of full speed at which the arm moves until `rack command RACK servo release`;"
-            " default: full speed from the start"
-        ),
-    )
-    guessed: tuple[str, ...] = Field(
-        (),
-        description=(
-            "keys of this table whose values were guessed, as in gripper.force: an arm that is"
-            " not simulated is not enabled before each is confirmed, by removing it here"
-        ),
-    )
+    model: Path = Field(strict=False)
+    """MJCF file of the arm and its cell; relative to the config"""
+    joints: tuple[str, ...] = Field((), min_length=1, max_length=16)
+    """MJCF joints of the arm, base to tool; default: those with an actuator, without the
+    gripper's"""
+    tool: str = Field("", min_length=1)
+    """MJCF site whose pose is the tool's, or a body; default: the last site that the arm carries,
+    else its last body"""
+    tool_offset: ToolConfig | None = None
+    """pose of the tool on the body that `tool` names; default: the body's own"""
+    home: tuple[Finite, ...] = Field((), min_length=1)
+    """joint positions to which tasks return, and the simulated start, rad; default: those of the
+    first keyframe"""
+    start: tuple[Finite, ...] | None = None
+    """where the simulated arm starts, rad; default: home"""
+    velocity: tuple[Positive, ...]
+    """velocity limits, rad/s"""
+    acceleration: tuple[Positive, ...]
+    """acceleration limits of planned motion, rad/s2"""
+    jerk: tuple[Positive, ...]
+    """jerk limits of planned motion, rad/s3"""
+    torque: tuple[Positive, ...] | None = None
+    """torque limits, N m; default: the model's actuator limits"""
+    position: tuple[tuple[Finite, Finite], ...] | None = None
+    """position limits, rad; default: the model's joint ranges"""
+    interface: Interface = "torque"
+    """what the drives take in every cycle: torques, or set points of position or velocity, which
+    they follow by loops of their own; the simulated arm's drives are such, too"""
+    exclude: tuple[tuple[str, str], ...] = ()
+    """pairs of MJCF bodies whose contacts do not count, beside the model's own"""
+    gripper: GripperConfig | None = None
+    """gripper, if the arm has one"""
+    sensors: SensorConfig | None = None
+    """resolution and noise of the joints' encoders; default: exact if they are simulated, 1e-4 and
+    5e-5 rad otherwise, see `rack.levels.arm.Arm.sensors`"""
+    calibration: CalibrationConfig = CalibrationConfig()
+    """from the drives' samples to positions"""
+    latency_ticks: int = Field(0, ge=0, le=20)
+    """age of the newest sample when a cycle reads it, ticks, as a bus to the drives has it; the
+    simulated arm's samples are that old, too"""
+    wrist: WristConfig | None = None
+    """force/torque sensor, if the arm has one"""
+    hand: HandConfig | None = None
+    """tendons and fingers, for a hand in place of an arm"""
+    patience_ms: Positive | None = Field(None, le=100.0)
+    """time without a new torque for which motors keep the last one, ms; then the brakes engage;
+    rounded down to whole torque cycles, at least one; default: by what the arm does in it, see
+    `rack check --verbose`"""
+    substeps: int = Field(5, ge=1, le=50)
+    """MuJoCo steps in one servo cycle"""
+    min_armature: Finite = Field(0.05, ge=0)
+    """least drive inertia of every joint, kg m2: light wrists need it"""
+    enable: Literal["at-start", "by-command"] | None = None
+    """when drives are asked for torque: at the start, or by `rack command RACK servo enable`;
+    default: at-start for the simulated arm, by-command for every other"""
+    bring_up: Positive | None = Field(None, le=1.0)
+    """part of full speed at which the arm moves until `rack command RACK servo release`; default:
+    full speed from the start"""
+    guessed: tuple[str, ...] = ()
+    """keys of this table whose values were guessed, as in gripper.force: an arm that is not
+    simulated is not enabled before each is confirmed, by removing it here"""
 
     @property
     def per_joint(self) -> dict[str, tuple[Any, ...] | None]:
@@ -475,55 +400,62 @@ class RobotConfig(Table):
 class MotionConfig(Table):
     """A move of an obstacle, a mocap body, which the simulated cell makes at a fixed time."""
 
-    body: str = Field(description="obstacle that moves")
-    at: float = Field(
-        ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it starts, s"
-    )
-    to: Vector = Field(description="where its origin goes, m")
-    speed: Positive = Field(0.25, description="speed along the straight line, m/s")
+    body: str
+    """obstacle that moves"""
+    at: float = Field(ge=0, le=1e9, allow_inf_nan=False)
+    """simulated time when it starts, s"""
+    to: Vector
+    """where its origin goes, m"""
+    speed: Positive = 0.25
+    """speed along the straight line, m/s"""
 
 
 class PushConfig(Table):
     """`[[scene.push]]`: a force on an object, which the simulated cell exerts at a fixed time."""
 
-    body: str = Field(description="object that is pushed")
-    at: float = Field(
-        ge=0, le=1e9, allow_inf_nan=False, description="simulated time when it begins, s"
-    )
-    seconds: Positive = Field(description="time for which it lasts, s")
-    force: Vector = Field(description="force at the centre of mass, in the world's frame, N")
-    rise: NotNegative = Field(
-        0.0, description="time in which it rises, and in which it falls at its end, s"
-    )
+    body: str
+    """object that is pushed"""
+    at: float = Field(ge=0, le=1e9, allow_inf_nan=False)
+    """simulated time when it begins, s"""
+    seconds: Positive
+    """time for which it lasts, s"""
+    force: Vector
+    """force at the centre of mass, in the world's frame, N"""
+    rise: NotNegative = 0.0
+    """time in which it rises, and in which it falls at its end, s"""
 
 
 class GoalConfig(Table):
     """`[[scene.goal]]`: where the task takes an object. A task of transfers states goals by
     itself."""
 
-    object: str = Field(description="object that the task moves, or keeps")
-    position: Vector = Field(description="where its origin ends, m")
+    object: str
+    """object that the task moves, or keeps"""
+    position: Vector
+    """where its origin ends, m"""
     # A gripper centres a part across its pads, not along them: there it stays as far off as it was
     # taken, or slips.
-    tolerance_mm: Positive = Field(
-        10.0, description="distance from there at which the task still counts as done, mm"
-    )
+    tolerance_mm: Positive = 10.0
+    """distance from there at which the task still counts as done, mm"""
 
 
 class SceneConfig(Table):
     """`[scene]`: objects and obstacles in the cell, by their names in the MJCF."""
 
-    objects: tuple[str, ...] = Field((), description="free bodies that tasks may move")
-    obstacles: tuple[str, ...] = Field((), description="mocap bodies that may move by themselves")
-    supports: tuple[str, ...] = Field(
-        (), description="geoms on which objects may stand, and a tool on a wrist sensor may press"
-    )
-    clearance: Positive = Field(
-        0.015, description="distance that planned motion keeps from everything, m"
-    )
-    motion: tuple[MotionConfig, ...] = Field((), description="moves of obstacles, by time")
-    push: tuple[PushConfig, ...] = Field((), description="forces on objects, by time")
-    goal: tuple[GoalConfig, ...] = Field((), description="where objects end, if the task is done")
+    objects: tuple[str, ...] = ()
+    """free bodies that tasks may move"""
+    obstacles: tuple[str, ...] = ()
+    """mocap bodies that may move by themselves"""
+    supports: tuple[str, ...] = ()
+    """geoms on which objects may stand, and a tool on a wrist sensor may press"""
+    clearance: Positive = 0.015
+    """distance that planned motion keeps from everything, m"""
+    motion: tuple[MotionConfig, ...] = ()
+    """moves of obstacles, by time"""
+    push: tuple[PushConfig, ...] = ()
+    """forces on objects, by time"""
+    goal: tuple[GoalConfig, ...] = ()
+    """where objects end, if the task is done"""
 
     @property
     def bodies(self) -> tuple[str, ...]:

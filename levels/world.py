@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
@@ -20,14 +19,14 @@ from rack.levels.tables import Positive, Table, read_params
 class WorldParams(Table):
     """When a body counts as moving."""
 
-    moved: Positive = Field(
-        0.002, description="distance from where it rested at which a body moves, m"
-    )
-    turned: Positive = Field(
-        0.02, description="angle from how it rested at which a body moves, rad"
-    )
-    slow: Positive = Field(0.005, description="speed below which a moving body may be resting, m/s")
-    resting: Positive = Field(0.2, description="time of being slow after which it rests, s")
+    moved: Positive = 0.002
+    """distance from where it rested at which a body moves, m"""
+    turned: Positive = 0.02
+    """angle from how it rested at which a body moves, rad"""
+    slow: Positive = 0.005
+    """speed below which a moving body may be resting, m/s"""
+    resting: Positive = 0.2
+    """time of being slow after which it rests, s"""
 
 
 class WorldModel(Executor):

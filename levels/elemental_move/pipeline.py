@@ -25,28 +25,17 @@ class ElementalMoveParams(Table):
     """Bounds of patience, of grasping, and of the answers from below, in
     `[board.<name>.params]`."""
 
-    patience: Positive = Field(
-        60.0, description="time that a move waits for a free path before it is an error, s"
-    )
-    retry: Positive = Field(
-        2.0, description="time after which a path is searched again in a world at rest, s"
-    )
-    replans: int = Field(
-        10,
-        ge=1,
-        le=1000,
-        description="other paths that one move may take before a blocked way is an error",
-    )
-    grasp_gap: Positive | None = Field(
-        None,
-        description=(
-            "a gripper closer to closed than this holds nothing, m or rad; default: a twentieth of"
-            " its way"
-        ),
-    )
-    answer: Positive = Field(
-        0.3, description="time that settling and the report from below may take, s"
-    )
+    patience: Positive = 60.0
+    """time that a move waits for a free path before it is an error, s"""
+    retry: Positive = 2.0
+    """time after which a path is searched again in a world at rest, s"""
+    replans: int = Field(10, ge=1, le=1000)
+    """other paths that one move may take before a blocked way is an error"""
+    grasp_gap: Positive | None = None
+    """a gripper closer to closed than this holds nothing, m or rad; default: a twentieth of its
+    way"""
+    answer: Positive = 0.3
+    """time that settling and the report from below may take, s"""
 
 
 class PlanStore:

@@ -17,9 +17,8 @@ from rack.levels.tables import Positive, Table, read_params
 class DeadZoneParams(Table):
     """Parameters of `DeadZone`."""
 
-    width: Positive = Field(
-        description="position error up to which a joint counts as at its set point, rad"
-    )
+    width: Positive
+    """position error up to which a joint counts as at its set point, rad"""
 
 
 class DeadZone(Modification):
@@ -42,14 +41,12 @@ class DeadZone(Modification):
 class JointPdParams(Table):
     """Parameters of `JointPd`."""
 
-    bandwidth: Positive = Field(
-        40.0, le=400.0, description="natural frequency of the error in every joint, rad/s"
-    )
-    damping: Positive = Field(1.0, le=3.0, description="damping ratio of the error")
-    load: bool = Field(
-        True,
-        description="add the torque of gravity and motion; without it joints sag under their load",
-    )
+    bandwidth: Positive = Field(40.0, le=400.0)
+    """natural frequency of the error in every joint, rad/s"""
+    damping: Positive = Field(1.0, le=3.0)
+    """damping ratio of the error"""
+    load: bool = True
+    """add the torque of gravity and motion; without it joints sag under their load"""
 
 
 class JointPd(Modification):
@@ -77,10 +74,10 @@ class JointPd(Modification):
 class NotchParams(Table):
     """Parameters of `Notch`."""
 
-    frequency: Positive = Field(
-        description="frequency that is removed from the torque, Hz; below half the law's rate"
-    )
-    quality: Positive = Field(1.0, le=100.0, description="frequency over the width of the notch")
+    frequency: Positive
+    """frequency that is removed from the torque, Hz; below half the law's rate"""
+    quality: Positive = Field(1.0, le=100.0)
+    """frequency over the width of the notch"""
 
 
 class Notch(Modification):

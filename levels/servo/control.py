@@ -26,15 +26,10 @@ Reacting = Literal["hold", "stop", "brake"]
 class LoopGains(Table):
     """Gains of the joint loop."""
 
-    bandwidth: Positive = Field(
-        60.0,
-        le=400.0,
-        description="natural frequency of the error in every joint, rad/s",
-        json_schema_extra=LIVE,
-    )
-    damping: Positive = Field(
-        1.0, le=3.0, description="damping ratio of the error", json_schema_extra=LIVE
-    )
+    bandwidth: Positive = Field(60.0, le=400.0, json_schema_extra=LIVE)
+    """natural frequency of the error in every joint, rad/s"""
+    damping: Positive = Field(1.0, le=3.0, json_schema_extra=LIVE)
+    """damping ratio of the error"""
 
     def fill(self, table: Array) -> None:
         """Fill the first two rows of a law's constants: stiffness, 1/s2, and damping, 1/s."""
@@ -45,39 +40,20 @@ class LoopGains(Table):
 class ArmParams(Table):
     """The arm that a board drives, and its reactions to faults of sensors and motors."""
 
-    following: Positive = Field(
-        0.02,
-        description="distance of a joint from its set point at which a motor counts as failed, rad",
-    )
-    on_sensor_fault: Reacting = Field(
-        "brake",
-        description=(
-            "ramp to rest and hold, or ramp and brake, or brake; without known velocities always"
-            " brake"
-        ),
-    )
-    on_actuator_fault: Reacting = Field(
-        "brake", description="ramp to rest and hold, or ramp and brake, or brake"
-    )
-    good_cycles: int = Field(
-        20, ge=1, le=10_000, description="good cycles in a row after which a fault is over"
-    )
-    retry: Positive = Field(
-        0.5,
-        description=(
-            "time after which a motor that gave too little is retried, or a struck arm resumes, s"
-        ),
-    )
-    patience: Positive = Field(
-        5.0,
-        description=(
-            "time for which faults may keep the arm from its set points before they are latched, s"
-        ),
-    )
-    arm: str = Field(
-        "rack.levels.arm:SimulatedArm",
-        description="class of the arm, package.module:Class; see rack.levels.arm.Arm",
-    )
+    following: Positive = 0.02
+    """distance of a joint from its set point at which a motor counts as failed, rad"""
+    on_sensor_fault: Reacting = "brake"
+    """ramp to rest and hold, or ramp and brake, or brake; without known velocities always brake"""
+    on_actuator_fault: Reacting = "brake"
+    """ramp to rest and hold, or ramp and brake, or brake"""
+    good_cycles: int = Field(20, ge=1, le=10_000)
+    """good cycles in a row after which a fault is over"""
+    retry: Positive = 0.5
+    """time after which a motor that gave too little is retried, or a struck arm resumes, s"""
+    patience: Positive = 5.0
+    """time for which faults may keep the arm from its set points before they are latched, s"""
+    arm: str = "rack.levels.arm:SimulatedArm"
+    """class of the arm, package.module:Class; see rack.levels.arm.Arm"""
 
     @field_validator("arm")
     @classmethod

@@ -123,14 +123,12 @@ class ModificationConfig(Table):
     """`[board.<name>.params.modifications.<modification>]`: one modification of the board's servo
     law."""
 
-    cls: str = Field(
-        alias="class",
-        description="subclass of rack.levels.servo.Modification, package.module:Class",
-    )
-    on: bool = Field(False, description="put in from the start")
-    params: dict[str, Any] = Field(
-        {}, description="parameters of the modification, declared by its class"
-    )
+    cls: str = Field(alias="class")
+    """subclass of rack.levels.servo.Modification, package.module:Class"""
+    on: bool = False
+    """put in from the start"""
+    params: dict[str, Any] = {}
+    """parameters of the modification, declared by its class"""
 
     @field_validator("cls")
     @classmethod
@@ -169,14 +167,10 @@ ModificationName = Annotated[
 class ModifiableParams(Table):
     """Parameters of a board whose servo law can be modified."""
 
-    modifications: dict[ModificationName, ModificationConfig] = Field(
-        {}, description="control modifications by name, in the order in which they act"
-    )
-    transfer: Positive = Field(
-        0.05,
-        le=10.0,
-        description="time in which the torque goes over to that of a law modified otherwise, s",
-    )
+    modifications: dict[ModificationName, ModificationConfig] = {}
+    """control modifications by name, in the order in which they act"""
+    transfer: Positive = Field(0.05, le=10.0)
+    """time in which the torque goes over to that of a law modified otherwise, s"""
 
     @field_validator("modifications")
     @classmethod

@@ -37,15 +37,10 @@ class FigureParams(Table):
     """Processor times of the level's unit functions; R, W, U and C are the bus's, in
     `[board.<name>.transfer]`."""
 
-    process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = (
-        Parameter(
-            2.0,
-            description=(
-                "X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"
-            ),
-        )
-    )
-    plan_ms: Milliseconds = Parameter(6.0, description="P: one plan, without its update, ms")
+    process_ms: Milliseconds | Annotated[tuple[Milliseconds, ...], Parameter(min_length=1)] = 2.0
+    """X: the executor in a cycle, ms; several times are taken in turn, cycle by cycle"""
+    plan_ms: Milliseconds = 6.0
+    """P: one plan, without its update, ms"""
 
 
 class FigureLoop(Executor):

@@ -20,23 +20,23 @@ DOWN = (0.0, 0.0, -1.0)
 class Action(Table):
     """Base of all actions."""
 
-    by: Positive | None = Field(
-        None, description="simulated time by which the action must be done, s"
-    )
+    by: Positive | None = None
+    """simulated time by which the action must be done, s"""
 
 
 class Transfer(Action):
     """Move an object to another place."""
 
-    do: Literal["transfer"] = Field("transfer", description="the kind of action")
-    object: str = Field(description="object of the scene")
-    to: Vector = Field(description="where the object's origin goes, m")
-    yaw: Finite | None = Field(
-        None, description="turn of the object's x axis there, rad; free when not given"
-    )
-    lift: Positive = Field(
-        0.1, description="height of the straight motion above grasp and release, m"
-    )
+    do: Literal["transfer"] = "transfer"
+    """the kind of action"""
+    object: str
+    """object of the scene"""
+    to: Vector
+    """where the object's origin goes, m"""
+    yaw: Finite | None = None
+    """turn of the object's x axis there, rad; free when not given"""
+    lift: Positive = 0.1
+    """height of the straight motion above grasp and release, m"""
 
     def __str__(self) -> str:
         return f"transfer {self.object} to {list(self.to)}"
@@ -45,19 +45,17 @@ class Transfer(Action):
 class Goto(Action):
     """Move the tool to a pose, or the joints to positions."""
 
-    do: Literal["goto"] = Field("goto", description="the kind of action")
-    position: Vector | None = Field(None, description="of the tool, m")
-    quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
-        None, description="of the tool, as w, x, y, z"
-    )
-    direction: Vector | Literal["any"] | None = Field(
-        None,
-        description=(
-            "of the tool's z axis, any turn about it; down when not given; 'any': an arm of five"
-            " joints or fewer reaches most places in few orientations"
-        ),
-    )
-    joints: tuple[Finite, ...] | None = Field(None, description="joint positions, rad")
+    do: Literal["goto"] = "goto"
+    """the kind of action"""
+    position: Vector | None = None
+    """of the tool, m"""
+    quaternion: tuple[Finite, Finite, Finite, Finite] | None = None
+    """of the tool, as w, x, y, z"""
+    direction: Vector | Literal["any"] | None = None
+    """of the tool's z axis, any turn about it; down when not given; 'any': an arm of five joints or
+    fewer reaches most places in few orientations"""
+    joints: tuple[Finite, ...] | None = None
+    """joint positions, rad"""
 
     @model_validator(mode="after")
     def _one_goal(self) -> Goto:
@@ -81,7 +79,8 @@ class Goto(Action):
 class Home(Action):
     """Move the arm back to its start."""
 
-    do: Literal["home"] = Field("home", description="the kind of action")
+    do: Literal["home"] = "home"
+    """the kind of action"""
 
     def __str__(self) -> str:
         return "home"
@@ -93,7 +92,8 @@ AnyAction = Annotated[Transfer | Goto | Home, Field(discriminator="do")]
 class TaskConfig(Program):
     """A program: actions in their order."""
 
-    action: tuple[AnyAction, ...] = Field((), description="actions, done in their order")
+    action: tuple[AnyAction, ...] = ()
+    """actions, done in their order"""
 
     def goals(self) -> Iterator[GoalConfig]:
         """Yield where transfers take objects."""
@@ -117,22 +117,15 @@ class TaskParams(Table):
     In `[board.<name>.params]`; s of simulated time.
     """
 
-    beginning: Positive = Field(
-        0.1, description="from a segment's arrival in the primitive level to motion, s"
-    )
-    settling: Positive = Field(
-        0.2, description="from the end of a motion to the report that it is done, s"
-    )
-    gripping: Positive = Field(
-        0.6, description="time that the gripper takes to open or close and to settle, s"
-    )
-    stalled_s: Positive = Field(
-        90.0,
-        description=(
-            "time without any progress after which the task ends, unless an operator holds it;"
-            " longer than the patience of the level below, s"
-        ),
-    )
+    beginning: Positive = 0.1
+    """from a segment's arrival in the primitive level to motion, s"""
+    settling: Positive = 0.2
+    """from the end of a motion to the report that it is done, s"""
+    gripping: Positive = 0.6
+    """time that the gripper takes to open or close and to settle, s"""
+    stalled_s: Positive = 90.0
+    """time without any progress after which the task ends, unless an operator holds it; longer than
+    the patience of the level below, s"""
 
 
 read_program = TaskConfig.read

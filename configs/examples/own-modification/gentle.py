@@ -13,9 +13,8 @@ from rack.levels.tables import Positive, Table, read_params
 class GentleParams(Table):
     """What `params` of the modification may hold."""
 
-    part: Positive = Field(
-        0.2, le=1.0, description="part of each joint's torque limit that may be added to its load"
-    )
+    part: Positive = Field(0.2, le=1.0)
+    """part of each joint's torque limit that may be added to its load"""
 
 
 class Gentle(Modification):

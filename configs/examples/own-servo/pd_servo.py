@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
 
 from rack.backplane.message import State
 from rack.levels.arm import SimulatedArm
@@ -18,8 +17,10 @@ from rack.levels.tables import Positive, Table, read_params
 class Gains(Table):
     """What `[board.servo.params]` may hold."""
 
-    stiffness: Positive = Field(1600.0, description="acceleration for an error of one rad, 1/s2")
-    damping: Positive = Field(80.0, description="acceleration against an error of one rad/s, 1/s")
+    stiffness: Positive = 1600.0
+    """acceleration for an error of one rad, 1/s2"""
+    damping: Positive = 80.0
+    """acceleration against an error of one rad/s, 1/s"""
 
 
 class PdServo(Executor):

@@ -37,25 +37,13 @@ from rack.levels.tables import Positive, Table, read_params
 class CoordinatorParams(Table):
     """The arms that a coordinator orders about, and how long it waits for them."""
 
-    arms: dict[ArmName, MailboxName] = Field(
-        min_length=1,
-        description=(
-            "mailbox with an arm's report, by the arm's name; its orders are in order_<name>"
-        ),
-    )
-    stalled_s: Positive = Field(
-        180.0,
-        description=(
-            "time without any progress after which the program ends, unless an operator holds it;"
-            " longer than an arm's, s"
-        ),
-    )
-    farewell_s: Positive = Field(
-        10.0,
-        description=(
-            "time that the arms have to come to rest and to confirm the end of the program, s"
-        ),
-    )
+    arms: dict[ArmName, MailboxName] = Field(min_length=1)
+    """mailbox with an arm's report, by the arm's name; its orders are in order_<name>"""
+    stalled_s: Positive = 180.0
+    """time without any progress after which the program ends, unless an operator holds it; longer
+    than an arm's, s"""
+    farewell_s: Positive = 10.0
+    """time that the arms have to come to rest and to confirm the end of the program, s"""
 
 
 class Coordinator(Executor):

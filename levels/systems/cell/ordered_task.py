@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, StringConstraints, ValidationError
+from pydantic import StringConstraints, ValidationError
 
 from rack.backplane.message import Message, MessageType, State, fill_counts
 from rack.levels.errors import ProgramError, Refused
@@ -41,19 +41,12 @@ MAX_STRAY_RAD = 0.005
 class OrderedTaskParams(TaskParams):
     """From where a task level takes its orders, and for how long it keeps a promise."""
 
-    coordinator: RackName = Field(
-        "",
-        description=(
-            "rack that gives the orders over the network; empty: a board of this rack gives them"
-        ),
-    )
-    orders: MailboxName = Field("lan.orders", description="mailbox with the orders")
-    decision: Positive = Field(
-        5.0,
-        description=(
-            "time between an answer and the order to do it, for which a promised time holds, s"
-        ),
-    )
+    coordinator: RackName = ""
+    """rack that gives the orders over the network; empty: a board of this rack gives them"""
+    orders: MailboxName = "lan.orders"
+    """mailbox with the orders"""
+    decision: Positive = 5.0
+    """time between an answer and the order to do it, for which a promised time holds, s"""
 
 
 class OrderedTaskExecutor(TaskExecutor):

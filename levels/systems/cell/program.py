@@ -44,9 +44,8 @@ class CellStep(Table):
     """`[[task.step]]`: actions that begin together, once every arm has answered that it can do its
     own by its time."""
 
-    do: tuple[ArmAction, ...] = Field(
-        description="actions, one for each arm that has a part in the step"
-    )
+    do: tuple[ArmAction, ...]
+    """actions, one for each arm that has a part in the step"""
 
     @property
     def actions(self) -> dict[str, ArmTransfer | ArmGoto | ArmHome]:
@@ -57,9 +56,8 @@ class CellStep(Table):
 class CellProgram(Program):
     """A program for several arms: steps, each begun when the one before it is done."""
 
-    step: tuple[CellStep, ...] = Field(
-        (), max_length=MAX_STEPS, description="steps, done in their order"
-    )
+    step: tuple[CellStep, ...] = Field((), max_length=MAX_STEPS)
+    """steps, done in their order"""
 
     @property
     def checksum(self) -> int:

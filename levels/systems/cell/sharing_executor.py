@@ -26,15 +26,10 @@ SHARED = Output(SHARED_BODIES, cycles=8)
 class SharingServoParams(ServoParams):
     """`[board.servo.params]` of a servo level that shares objects."""
 
-    shared: tuple[str, ...] = Field(
-        min_length=1,
-        max_length=MOST_SHARED,
-        description="objects of the scene that arms of other racks move too",
-    )
-    arm: str = Field(
-        "rack.levels.systems.cell.sharing_arm:SharingArm",
-        description="class of the arm, package.module:Class; a SharingArm",
-    )
+    shared: tuple[str, ...] = Field(min_length=1, max_length=MOST_SHARED)
+    """objects of the scene that arms of other racks move too"""
+    arm: str = "rack.levels.systems.cell.sharing_arm:SharingArm"
+    """class of the arm, package.module:Class; a SharingArm"""
 
     @field_validator("arm")
     @classmethod

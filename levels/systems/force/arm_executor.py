@@ -4,7 +4,6 @@ and limits them."""
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
@@ -31,13 +30,9 @@ class ForceArmParams(ArmParams):
     """`[board.<name>.params]`: the arm, and its reactions to faults of sensors and motors and to
     strong contacts."""
 
-    on_force_limit: Reacting = Field(
-        "brake",
-        description=(
-            "reaction to a contact beyond the limits: ramp to rest and hold, or ramp and brake, or"
-            " brake"
-        ),
-    )
+    on_force_limit: Reacting = "brake"
+    """reaction to a contact beyond the limits: ramp to rest and hold, or ramp and brake, or
+    brake"""
 
 
 class ForceArmExecutor(WristLevel, ArmExecutor):

@@ -20,7 +20,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
@@ -42,8 +42,10 @@ class FrameConfig(Table):
     """`[task.frame.<name>]`: a task frame by two of its axes, in the world's frame, of any
     length."""
 
-    x: Vector = Field(description="its x axis")
-    z: Vector = Field(description="its z axis, at a right angle to x")
+    x: Vector
+    """its x axis"""
+    z: Vector
+    """its z axis, at a right angle to x"""
 
     def objection(self) -> str:
         """Return why the axes are no frame; empty: they are one."""
@@ -69,23 +71,23 @@ class ContactConfig(Table):
     """`[task.contact.<name>]`: a contact for the calls `comply` and `guard`; axes that are not
     named are of motion."""
 
-    frame: str = Field(description="task frame")
-    wrench: dict[Axis, Finite] = Field(
-        {}, description="of the tool on the surroundings on axes of force, N or N m; by axis"
-    )
-    speed: dict[Axis, Positive] = Field(
-        {}, description="most on an axis of force, m/s or rad/s; by axis; default: the server's"
-    )
-    guard: dict[Axis, Positive] = Field(
-        {}, description="wrench, either way, that ends a motion, N or N m; by axis"
-    )
+    frame: str
+    """task frame"""
+    wrench: dict[Axis, Finite] = {}
+    """of the tool on the surroundings on axes of force, N or N m; by axis"""
+    speed: dict[Axis, Positive] = {}
+    """most on an axis of force, m/s or rad/s; by axis; default: the server's"""
+    guard: dict[Axis, Positive] = {}
+    """wrench, either way, that ends a motion, N or N m; by axis"""
 
 
 class ForceProgram(Program):
     """`[task]` of a client of a server of force and motion."""
 
-    frame: dict[str, FrameConfig] = Field({}, description="task frames, by name")
-    contact: dict[str, ContactConfig] = Field({}, description="contacts, by name")
+    frame: dict[str, FrameConfig] = {}
+    """task frames, by name"""
+    contact: dict[str, ContactConfig] = {}
+    """contacts, by name"""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield frames that are none, and contacts in no frame, or beyond the limits of arm and

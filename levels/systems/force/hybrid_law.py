@@ -50,14 +50,14 @@ class HybridGains(Table):
     at 0.1 m/s; a loop 4 times as fast is as good, one 6 times as fast shakes while it slides.
     """
 
-    stiffness: Positive = Field(10_000.0, description="of the stiffest contact, tool included, N/m")
-    turning_stiffness: Positive = Field(40.0, description="the same about an axis, N m/rad")
-    bandwidth: Positive = Field(
-        10.0, le=100.0, description="of the force loop against that contact, rad/s"
-    )
-    smoothing: Positive = Field(
-        0.03, le=1.0, description="time constant of the velocity on axes of force, s"
-    )
+    stiffness: Positive = 10_000.0
+    """of the stiffest contact, tool included, N/m"""
+    turning_stiffness: Positive = 40.0
+    """the same about an axis, N m/rad"""
+    bandwidth: Positive = Field(10.0, le=100.0)
+    """of the force loop against that contact, rad/s"""
+    smoothing: Positive = Field(0.03, le=1.0)
+    """time constant of the velocity on axes of force, s"""
 
 
 class ForceTask(NamedTuple):

@@ -25,26 +25,20 @@ scale."""
 class ServerParams(TrajectoryParams):
     """`[board.<name>.params]`: how contacts are judged, and what happens without a client."""
 
-    speed: Positive = Field(
-        0.05, description="most on an axis of force, where a request gives none, m/s"
-    )
-    turning: Positive = Field(0.2, description="the same about an axis, rad/s")
-    tolerance: Positive = Field(
-        0.3, le=1.0, description="part of a wanted force by which it may be off"
-    )
-    settle: Positive = Field(
-        0.2,
-        description=(
-            "time for which forces are within it when they are settled, and a COMPLY is done, s"
-        ),
-    )
-    reach: Positive = Field(
-        4.0, description="longest time without settled forces, s: then compliance ends"
-    )
-    silence: Positive = Field(
-        2.0, description="time without a sign of life after which the client is lost, s"
-    )
-    hold: Positive = Field(3.0, description="time for which forces are held without a client, s")
+    speed: Positive = 0.05
+    """most on an axis of force, where a request gives none, m/s"""
+    turning: Positive = 0.2
+    """the same about an axis, rad/s"""
+    tolerance: Positive = Field(0.3, le=1.0)
+    """part of a wanted force by which it may be off"""
+    settle: Positive = 0.2
+    """time for which forces are within it when they are settled, and a COMPLY is done, s"""
+    reach: Positive = 4.0
+    """longest time without settled forces, s: then compliance ends"""
+    silence: Positive = 2.0
+    """time without a sign of life after which the client is lost, s"""
+    hold: Positive = 3.0
+    """time for which forces are held without a client, s"""
 
 
 class ServerWork(RequestWork):

@@ -32,13 +32,8 @@ STEPS = 2
 class FingertipGains(Table):
     """Gains of the fingertip loop."""
 
-    posture: NotNegative = Field(
-        0.2,
-        le=1.0,
-        description=(
-            "part of the joint loop's stiffness that keeps the posture of a finger in mode FORCE"
-        ),
-    )
+    posture: NotNegative = Field(0.2, le=1.0)
+    """part of the joint loop's stiffness that keeps the posture of a finger in mode FORCE"""
 
 
 class FingertipLaw:

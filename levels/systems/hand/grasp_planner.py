@@ -38,17 +38,14 @@ OUTSIDE_M = 0.2
 class GraspRules(Table):
     """What a planned grasp is to be."""
 
-    pad: Positive = Field(
-        0.009, description="distance of a tip's site from the surface that the tip touches, m"
-    )
-    clear: Positive = Field(
-        0.02, description="distance from the object at which tips begin to close, m"
-    )
-    pull: NotNegative = Field(
-        2.0,
-        description="force on the object, in addition to its weight, that friction must bear, N",
-    )
-    reserve: Positive = Field(1.5, ge=1.0, description="by how much more it could bear")
+    pad: Positive = 0.009
+    """distance of a tip's site from the surface that the tip touches, m"""
+    clear: Positive = 0.02
+    """distance from the object at which tips begin to close, m"""
+    pull: NotNegative = 2.0
+    """force on the object, in addition to its weight, that friction must bear, N"""
+    reserve: Positive = Field(1.5, ge=1.0)
+    """by how much more it could bear"""
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,12 @@ Posture = Mapping[str, tuple[Finite, ...]]
 class PreshapeStep(Table):
     """Bring the joints to a posture."""
 
-    do: Literal["preshape"] = Field("preshape", description="the kind of step")
-    posture: str = Field(description="name of the posture, in [task.posture]")
-    seconds: Positive = Field(1.0, description="time that it takes, s")
+    do: Literal["preshape"] = "preshape"
+    """the kind of step"""
+    posture: str
+    """name of the posture, in [task.posture]"""
+    seconds: Positive = 1.0
+    """time that it takes, s"""
 
 
 class CloseStep(Table):
@@ -31,54 +34,62 @@ class CloseStep(Table):
     Without points, they and the fingers are those of a plan from the level above.
     """
 
-    do: Literal["close"] = Field("close", description="the kind of step")
-    object: str = Field(description="object of the scene")
-    points: Mapping[str, Vector] = Field(
-        {},
-        description=(
-            "where the tips would go if nothing were in the way, in the object's frame, m, by"
-            " finger"
-        ),
-    )
-    depth: Positive = Field(
-        0.01, le=0.2, description="distance of such a point from a planned contact, inwards, m"
-    )
-    speed: Positive = Field(0.03, le=1.0, description="of the tip with the longest way, m/s")
-    touch: Positive = Field(0.3, description="force at which a tip touches the object, N")
-    seconds: Positive = Field(3.0, description="time by which all must touch it, s")
+    do: Literal["close"] = "close"
+    """the kind of step"""
+    object: str
+    """object of the scene"""
+    points: Mapping[str, Vector] = {}
+    """where the tips would go if nothing were in the way, in the object's frame, m, by finger"""
+    depth: Positive = Field(0.01, le=0.2)
+    """distance of such a point from a planned contact, inwards, m"""
+    speed: Positive = Field(0.03, le=1.0)
+    """of the tip with the longest way, m/s"""
+    touch: Positive = 0.3
+    """force at which a tip touches the object, N"""
+    seconds: Positive = 3.0
+    """time by which all must touch it, s"""
 
 
 class SqueezeStep(Table):
     """Raise the internal forces of the grasp."""
 
-    do: Literal["squeeze"] = Field("squeeze", description="the kind of step")
-    grip: Positive = Field(
-        description="force of the finger that opposes the others, which share it, N"
-    )
-    seconds: Positive = Field(0.5, description="time in which they rise, s")
+    do: Literal["squeeze"] = "squeeze"
+    """the kind of step"""
+    grip: Positive
+    """force of the finger that opposes the others, which share it, N"""
+    seconds: Positive = 0.5
+    """time in which they rise, s"""
 
 
 class ShiftStep(Table):
     """Move the object with the fingers."""
 
-    do: Literal["shift"] = Field("shift", description="the kind of step")
-    by: Vector = Field(description="way of the object in the world's frame, m")
-    seconds: Positive = Field(1.0, description="time that it takes, s")
+    do: Literal["shift"] = "shift"
+    """the kind of step"""
+    by: Vector
+    """way of the object in the world's frame, m"""
+    seconds: Positive = 1.0
+    """time that it takes, s"""
 
 
 class HoldStep(Table):
     """Keep the object where it is."""
 
-    do: Literal["hold"] = Field("hold", description="the kind of step")
-    seconds: Positive = Field(description="for how long, s")
+    do: Literal["hold"] = "hold"
+    """the kind of step"""
+    seconds: Positive
+    """for how long, s"""
 
 
 class ReleaseStep(Table):
     """Let the forces fall, then withdraw the tips from the object."""
 
-    do: Literal["release"] = Field("release", description="the kind of step")
-    way: Positive = Field(0.015, le=0.2, description="by which the tips withdraw, m")
-    seconds: Positive = Field(1.0, description="time that it takes, s; half of it for the forces")
+    do: Literal["release"] = "release"
+    """the kind of step"""
+    way: Positive = Field(0.015, le=0.2)
+    """by which the tips withdraw, m"""
+    seconds: Positive = 1.0
+    """time that it takes, s; half of it for the forces"""
 
 
 Step = PreshapeStep | CloseStep | SqueezeStep | ShiftStep | HoldStep | ReleaseStep
@@ -89,13 +100,12 @@ GRIPPING = (SqueezeStep, ShiftStep, HoldStep, ReleaseStep)
 class GraspProgram(Program):
     """Postures and steps."""
 
-    opposing: str = Field("thumb", description="the finger that opposes all others")
-    posture: Mapping[str, Posture] = Field(
-        {}, description="joint positions of every finger, rad, by posture"
-    )
-    step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field(
-        (), max_length=MAX_STEPS, description="steps, done in their order"
-    )
+    opposing: str = "thumb"
+    """the finger that opposes all others"""
+    posture: Mapping[str, Posture] = {}
+    """joint positions of every finger, rad, by posture"""
+    step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field((), max_length=MAX_STEPS)
+    """steps, done in their order"""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of everything that the hand or the scene lacks, and of steps

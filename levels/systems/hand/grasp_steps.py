@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
@@ -41,21 +40,16 @@ SLIPPED_PART = 0.2
 class GraspParams(GripGains):
     """`[board.<name>.params]` of a grasp loop."""
 
-    astray: Positive = Field(
-        0.03, description="distance from a posture at which a joint has reached it, rad"
-    )
-    patience: Positive = Field(
-        1.0, description="time in excess of its own after which a step has failed, s"
-    )
-    stalled: Positive = Field(
-        60.0, description="time of waiting, other than for an operator, that fails the program, s"
-    )
-    lost: Positive = Field(
-        0.2, description="time without touch after which a finger has lost the object, s"
-    )
-    tolerance: Positive = Field(
-        0.02, description="distance of a gripped object from its place: it is lost, m"
-    )
+    astray: Positive = 0.03
+    """distance from a posture at which a joint has reached it, rad"""
+    patience: Positive = 1.0
+    """time in excess of its own after which a step has failed, s"""
+    stalled: Positive = 60.0
+    """time of waiting, other than for an operator, that fails the program, s"""
+    lost: Positive = 0.2
+    """time without touch after which a finger has lost the object, s"""
+    tolerance: Positive = 0.02
+    """distance of a gripped object from its place: it is lost, m"""
 
 
 @dataclass

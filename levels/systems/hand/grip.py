@@ -28,24 +28,18 @@ LEAST_SPAN_M = 1e-3
 class GripGains(Table):
     """Gains of the grip, and its limits."""
 
-    stiffness: Positive = Field(
-        300.0,
-        le=5000.0,
-        description=(
-            "of each tip about its point, N/m; of the opposing one, as of all others together"
-        ),
-    )
-    recover: NotNegative = Field(
-        4000.0, description="rise of the force on an object, for its distance, N/(m s)"
-    )
-    creep: NotNegative = Field(
-        0.5, le=5.0, description="rate at which points follow tips that have crept, 1/s"
-    )
-    most_load: NotNegative = Field(8.0, description="largest such force, N")
-    reserve: NotNegative = Field(
-        0.5, le=5.0, description="rise of the grip with the load sensed, N/N"
-    )
-    most_grip: Positive = Field(14.0, description="largest force of the opposing finger, N")
+    stiffness: Positive = Field(300.0, le=5000.0)
+    """of each tip about its point, N/m; of the opposing one, as of all others together"""
+    recover: NotNegative = 4000.0
+    """rise of the force on an object, for its distance, N/(m s)"""
+    creep: NotNegative = Field(0.5, le=5.0)
+    """rate at which points follow tips that have crept, 1/s"""
+    most_load: NotNegative = 8.0
+    """largest such force, N"""
+    reserve: NotNegative = Field(0.5, le=5.0)
+    """rise of the grip with the load sensed, N/N"""
+    most_grip: Positive = 14.0
+    """largest force of the opposing finger, N"""
 
 
 class HandGrip:

@@ -31,15 +31,12 @@ from rack.levels.tables import NotNegative, Positive, Table
 class JointGains(Table):
     """Gains of the joint loop."""
 
-    bandwidth: Positive = Field(
-        35.0, le=400.0, description="natural frequency of the error in every joint, rad/s"
-    )
-    damping: Positive = Field(
-        0.7, le=5.0, description="damping ratio that the loop adds to the friction of joints"
-    )
-    ahead: NotNegative = Field(
-        0.006, le=0.1, description="time from a command of tensions until they have come, s"
-    )
+    bandwidth: Positive = Field(35.0, le=400.0)
+    """natural frequency of the error in every joint, rad/s"""
+    damping: Positive = Field(0.7, le=5.0)
+    """damping ratio that the loop adds to the friction of joints"""
+    ahead: NotNegative = Field(0.006, le=0.1)
+    """time from a command of tensions until they have come, s"""
 
 
 class JointLaw:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.level import Input, LevelContext, Misfits, Ports
@@ -142,7 +141,8 @@ class TendonLoop(HandLoop):
 class FingerParams(FingertipGains, JointGains, TendonGains):
     """`[board.<name>.params]` of a board that runs all loops of a finger."""
 
-    finger: str = Field(description="name of the finger, of robot.hand.finger")
+    finger: str
+    """name of the finger, of robot.hand.finger"""
 
 
 class FingerExecutor(HandLoop):

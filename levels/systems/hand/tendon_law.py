@@ -38,17 +38,16 @@ MOST_LEARNED = 0.1
 class TendonGains(Table):
     """What the law knows of the valves, and its gains."""
 
-    lag: Positive = Field(0.008, le=1.0, description="time constant of a valve, s")
-    lead: NotNegative = Field(
-        1.0, le=4.0, description="part of the tension still missing that is commanded in excess"
-    )
-    trim: NotNegative = Field(
-        4.0, le=20.0, description="rate at which a valve's lasting error is corrected, 1/s"
-    )
-    most_trim: NotNegative = Field(10.0, description="largest such correction, N")
-    margin: NotNegative = Field(
-        1.0, description="tension kept above the hand's least, for a valve's error, N"
-    )
+    lag: Positive = Field(0.008, le=1.0)
+    """time constant of a valve, s"""
+    lead: NotNegative = Field(1.0, le=4.0)
+    """part of the tension still missing that is commanded in excess"""
+    trim: NotNegative = Field(4.0, le=20.0)
+    """rate at which a valve's lasting error is corrected, 1/s"""
+    most_trim: NotNegative = 10.0
+    """largest such correction, N"""
+    margin: NotNegative = 1.0
+    """tension kept above the hand's least, for a valve's error, N"""
 
 
 class TendonLaw:

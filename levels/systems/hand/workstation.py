@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.backplane.words import Block
@@ -36,16 +35,16 @@ WORD = 8
 class WorkstationParams(Table):
     """`[host.<name>.params]`: what is planned, and where the picture is."""
 
-    object: str = Field(description="object to grasp, of scene.objects")
-    opposing: str = Field(description="finger that opposes all others")
-    rules: GraspRules = Field(GraspRules(), description="what the grasp is to be")
-    picture: str | None = Field(
-        None,
-        description=(
-            "SVG file, replaced as the hand moves; {rack} stands for the rack's name; default: none"
-        ),
-    )
-    every_s: Positive = Field(0.2, description="time between pictures, s")
+    object: str
+    """object to grasp, of scene.objects"""
+    opposing: str
+    """finger that opposes all others"""
+    rules: GraspRules = GraspRules()
+    """what the grasp is to be"""
+    picture: str | None = None
+    """SVG file, replaced as the hand moves; {rack} stands for the rack's name; default: none"""
+    every_s: Positive = 0.2
+    """time between pictures, s"""
 
 
 class Workstation(HostProgram):

@@ -25,10 +25,10 @@ Link = deque[tuple[int, bytes]]
 class GatewayParams(Table):
     """`[board.<name>.params]`: the link to the level above, and what to do without it."""
 
-    delay: NotNegative = Field(0.0, le=1.0, description="time that the link takes, each way, s")
-    missing: int = Field(
-        5, ge=0, le=1000, description="references in a row that may be missing and are extrapolated"
-    )
+    delay: NotNegative = Field(0.0, le=1.0)
+    """time that the link takes, each way, s"""
+    missing: int = Field(5, ge=0, le=1000)
+    """references in a row that may be missing and are extrapolated"""
 
 
 class JointGateway(Executor):

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
@@ -41,10 +40,10 @@ ARM_LOST = "no status from the board of the arm: waiting for it"
 class JointServoParams(ModifiableParams, LoopGains):
     """`[board.<name>.params]`: the joints that a board servoes, and the gains of their loop."""
 
-    joints: tuple[str, ...] | None = Field(
-        None, description="joints of `robot.joints` that it servoes; default: all"
-    )
-    gripper: bool = Field(False, description="true: it drives the gripper, too")
+    joints: tuple[str, ...] | None = None
+    """joints of `robot.joints` that it servoes; default: all"""
+    gripper: bool = False
+    """true: it drives the gripper, too"""
 
 
 class JointServo(Executor):

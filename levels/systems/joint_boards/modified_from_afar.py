@@ -47,11 +47,8 @@ BoardAndName = Annotated[
 class SenderParams(Table):
     """`[board.<name>.params]`: what an operator may put in."""
 
-    known: tuple[BoardAndName, ...] = Field(
-        min_length=1,
-        max_length=MOST_NAMES,
-        description="modifications as board.name, of boards of the other rack",
-    )
+    known: tuple[BoardAndName, ...] = Field(min_length=1, max_length=MOST_NAMES)
+    """modifications as board.name, of boards of the other rack"""
 
 
 class ModificationSender(Executor):

@@ -29,10 +29,10 @@ SLACK_S = 0.002
 class NetworkGatewayParams(GatewayParams):
     """`[board.<name>.params]`: the link, and the rack at its other end."""
 
-    period: Positive = Field(0.02, le=1.0, description="time from reference to reference, s")
-    tick: Positive = Field(
-        0.001, le=1.0, description="length of a tick of the rack that sends references, s"
-    )
+    period: Positive = Field(0.02, le=1.0)
+    """time from reference to reference, s"""
+    tick: Positive = Field(0.001, le=1.0)
+    """length of a tick of the rack that sends references, s"""
 
 
 class NetworkGateway(JointGateway):

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from rack.levels.systems.state_table.table import SAME, STATES, RowConfig, StateTable
 from rack.levels.systems.state_table.vocabulary import Lexicon, Vocabulary, objection
+from rack.levels.tables import keys_of
 
 Box = dict[str, frozenset[str]]
 """A set of cases: the values permitted by condition."""
@@ -53,7 +54,7 @@ def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> I
             yield f"do: {why}"
     for key in ("next", "do", "status"):
         if getattr(row, key) is None:
-            yield f"{key}: missing; {RowConfig.model_fields[key].description}"
+            yield f"{key}: missing; {keys_of(RowConfig)[key].description}"
     if row.status is not None and row.status not in STATES:
         yield f"status: unknown '{row.status}'; known: {', '.join(STATES)}"
     if row.status in REASONED and row.reason is None:

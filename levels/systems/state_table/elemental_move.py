@@ -53,25 +53,23 @@ MOVE_TABLE_STATUS = status(
 class TaughtPoseConfig(Table):
     """`[plan.pose.<name>]`: a pose of the tool, pointing down, relative to an object or a place."""
 
-    height: Finite = Key(description="of the tool above its origin, m")
-    speed: Positive = Key(1.0, le=1.0, description="part of the joints' limits on the way there")
+    height: Finite
+    """of the tool above its origin, m"""
+    speed: Positive = Key(1.0, le=1.0)
+    """part of the joints' limits on the way there"""
 
 
 class MovePlanConfig(Table):
     """`[plan]` of the elemental move level's table."""
 
-    pose: dict[Name, TaughtPoseConfig] = Key(min_length=1, description="poses by name")
-    place: dict[Name, Place] = Key({}, description="origin of an object put there, m, by name")
-    moved: NotNegative = Key(
-        0.01,
-        description=(
-            "distance from where it was sensed , or should stand, at which an object is"
-            " displaced, m"
-        ),
-    )
-    home_speed: Positive = Key(
-        1.0, le=1.0, description="part of the joints' limits on the way home"
-    )
+    pose: dict[Name, TaughtPoseConfig] = Key(min_length=1)
+    """poses by name"""
+    place: dict[Name, Place] = {}
+    """origin of an object put there, m, by name"""
+    moved: NotNegative = 0.01
+    """distance from where it was sensed , or should stand, at which an object is displaced, m"""
+    home_speed: Positive = Key(1.0, le=1.0)
+    """part of the joints' limits on the way home"""
 
 
 class MoveTable(StateTableExecutor):

@@ -90,12 +90,8 @@ BELOW = Condition(
 class StateTableParams(Table):
     """`[board.<name>.params]`: the state tables of the level."""
 
-    tables: dict[Name, Annotated[Path, Key(strict=False)]] = Key(
-        min_length=1,
-        description=(
-            "TOML files by name, relative to the config; the first is in force at the start"
-        ),
-    )
+    tables: dict[Name, Annotated[Path, Key(strict=False)]] = Key(min_length=1)
+    """TOML files by name, relative to the config; the first is in force at the start"""
 
 
 def vocabulary(

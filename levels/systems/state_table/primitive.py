@@ -8,7 +8,6 @@ the arm.
 from __future__ import annotations
 
 import numpy as np
-from pydantic import Field as Key
 
 from rack.backplane.message import Field, Message, command, status
 from rack.levels.algebra import Array
@@ -72,9 +71,8 @@ JOINT_MOVE_STATUS = status(
 class PrimitivePlanConfig(Table):
     """`[plan]` of the primitive level's table."""
 
-    settled: Positive = Key(
-        0.01, description="distance from its end at which a joint has arrived, rad"
-    )
+    settled: Positive = 0.01
+    """distance from its end at which a joint has arrived, rad"""
 
 
 class PrimitiveTable(StateTableExecutor):

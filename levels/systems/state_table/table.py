@@ -71,32 +71,35 @@ LATE = "late"
 class RowConfig(Table):
     """`[[row]]`: one row of a state table."""
 
-    name: RowName = Field(description="what the row is for: shown while it fires")
-    state: States = Field(
-        min_length=1, description="the state, or a list of states, in which it may fire"
-    )
-    when: dict[str, Words] = Field({}, description="value, or a list of values, by condition")
-    otherwise: bool = Field(
-        False, alias="else", description="takes what the rows of the state above this one leave"
-    )
+    name: RowName
+    """what the row is for: shown while it fires"""
+    state: States = Field(min_length=1)
+    """the state, or a list of states, in which it may fire"""
+    when: dict[str, Words] = {}
+    """value, or a list of values, by condition"""
+    otherwise: bool = Field(False, alias="else")
+    """takes what the rows of the state above this one leave"""
     # Missing ones are reported with what else is wrong with the table.
-    next: Name | None = Field(None, description="next state, or same")
-    do: Words | None = Field(
-        None, description="actions with their parameters, in order; may be an empty list"
-    )
+    next: Name | None = None
+    """next state, or same"""
+    do: Words | None = None
+    """actions with their parameters, in order; may be an empty list"""
     status: str | None = Field(None, description="state shown upwards: " + ", ".join(STATES))
-    reason: Reason | None = Field(None, description="shown with status error or holding")
+    reason: Reason | None = None
+    """shown with status error or holding"""
 
 
 class TableConfig(Table):
     """A state table's file."""
 
-    start: Name = Field(description="state in which the table begins")
-    patience: Positive = Field(
-        10.0, description="time in one state after which the condition late is yes, s"
-    )
-    row: tuple[dict[str, Any], ...] = Field(min_length=1, max_length=500, description="its rows")
-    plan: dict[str, Any] = Field({}, description="the level's static plan")
+    start: Name
+    """state in which the table begins"""
+    patience: Positive = 10.0
+    """time in one state after which the condition late is yes, s"""
+    row: tuple[dict[str, Any], ...] = Field(min_length=1, max_length=500)
+    """its rows"""
+    plan: dict[str, Any] = {}
+    """the level's static plan"""
 
 
 class TableError(LevelError):

@@ -43,14 +43,17 @@ TASK_TABLE_STATUS = status(
 class StepConfig(Table):
     """`[[plan.step]]`: an object, and where it goes."""
 
-    object: str = Key(description="an object of the scene")
-    place: Name = Key(description="a place that the level below knows")
+    object: str
+    """an object of the scene"""
+    place: Name
+    """a place that the level below knows"""
 
 
 class TaskPlanConfig(Table):
     """`[plan]` of the task level's table."""
 
-    step: tuple[StepConfig, ...] = Key(min_length=1, max_length=100, description="steps, in order")
+    step: tuple[StepConfig, ...] = Key(min_length=1, max_length=100)
+    """steps, in order"""
 
 
 class TaskTable(StateTableExecutor):

@@ -20,8 +20,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pydantic import Field
-
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
@@ -197,7 +195,8 @@ class Motions:
 class ScriptParams(Table):
     """`[host.<name>.params]`: the script of a command environment."""
 
-    script: str = Field(description="Python script to run, in a folder of python_path")
+    script: str
+    """Python script to run, in a folder of python_path"""
 
 
 class CommandEnvironment(HostProgram):

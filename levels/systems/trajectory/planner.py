@@ -44,9 +44,8 @@ lost."""
 class PlanningParams(Table):
     """How far the planner goes ahead, in `[board.<name>.params]`."""
 
-    ahead: int = Field(
-        4, ge=1, le=HELD, description="requests that may be queued or under way at the same time"
-    )
+    ahead: int = Field(4, ge=1, le=HELD)
+    """requests that may be queued or under way at the same time"""
 
 
 class RequestExecutor(Executor):

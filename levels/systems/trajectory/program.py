@@ -25,29 +25,30 @@ Turn = tuple[Finite, Finite, Finite, Finite]
 class MotionStep(Table):
     """Base of the steps that move the arm."""
 
-    segment: NotNegative = Field(
-        0.0, description="time of the segment, s; 0: from the limits; too short: stretched"
-    )
-    acceleration: NotNegative = Field(
-        0.0, description="half the time of the blend into it, s; 0: the level's default"
-    )
+    segment: NotNegative = 0.0
+    """time of the segment, s; 0: from the limits; too short: stretched"""
+    acceleration: NotNegative = 0.0
+    """half the time of the blend into it, s; 0: the level's default"""
 
 
 class HomeStep(MotionStep):
     """Move the joints to where the arm starts."""
 
-    do: Literal["home"] = Field("home", description="the kind of step")
+    do: Literal["home"] = "home"
+    """the kind of step"""
 
 
 class MoveStep(MotionStep):
     """Move straight in joint space, to joint positions or to where the tool has a pose."""
 
-    do: Literal["move"] = Field("move", description="the kind of step")
-    joints: tuple[Finite, ...] | None = Field(None, description="joint positions, rad")
-    position: Vector | None = Field(None, description="of the tool, m")
-    quaternion: Turn | None = Field(
-        None, description="of the tool, as w, x, y, z; as at home when not given"
-    )
+    do: Literal["move"] = "move"
+    """the kind of step"""
+    joints: tuple[Finite, ...] | None = None
+    """joint positions, rad"""
+    position: Vector | None = None
+    """of the tool, m"""
+    quaternion: Turn | None = None
+    """of the tool, as w, x, y, z; as at home when not given"""
 
     @model_validator(mode="after")
     def _one_goal(self) -> MoveStep:
@@ -62,18 +63,16 @@ class LineStep(MotionStep):
     """Move the tool along a straight line, to a pose in the world or in the frame of a body, which
     it may follow."""
 
-    do: Literal["line"] = Field("line", description="the kind of step")
-    position: Vector = Field(description="of the tool, m, in the frame of `body`")
-    quaternion: Turn | None = Field(
-        None, description="of the tool, as w, x, y, z, in that frame; as at home by default"
-    )
-    body: str | None = Field(
-        None, description="object or obstacle in whose frame the goal is; the world when not given"
-    )
-    live: bool = Field(
-        False,
-        description="true: the goal follows the body; false: it is copied when the motion begins",
-    )
+    do: Literal["line"] = "line"
+    """the kind of step"""
+    position: Vector
+    """of the tool, m, in the frame of `body`"""
+    quaternion: Turn | None = None
+    """of the tool, as w, x, y, z, in that frame; as at home by default"""
+    body: str | None = None
+    """object or obstacle in whose frame the goal is; the world when not given"""
+    live: bool = False
+    """true: the goal follows the body; false: it is copied when the motion begins"""
 
     @model_validator(mode="after")
     def _follows_a_body(self) -> LineStep:
@@ -87,26 +86,32 @@ class LineStep(MotionStep):
 class StayStep(Table):
     """Stay at the goal before it; if that is live, follow it."""
 
-    do: Literal["stay"] = Field("stay", description="the kind of step")
-    seconds: Positive = Field(description="for how long, s")
+    do: Literal["stay"] = "stay"
+    """the kind of step"""
+    seconds: Positive
+    """for how long, s"""
 
 
 class GripStep(Table):
     """Bring the gripper to an opening, at rest."""
 
-    do: Literal["grip"] = Field("grip", description="the kind of step")
-    opening: Finite = Field(description="gripper joint position, m or rad")
-    force: Positive | None = Field(
-        None, description="largest force, N or N m; that of the gripper when not given"
-    )
-    seconds: NotNegative = Field(0.0, description="time that it takes, s; 0: the level's default")
+    do: Literal["grip"] = "grip"
+    """the kind of step"""
+    opening: Finite
+    """gripper joint position, m or rad"""
+    force: Positive | None = None
+    """largest force, N or N m; that of the gripper when not given"""
+    seconds: NotNegative = 0.0
+    """time that it takes, s; 0: the level's default"""
 
 
 class CancelStep(Table):
     """Cancel what is under way or queued; the arm ramps to rest."""
 
-    do: Literal["cancel"] = Field("cancel", description="the kind of step")
-    after: NotNegative = Field(description="time after the step before it began, s")
+    do: Literal["cancel"] = "cancel"
+    """the kind of step"""
+    after: NotNegative
+    """time after the step before it began, s"""
 
 
 Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | CancelStep
@@ -116,8 +121,9 @@ class MotionProgram(Program):
     """Steps in their order: step k becomes request k + 1."""
 
     step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field(
-        (), max_length=MAX_REQUESTS, description="steps, done in their order"
+        (), max_length=MAX_REQUESTS
     )
+    """steps, done in their order"""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of everything that the arm or the scene lacks."""
