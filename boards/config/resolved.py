@@ -37,7 +37,7 @@ from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
 from rack.boards.config.toml import Tables, parse
-from rack.boards.config.wiring import TaskPorts, Wiring, reference
+from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
@@ -110,7 +110,7 @@ def wire(config: RackConfig) -> Layout:
 
 def classes(config: RackConfig) -> tuple[str, ...]:
     """Return the classes of all levels, for the crate to preload while the config is checked."""
-    return tuple(dict.fromkeys(reference(config, place) for place in config.tasks()))
+    return tuple(dict.fromkeys(place.target for place in config.tasks()))
 
 
 @dataclass(frozen=True)
@@ -352,7 +352,7 @@ class _Examined:
         name = ports.place.board
         return HostWiring(
             board=name,
-            target=reference(config, ports.place),
+            target=ports.place.target,
             inputs=dict(ports.sources),
             outputs=dict(ports.writes),
             context=self._context(name, config.host[name].params, every=1, within_cycles=1),
@@ -376,7 +376,7 @@ class _Examined:
             busy_ms = board.budget.cycle_ms
         return TaskWiring(
             task=ports.task,
-            target=reference(self._config, ports.place),
+            target=ports.place.target,
             inputs={
                 port: source
                 for port, source in ports.reads.items()

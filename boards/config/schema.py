@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from rack.backplane.clock.system_clock import ticks_of
-from rack.backplane.layout import Role, Wake
+from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
@@ -349,14 +349,31 @@ class CommandConfig(Table):
 
 
 class TaskPlace(NamedTuple):
-    """A task's place in the config: slot, requested core and SCHED_FIFO priority."""
+    """A task's place in the config: class, slot, requested core and SCHED_FIFO priority; that of a
+    host board."""
 
     name: str
     board: str
     role: Role
+    target: str
     slot: int
     core: int
     priority: int
+
+    @property
+    def table(self) -> str:
+        """Its table, as in "board.servo"."""
+        return f"{'host' if self.role == 'host' else 'board'}.{self.board}"
+
+    @property
+    def class_key(self) -> str:
+        """The key of its class."""
+        return "program" if self.role == "host" else self.role
+
+    @property
+    def reads_key(self) -> str:
+        """The key under which its ports are rewired."""
+        return "planner_reads" if self.role == "planner" else "reads"
 
 
 class RackConfig(Table):
@@ -454,19 +471,31 @@ class RackConfig(Table):
     def tasks(self) -> Iterator[TaskPlace]:
         """Yield every task in order: each board's executor, then its planner."""
         for name, board in self.board.items():
-            yield TaskPlace(name, name, "executor", board.slot, board.core, board.priority)
+            yield TaskPlace(
+                name, name, "executor", board.executor, board.slot, board.core, board.priority
+            )
             if board.planner is not None:
                 slot = board.slot if board.planner_slot is None else board.planner_slot
                 core = board.core if board.planner_core is None else board.planner_core
                 yield TaskPlace(
-                    f"{name}.planner", name, "planner", slot, core, board.planner_priority
+                    f"{name}.planner",
+                    name,
+                    "planner",
+                    board.planner,
+                    slot,
+                    core,
+                    board.planner_priority,
                 )
 
     def hosts(self) -> Iterator[TaskPlace]:
         """Yield every board of the host side, outside the crate: it has no slot, and runs on any
         core."""
-        for name in self.host:
-            yield TaskPlace(name, name, "host", OUTSIDE, ANY_CORE, 0)
+        for name, host in self.host.items():
+            yield TaskPlace(name, name, "host", host.program, OUTSIDE, ANY_CORE, 0)
+
+    def table(self, of: TaskPlace | TaskSpec) -> BoardConfig | HostConfig:
+        """Return the table of a task's board, or of a host board."""
+        return self.host[of.board] if of.role == "host" else self.board[of.board]
 
     def text(self) -> str:
         """Return the config as self-contained TOML that loads to the same config."""

@@ -22,9 +22,7 @@ from rack.backplane.message import MessageType
 from rack.boards.classes import find_class
 from rack.boards.config.schema import (
     LAN,
-    BoardConfig,
     ExchangeConfig,
-    HostConfig,
     RackConfig,
     Sources,
     TaskPlace,
@@ -74,9 +72,9 @@ class TaskPorts:
     """The class of a task or host board, and the mailbox of each port.
 
     `reads` holds a mailbox by port or, for a port that reads many, a dict of mailboxes by board;
-    `writes` a mailbox by port, `inputs` and `outputs` the declarations of the ports; `exchange`
-    when an executor reads them; `connections` where the inputs that its class declares are
-    connected; not `is_whole` if mistakes keep some ports unknown.
+    `inputs` and `outputs` the declarations of the ports; `exchange` when an executor reads them;
+    `connections` where the inputs that its class declares are connected; not `is_whole` if mistakes
+    keep some ports unknown.
     """
 
     place: TaskPlace
@@ -84,7 +82,6 @@ class TaskPorts:
     inputs: Mapping[str, Input]
     outputs: Mapping[str, Output]
     reads: Mapping[str, Source]
-    writes: Mapping[str, str]
     exchange: Mapping[str, ExchangeConfig]
     connections: tuple[Connection, ...]
     is_whole: bool = True
@@ -108,53 +105,30 @@ class TaskPorts:
             for mailbox in mailboxes_of(source)
         ]
 
+    @cached_property
+    def writes(self) -> dict[str, str]:
+        """The mailboxes that the task writes, by port."""
+        return {port: f"{self.place.board}.{port}" for port in self.outputs}
+
     def rests_on(self, output: str) -> tuple[str, ...]:
         """Return the mailboxes on whose information an output rests."""
         return mailboxes_of(self.reads.get(self.outputs[output].rests_on or output, {}))
 
 
-def table_of(place: TaskPlace) -> str:
-    """Return the table of a task's board, or of a host board, as in "board.servo"."""
-    kind = "host" if place.role == "host" else "board"
-    return f"{kind}.{place.board}"
-
-
-def key_of(place: TaskPlace) -> str:
-    """Return the key under which a config rewires the ports of a task or host board."""
-    return "planner_reads" if place.role == "planner" else "reads"
-
-
 def rewired(config: RackConfig, place: TaskPlace) -> Mapping[str, Sources]:
-    """Return what a config holds under that key."""
-    found: Mapping[str, Sources] = getattr(_own_table(config, place), key_of(place))
-    return found
-
-
-def _own_table(config: RackConfig, place: TaskPlace) -> BoardConfig | HostConfig:
-    return config.host[place.board] if place.role == "host" else config.board[place.board]
-
-
-def class_key(place: TaskPlace) -> str:
-    """Return the key under which a config names the class of a task or host board."""
-    return "program" if place.role == "host" else place.role
-
-
-def reference(config: RackConfig, place: TaskPlace) -> str:
-    """Return the class that the config names for a task or host board, as
-    "package.module:Class"."""
-    found: str = getattr(_own_table(config, place), class_key(place))
+    """Return the mailboxes that a config gives to ports of a task or host board, by port."""
+    found: Mapping[str, Sources] = getattr(config.table(place), place.reads_key)
     return found
 
 
 def declared_ports(config: RackConfig, place: TaskPlace) -> TaskPorts:
     """Return the ports that the class of a task or host board declares. Raises `LookupError` if
     there is none."""
-    kind, outputs = _class(reference(config, place), place.role)
+    kind, outputs = _class(place.target, place.role)
     connections = tuple(_connections(config, place, kind.inputs))
     reads = {c.port: c.source for c in connections if c.fits and c.is_there}
-    writes = {port: f"{place.board}.{port}" for port in outputs}
     exchange = config.board[place.board].exchange if place.role == "executor" else {}
-    return TaskPorts(place, kind, kind.inputs, outputs, reads, writes, exchange, connections)
+    return TaskPorts(place, kind, kind.inputs, outputs, reads, exchange, connections)
 
 
 def with_made_ports(
@@ -163,14 +137,12 @@ def with_made_ports(
     """Add the ports that the config makes: their types may be those of other mailboxes."""
     if not issubclass(ports.kind, Executor):
         return ports
-    board = ports.place.board
-    made = ports.kind.made_ports(config.board[board].params, types)
+    made = ports.kind.made_ports(config.board[ports.place.board].params, types)
     return replace(
         ports,
         inputs={**ports.inputs, **made.inputs},
         outputs={**ports.outputs, **made.outputs},
         reads={**ports.reads, **{port: entry.source for port, entry in made.inputs.items()}},
-        writes={**ports.writes, **{port: f"{board}.{port}" for port in made.outputs}},
         is_whole=made.is_whole,
     )
 
@@ -182,9 +154,7 @@ def with_exchange(ports: TaskPorts) -> TaskPorts:
         return ports
     outputs = dict(ports.outputs)
     outputs.setdefault(EXCHANGE, Output(exchange_message(ports.reads)))
-    return replace(
-        ports, outputs=outputs, writes={**ports.writes, EXCHANGE: f"{ports.task}.{EXCHANGE}"}
-    )
+    return replace(ports, outputs=outputs)
 
 
 def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
@@ -215,12 +185,12 @@ def _connections(
 ) -> Iterator[Connection]:
     own = {place.board}
     wired = rewired(config, place)
-    table = _own_table(config, place)
+    table = config.table(place)
     neighbours = {"own": (place.board,), "above": getattr(table, "above", ()), "below": table.below}
     for port, entry in inputs.items():
         start, _, rest = entry.source.partition(".")
         if port in wired:
-            yield Connection(port, entry, f"{key_of(place)}.{port}", wired[port], wired[port])
+            yield Connection(port, entry, f"{place.reads_key}.{port}", wired[port], wired[port])
             continue
         boards = neighbours.get(start, (start,))
         is_there = start not in ("above", "below") or {*boards} <= config.board.keys() - own
@@ -318,7 +288,7 @@ class Wiring:
         """The tables with parameters, as in "board.servo", and their records, each once."""
         found = self.ports.items()
         return dict.fromkeys(
-            (table_of(place), p.kind.params) for place, p in found if p.kind.params is not None
+            (place.table, p.kind.params) for place, p in found if p.kind.params is not None
         )
 
     @property

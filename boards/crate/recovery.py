@@ -78,8 +78,7 @@ class Supervision:
         if task == CLOCK:
             return common.restarts, common.within_s
         spec = self._layout.task(task)
-        config = self._config
-        board = config.host[task] if spec.role == "host" else config.board[spec.board]
+        board = self._config.table(spec)
         most = common.restarts if board.restarts is None else board.restarts
         return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
 

@@ -7,16 +7,8 @@ from collections.abc import Iterator
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
 from rack.backplane.message import State
-from rack.boards.config.schema import LAN
-from rack.boards.config.wiring import (
-    TaskPorts,
-    Wiring,
-    class_key,
-    key_of,
-    reference,
-    rewired,
-    table_of,
-)
+from rack.boards.config.schema import LAN, TaskPlace
+from rack.boards.config.wiring import TaskPorts, Wiring, rewired
 from rack.boards.errors import Mistake
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
@@ -28,25 +20,23 @@ def ports(wiring: Wiring) -> Iterator[Mistake]:
     """Check that each class is there, and that its inputs are connected as it declares."""
     config = wiring.config
     for place in (*config.tasks(), *config.hosts()):
-        table = table_of(place)
         if place in wiring.missing:
-            yield Mistake(
-                f"{table}.{class_key(place)}", reference(config, place), wiring.missing[place]
-            )
+            yield Mistake(f"{place.table}.{place.class_key}", place.target, wiring.missing[place])
         else:
-            yield from _connected(wiring, table, wiring.ports[place])
+            yield from _connected(wiring, place, wiring.ports[place])
 
 
-def _connected(wiring: Wiring, table: str, ports: TaskPorts) -> Iterator[Mistake]:
-    role = ports.place.role
+def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Iterator[Mistake]:
+    role = place.role
+    table = place.table
     inputs = ", ".join(ports.kind.inputs) or "none"
     for output, told in ports.outputs.items():
         if told.rests_on and told.rests_on not in ports.inputs:
             why = f"its output '{output}' rests on '{told.rests_on}'; inputs: {inputs}"
-            yield Mistake(f"{table}.{role}", reference(wiring.config, ports.place), why)
-    for port, given in rewired(wiring.config, ports.place).items():
+            yield Mistake(f"{table}.{role}", place.target, why)
+    for port, given in rewired(wiring.config, place).items():
         if port not in ports.kind.inputs:
-            key = f"{key_of(ports.place)}.{port}"
+            key = f"{place.reads_key}.{port}"
             yield Mistake(f"{table}.{key}", given, f"the {role} has no such port; ports: {inputs}")
     for port, entry, key, given, mailboxes, _ in (
         found for found in ports.connections if not found.fits
@@ -94,8 +84,8 @@ def _wired_at(ports: TaskPorts, port: str) -> str:
     """Return the key of a config under which an input is wired, as in
     "board.servo.reads.command"."""
     place = ports.place
-    key = ports.kind.wired_by if issubclass(ports.kind, Adapter) else key_of(place)
-    return f"{table_of(place)}.{key}.{port}"
+    key = ports.kind.wired_by if issubclass(ports.kind, Adapter) else place.reads_key
+    return f"{place.table}.{key}.{port}"
 
 
 def statuses(wiring: Wiring) -> Iterator[Mistake]:
