@@ -125,25 +125,30 @@ class Resolved:
     commands: tuple[Request, ...]
     goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
-    def with_name(self, rack: str) -> Resolved:
-        """Return the rack whose levels see another name, which may stand in their messages."""
-        tasks = (replace(task, context=replace(task.context, rack=rack)) for task in self.tasks)
-        return replace(self, tasks=tuple(tasks))
+    def for_run(
+        self, repeats: str, entries: Mapping[str, Entries] | None, keeping: Keeping | None
+    ) -> Resolved:
+        """Return the rack for one run.
 
-    def with_entries(self, entries: Mapping[str, Entries]) -> Resolved:
-        """Return the rack for a replay: no host boards and other racks, but what each adapter wrote
-        in the recorded run."""
-        tasks = tuple(replace(task, entries=entries.get(task.task)) for task in self.tasks)
-        return replace(self, tasks=tasks, hosts=())
+        `repeats`: the name that its levels see, which may stand in their messages; empty: its own.
+        `entries`: of a replay, which has no host boards and other racks, but what each adapter
+        wrote in the recorded run. `keeping`: its checkpoints, or the one that it continues from.
+        """
+        tasks = tuple(
+            replace(
+                task,
+                context=replace(task.context, rack=repeats or self.config.name),
+                entries=None if entries is None else entries.get(task.task),
+                keeping=keeping,
+            )
+            for task in self.tasks
+        )
+        return replace(self, tasks=tasks, hosts=self.hosts if entries is None else ())
 
     @property
     def is_replay(self) -> bool:
         """Whether what came from outside in a recorded run comes again."""
         return any(task.entries is not None for task in self.tasks)
-
-    def with_keeping(self, keeping: Keeping) -> Resolved:
-        """Return the rack with checkpoints, or continuing from one."""
-        return replace(self, tasks=tuple(replace(task, keeping=keeping) for task in self.tasks))
 
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task

@@ -162,11 +162,9 @@ class Rack:
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
         # A level's module may have ended it: then resolving says which.
         crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
-        plan = resolve(self.config)
-        plan = plan.with_name(self._repeats) if self._repeats else plan
-        self._plan = plan = plan if self._entries is None else plan.with_entries(self._entries)
+        plan = resolve(self.config).for_run(self._repeats, self._entries, self._keeping)
+        self._plan = plan
         if self._keeping is not None:
-            self._plan = plan = plan.with_keeping(self._keeping)
             self._origin = import_module(RESTORING).origin(plan, self._keeping)
         plan.check_files()
         remove_dead(self.config.name)
