@@ -54,85 +54,70 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     **dict.fromkeys(MISSES, "miss"),
 }
 """The kind of event for each alarm; any other alarm is a detection."""
-TEXTS: Mapping[Alarm, tuple[About, str]] = {
-    Alarm.HANG: ("task", "'{subject}' is not responding: {releases} missed since tick {since}"),
-    Alarm.REJOINED: ("task", "'{subject}' rejoined after {span}"),
-    Alarm.LATE: ("task", "'{subject}' missed its deadline: still running at its next release"),
-    Alarm.PLAN_LATE: ("task", "'{subject}' missed its deadline: its plan was not finished"),
-    Alarm.STARVED: (
-        "task",
-        "'{subject}' is not getting its core: {releases} missed since tick {since}",
-    ),
-    Alarm.FLOWS: ("mailbox", "'{subject}': messages flow again, {span} after a fault"),
-    Alarm.STALE: (
-        "mailbox",
-        "'{subject}' is stale, {span}: its writer '{writer}' is dead or stopped",
-    ),
-    Alarm.MUTE: ("mailbox", "'{subject}' is stale, {span}: '{writer}' is running but not writing"),
-    Alarm.GAP: ("mailbox", "'{subject}': {messages} lost, gap in serials"),
-    Alarm.HELD_BACK: ("mailbox", "'{subject}': a message was delayed by {span}"),
-    Alarm.DISORDER: ("mailbox", "'{subject}': messages out of order, the last one by {span}"),
-    Alarm.DAMAGED: ("mailbox", "'{subject}': a message failed its check"),
-    Alarm.BABBLE: (
-        "mailbox",
-        "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1",
-    ),
-    Alarm.MASQUERADE: (
-        "mailbox",
-        "'{subject}': a message comes from process {value:.0f}, which is not its writer",
-    ),
-    Alarm.QUEUE_FULL: ("mailbox", "'{subject}' is full: {messages} of '{writer}' refused"),
-    Alarm.INBOX_FULL: ("mailbox", "inbox is full: {messages} in '{subject}' lost"),
-    Alarm.LOCKED: ("mailbox", "'{subject}': a dead or stopped process holds the lock"),
-    Alarm.CLOCK_STOPPED: ("nothing", "clock stopped: no tick for {span}"),
-    Alarm.CLOCK_SKIPPED: ("nothing", "clock skipped {ticks}"),
-    Alarm.CLOCK_LATE: ("nothing", "clock late: tick {late_ms:.3f} ms late"),
-    Alarm.SENSOR_RANGE: ("joint", "sensor {subject} out of range: {value:g} rad"),
-    Alarm.SENSOR_STUCK: (
-        "joint",
-        "sensor {subject} stuck: unchanged for {value:.0f} cycles while the arm is driven",
-    ),
-    Alarm.SENSOR_SILENT: ("nothing", "sensors silent: no new sample for {span}"),
-    Alarm.SENSOR_LATE: ("nothing", "samples late: {span} old"),
-    Alarm.SENSOR_MODEL: ("joint", "sensor {subject} disagrees with the model: off by {value:.3g}"),
-    Alarm.ACTUATOR: (
-        "joint",
-        "actuator {subject} does not produce its commanded torque: off by {value:.3g}",
-    ),
-    Alarm.COMMAND_INVALID: ("joint", "rejected: torque of {subject} is NaN"),
-    Alarm.COMMAND_LIMIT: (
-        "joint",
-        "torque of {subject} cut to its limit: {value:.3g} N m was commanded",
-    ),
-    Alarm.SET_POINT: (
-        "joint",
-        "rejected: set point of {subject} is {value:.3g} rad from the joint",
-    ),
-    Alarm.LIMIT_EXCEEDED: ("joint", "{subject} is beyond its limit, as sensed: {value:.4g}"),
-    Alarm.TENSION_INVALID: ("joint", "rejected: a tension of {subject} is NaN"),
-    Alarm.TENSION_LIMIT: (
-        "joint",
-        "tension of {subject} cut to its limit: {value:.3g} N was commanded",
-    ),
-    Alarm.TENDON: ("joint", "tendon of {subject} is slack: {value:.3g} N"),
-    Alarm.BRAKES_CLOSED: ("brakes", "brakes engaged: {subject}"),
-    Alarm.BRAKES_OPENED: ("brakes", "brakes released after {span}"),
-    Alarm.RE_REFERENCED: (
-        "joint",
-        "sensor {subject} trusted again: {value:.3g} rad from its estimate",
-    ),
-    Alarm.COLLISION: ("geom", "unintended contact: '{subject}' touches '{writer}'"),
-    Alarm.FORCE_LIMIT: ("nothing", "contact too strong: force of {value:.3g} N"),
-    Alarm.MOMENT_LIMIT: ("nothing", "contact too strong: torque of {value:.3g} N m"),
-    Alarm.MODIFICATION: ("name", "control modification '{subject}' failed and was taken out"),
-    Alarm.PEER_LOST: (
-        "name",
-        "rack '{subject}' is lost: its network adapter ended, or is out of reach",
-    ),
-    Alarm.PEER_BACK: ("name", "rack '{subject}' is back after {span}"),
-    Alarm.PEER_RESTARTED: ("name", "rack '{subject}' is back after {span}: it was restarted"),
-    Alarm.REMOTE_STOP: ("name", "'{subject}' has set the emergency stop from another machine"),
-    Alarm.LATCHED: ("joint", "fault of {subject} latched at {value:.4g}: brakes stay engaged"),
+TEXTS: Mapping[About, Mapping[Alarm, str]] = {
+    "task": {
+        Alarm.HANG: "'{subject}' is not responding: {releases} missed since tick {since}",
+        Alarm.REJOINED: "'{subject}' rejoined after {span}",
+        Alarm.LATE: "'{subject}' missed its deadline: still running at its next release",
+        Alarm.PLAN_LATE: "'{subject}' missed its deadline: its plan was not finished",
+        Alarm.STARVED: "'{subject}' is not getting its core: {releases} missed since tick {since}",
+    },
+    "mailbox": {
+        Alarm.FLOWS: "'{subject}': messages flow again, {span} after a fault",
+        Alarm.STALE: "'{subject}' is stale, {span}: its writer '{writer}' is dead or stopped",
+        Alarm.MUTE: "'{subject}' is stale, {span}: '{writer}' is running but not writing",
+        Alarm.GAP: "'{subject}': {messages} lost, gap in serials",
+        Alarm.HELD_BACK: "'{subject}': a message was delayed by {span}",
+        Alarm.DISORDER: "'{subject}': messages out of order, the last one by {span}",
+        Alarm.DAMAGED: "'{subject}': a message failed its check",
+        Alarm.BABBLE: "'{subject}': '{writer}' writes {value:g} messages per cycle; permitted: 1",
+        Alarm.MASQUERADE: (
+            "'{subject}': a message comes from process {value:.0f}, which is not its writer"
+        ),
+        Alarm.QUEUE_FULL: "'{subject}' is full: {messages} of '{writer}' refused",
+        Alarm.INBOX_FULL: "inbox is full: {messages} in '{subject}' lost",
+        Alarm.LOCKED: "'{subject}': a dead or stopped process holds the lock",
+    },
+    "nothing": {
+        Alarm.CLOCK_STOPPED: "clock stopped: no tick for {span}",
+        Alarm.CLOCK_SKIPPED: "clock skipped {ticks}",
+        Alarm.CLOCK_LATE: "clock late: tick {late_ms:.3f} ms late",
+        Alarm.SENSOR_SILENT: "sensors silent: no new sample for {span}",
+        Alarm.SENSOR_LATE: "samples late: {span} old",
+        Alarm.FORCE_LIMIT: "contact too strong: force of {value:.3g} N",
+        Alarm.MOMENT_LIMIT: "contact too strong: torque of {value:.3g} N m",
+    },
+    "joint": {
+        Alarm.SENSOR_RANGE: "sensor {subject} out of range: {value:g} rad",
+        Alarm.SENSOR_STUCK: (
+            "sensor {subject} stuck: unchanged for {value:.0f} cycles while the arm is driven"
+        ),
+        Alarm.SENSOR_MODEL: "sensor {subject} disagrees with the model: off by {value:.3g}",
+        Alarm.ACTUATOR: (
+            "actuator {subject} does not produce its commanded torque: off by {value:.3g}"
+        ),
+        Alarm.COMMAND_INVALID: "rejected: torque of {subject} is NaN",
+        Alarm.COMMAND_LIMIT: "torque of {subject} cut to its limit: {value:.3g} N m was commanded",
+        Alarm.SET_POINT: "rejected: set point of {subject} is {value:.3g} rad from the joint",
+        Alarm.LIMIT_EXCEEDED: "{subject} is beyond its limit, as sensed: {value:.4g}",
+        Alarm.TENSION_INVALID: "rejected: a tension of {subject} is NaN",
+        Alarm.TENSION_LIMIT: "tension of {subject} cut to its limit: {value:.3g} N was commanded",
+        Alarm.TENDON: "tendon of {subject} is slack: {value:.3g} N",
+        Alarm.RE_REFERENCED: "sensor {subject} trusted again: {value:.3g} rad from its estimate",
+        Alarm.LATCHED: "fault of {subject} latched at {value:.4g}: brakes stay engaged",
+    },
+    "brakes": {
+        Alarm.BRAKES_CLOSED: "brakes engaged: {subject}",
+        Alarm.BRAKES_OPENED: "brakes released after {span}",
+    },
+    "geom": {Alarm.COLLISION: "unintended contact: '{subject}' touches '{writer}'"},
+    "name": {
+        Alarm.MODIFICATION: "control modification '{subject}' failed and was taken out",
+        Alarm.PEER_LOST: "rack '{subject}' is lost: its network adapter ended, or is out of reach",
+        Alarm.PEER_BACK: "rack '{subject}' is back after {span}",
+        Alarm.PEER_RESTARTED: "rack '{subject}' is back after {span}: it was restarted",
+        Alarm.REMOTE_STOP: "'{subject}' has set the emergency stop from another machine",
+    },
 }
 
 
@@ -261,7 +246,7 @@ class AlarmEvents:
 
     def _described(self, alarm: Alarm, row: np.void, owner: str) -> tuple[str, str]:
         """Return the name of the subject of an alarm from `owner`, and its text."""
-        about, text = TEXTS[alarm]
+        about, text = next((kind, texts[alarm]) for kind, texts in TEXTS.items() if alarm in texts)
         number = int(row["subject"])
         value = float(row["value"])
         layout = self._layout
