@@ -18,7 +18,6 @@ from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
-from rack.boards.config.scheduling import Scheduling
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
@@ -68,9 +67,15 @@ LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
 
-class ClockConfig(Scheduling):
+class ClockConfig(Table):
     """`[clock]`: the system clock and its board, the system controller in slot 1."""
 
+    scheduler: Literal["fixed-priority", "earliest-deadline-first"] = "fixed-priority"
+    """fixed-priority: SCHED_FIFO, by the boards' priority; earliest-deadline-first: in real time
+    SCHED_DEADLINE, by their cycles, with twice their budgets reserved; on any core where the kernel
+    refuses theirs"""
+    on_no_realtime: Literal["refuse", "warn"] = "warn"
+    """if a SCHED_FIFO priority is refused: warn and continue, or refuse to launch"""
     period_ms: float = Field(ge=SHORTEST_MS, le=1000, allow_inf_nan=False)
     """tick period, ms; a whole number of ns"""
     mode: Mode = "realtime"

@@ -10,7 +10,6 @@ from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
 from rack.backplane.process import Reservation
-from rack.boards.config.scheduling import RESERVED
 from rack.boards.config.schema import (
     BoardConfig,
     BudgetConfig,
@@ -25,6 +24,9 @@ from rack.levels.timing.rack import CyclicSchedule, RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
 
 NS_PER_MS = 1e6
+RESERVED = 2
+"""Times its budget that a board may use up in a cycle: budgets are 99th percentiles, and the kernel
+lets whoever uses more wait for the next cycle."""
 PARTS = tuple(field.name for field in fields(Budget))
 PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 """Keys of a budget that only a board with a planner has."""
