@@ -84,14 +84,9 @@ class BoundCase:
         return tuple(mailbox for mailbox in struck if mailbox.readers)
 
     @property
-    def is_planner(self) -> bool:
-        """Whether it strikes a planner, which writes at no fixed period."""
-        return self.board != CLOCK and self.layout.task(self.board).role == "planner"
-
-    @property
-    def is_host(self) -> bool:
-        """Whether it strikes a host board, which has no cycle."""
-        return self.board != CLOCK and self.layout.task(self.board).role == "host"
+    def role(self) -> str:
+        """Role of the task; "clock" for the clock."""
+        return CLOCK if self.board == CLOCK else self.layout.task(self.board).role
 
     @property
     def cycle(self) -> int:
@@ -152,7 +147,7 @@ def cycles(count: int) -> Bound:
     board has none."""
 
     def ticks(case: BoundCase) -> int | None:
-        return None if case.is_host else count * case.cycle
+        return None if case.role == "host" else count * case.cycle
 
     text = counting(count, "cycle") if count else "the same cycle"
     return Bound(text, ticks)
@@ -183,7 +178,7 @@ def missing_writes(count: int) -> Bound:
     fixed period."""
 
     def ticks(case: BoundCase) -> int | None:
-        return None if case.is_planner else count * case.write
+        return None if case.role == "planner" else count * case.write
 
     return Bound(counting(count, "write"), ticks)
 

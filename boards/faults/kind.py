@@ -154,9 +154,9 @@ class Kind:
             return None
         return next(p for p in self.parameters if p.name == "size")
 
-    def values(self, entry: FaultEntry) -> dict[str, float]:
-        """Return the parameters that an entry of the fault table holds, by name."""
-        return {p.name: value for p, value in zip(self.parameters, entry.parameters, strict=False)}
+    def values(self, fault: FaultEntry | Injection) -> dict[str, float]:
+        """Return the parameters that a fault of this kind holds, by name."""
+        return {p.name: value for p, value in zip(self.parameters, fault.parameters, strict=False)}
 
     def bound_ticks(
         self, injection: Injection, layout: Layout, reader: str | None = None
@@ -167,10 +167,7 @@ class Kind:
         `reader` is the task that detects it; None: the first to do so, for a death the Rack. A
         mailbox without readers has no bound.
         """
-        given = {
-            p.name: value for p, value in zip(self.parameters, injection.parameters, strict=False)
-        }
-        case = BoundCase(layout, injection, given, reader)
+        case = BoundCase(layout, injection, self.values(injection), reader)
         needs_reader = self.takes_mailbox or (self.detected_as == (DIED,) and reader is not None)
         return None if needs_reader and not case.mailboxes else self.bound.ticks(case)
 
