@@ -13,16 +13,14 @@ from rack.backplane.layout import Layout
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import Request
-from rack.boards.classes import find_class
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.config.timing import first_tick
-from rack.boards.config.wiring import commandable
+from rack.boards.config.wiring import commandable, executor_of
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import norm
 from rack.levels.errors import LevelError
-from rack.levels.level import Executor
 from rack.levels.operator import NAMED, Commands, Goal, Operation, goal_names
 from rack.levels.tables import live_keys, read_params
 
@@ -32,8 +30,7 @@ DOWN = (0.0, 0.0, -1.0)
 def takes(config: RackConfig, board: str, commands: Commands) -> str:
     """Return the commands that a level takes as text, with the names that it knows: "hold, resume,
     table saw|slow"."""
-    table = config.board[board]
-    executor = find_class(table.executor, Executor)
+    executor = executor_of(config, board)
     words = []
     for what, goals in commands.items():
         names: Sequence[str] = ()
@@ -42,7 +39,7 @@ def takes(config: RackConfig, board: str, commands: Commands) -> str:
         elif what in NAMED:
             # A table may be in the middle of being edited.
             with suppress(LevelError):
-                names = executor.wording(what, table.params, config.scene)
+                names = executor.wording(what, config.board[board].params, config.scene)
         wording = (what.name.lower(), "|".join(names), goal_names(goals))
         words.append(" ".join(word for word in wording if word))
     return ", ".join(words)
@@ -51,7 +48,7 @@ def takes(config: RackConfig, board: str, commands: Commands) -> str:
 def live_params(config: RackConfig) -> dict[str, Sequence[str]]:
     """Return the params that an operator may set live, by board; boards without any are omitted."""
     return {
-        name: live_keys(find_class(config.board[name].executor, Executor).params)
+        name: live_keys(executor_of(config, name).params)
         for name, commands in commandable(config).items()
         if Operation.SET in commands
     }
@@ -59,7 +56,7 @@ def live_params(config: RackConfig) -> dict[str, Sequence[str]]:
 
 def launched_with(config: RackConfig, board: str, key: str) -> Any:
     """Return a parameter of a board as it was launched; None: there is no such."""
-    kind = find_class(config.board[board].executor, Executor).params
+    kind = executor_of(config, board).params
     if kind is None:
         return None
     return getattr(read_params(kind, config.board[board].params), key, None)
@@ -67,8 +64,7 @@ def launched_with(config: RackConfig, board: str, key: str) -> Any:
 
 def setting_name(config: RackConfig, board: str, number: int) -> str:
     """Return the name that a board's level gives to something by `number`: see `Executor.names`."""
-    table = config.board[board]
-    return find_class(table.executor, Executor).names(table.params)[number]
+    return executor_of(config, board).names(config.board[board].params)[number]
 
 
 def asked(given: Mapping[str, Any]) -> CommandConfig:

@@ -8,14 +8,12 @@ from functools import partial
 from pydantic import ValidationError
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
-from rack.boards.classes import find_class
 from rack.boards.config.cell import built_cell
 from rack.boards.config.mistakes import at_key, mistakes_of
-from rack.boards.config.schema import BoardConfig, CommandConfig, RackConfig
-from rack.boards.config.wiring import commandable
+from rack.boards.config.schema import CommandConfig, RackConfig
+from rack.boards.config.wiring import commandable, executor_of
 from rack.boards.errors import Mistake
 from rack.levels.errors import LevelError, RobotError
-from rack.levels.level import Executor
 from rack.levels.operator import NAMED, Commands, Goal, Operation, goal_names, listed
 from rack.levels.tables import live_keys, read_setting
 
@@ -56,7 +54,7 @@ def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterato
         return
     yield from _goal(at, command, known)
     if command.said is Operation.SET:
-        yield from _setting(place, command, config.board[command.level])
+        yield from _setting(place, command, config)
     else:
         yield from _name(at("name"), command, config)
     if command.joints is not None and Goal.JOINTS in known[command.said]:
@@ -101,11 +99,9 @@ def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mi
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
-    board = config.board[command.level]
+    params = config.board[command.level].params
     try:
-        known = find_class(board.executor, Executor).wording(
-            command.said, board.params, config.scene
-        )
+        known = executor_of(config, command.level).wording(command.said, params, config.scene)
     except LevelError:
         return  # reported elsewhere
     if command.name not in known:
@@ -116,10 +112,10 @@ def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mi
         )
 
 
-def _setting(place: str, command: CommandConfig, board: BoardConfig) -> Iterator[Mistake]:
+def _setting(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
     """Check that a command sets a live parameter of its level to a valid value."""
     name = at_key(place, "name")
-    kind = find_class(board.executor, Executor).params
+    kind = executor_of(config, command.level).params
     try:
         key, value = read_setting(command.name or "")
     except LevelError as error:
@@ -131,7 +127,7 @@ def _setting(place: str, command: CommandConfig, board: BoardConfig) -> Iterator
         why = f"read at the launch alone; live: {', '.join(live) or 'none'}"
         yield Mistake(f"{params}.{key}", value, why)
         return
-    given = {**board.params, key: value}
+    given = {**config.board[command.level].params, key: value}
     try:
         kind.model_validate(given)
     except ValidationError as error:
