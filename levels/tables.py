@@ -40,8 +40,11 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 Interface = Literal["torque", "position", "velocity"]
 """What drives take; with the last two they close loops of their own."""
+Moment = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+"""Simulated time, s."""
 LAST_TICK = 10**15
 """Ticks are 64-bit words: this many of the shortest ones last 300 years."""
+Tick = Annotated[int, Field(ge=0, le=LAST_TICK)]
 
 
 LIVE: JsonDict = {"live": True}
@@ -402,7 +405,7 @@ class MotionConfig(Table):
 
     body: str
     """obstacle that moves"""
-    at: float = Field(ge=0, le=1e9, allow_inf_nan=False)
+    at: Moment
     """simulated time when it starts, s"""
     to: Vector
     """where its origin goes, m"""
@@ -415,7 +418,7 @@ class PushConfig(Table):
 
     body: str
     """object that is pushed"""
-    at: float = Field(ge=0, le=1e9, allow_inf_nan=False)
+    at: Moment
     """simulated time when it begins, s"""
     seconds: Positive
     """time for which it lasts, s"""

@@ -22,7 +22,16 @@ from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
 from rack.levels.operator import NAME_BYTES, Goal, Operation
-from rack.levels.tables import LAST_TICK, Finite, Positive, RobotConfig, SceneConfig, Table, Vector
+from rack.levels.tables import (
+    Finite,
+    Moment,
+    Positive,
+    RobotConfig,
+    SceneConfig,
+    Table,
+    Tick,
+    Vector,
+)
 
 CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
@@ -318,9 +327,9 @@ class CommandConfig(Table):
     of the level's own commands; set: set a live parameter of the level; enable, disable: give
     torque to the arm, or take it; reset: clear a fault of its drives; release: end
     robot.bring_up"""
-    tick: int | None = Field(None, ge=0, le=LAST_TICK)
+    tick: Tick | None = None
     """tick at which the command is issued; give at most one of tick, at"""
-    at: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = None
+    at: Moment | None = None
     """instead of tick: simulated time, s"""
     joints: tuple[Finite, ...] | None = None
     """goal: one position per joint, rad"""

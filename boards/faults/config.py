@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
-from rack.levels.tables import LAST_TICK, Finite, Table
+from rack.levels.tables import Finite, Moment, Table, Tick
 
 CONDITION = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
 _DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s|min)\s*")
@@ -45,9 +45,9 @@ class FaultConfig(Table):
     """kind of fault; 'rack inject --help' lists the kinds"""
     board: str
     """task to strike: a board (servo), its planner (servo.planner), or clock"""
-    tick: int | None = Field(None, ge=0, le=LAST_TICK)
+    tick: Tick | None = None
     """first tick; give at most one of tick, at, when; default: the first of the run"""
-    at: float | None = Field(None, ge=0, le=1e9, allow_inf_nan=False)
+    at: Moment | None = None
     """instead of tick: start in simulated time, s"""
     when: str | None = None
     """instead of tick: start once this holds, as in "elemental_move.status.verb == grasp" """
