@@ -14,10 +14,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.algebra import norm
 from rack.levels.robot.engine import INTEGRATION, mj_update_sleep
 from rack.levels.tables import SceneConfig
 
 SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+STEPS_AT_REST = 10
+"""Steps in which a body is slower than `sleep_tolerance` before it sleeps: MuJoCo's mjMINAWAKE."""
 
 
 def state_size(model: mujoco.MjModel) -> int:
@@ -57,11 +60,15 @@ def sleeping(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
     them wakes them.
 
     A mocap body that moves does not, and MuJoCo ends the process at tendon equalities and flexible
-    bodies that might sleep. Only for whole steps: parts of one, called by themselves, leave out
-    what does not move.
+    bodies that might sleep. Where steps are short, or gravity weak, a body would sleep in the air,
+    at the turning point of its flight. Only for whole steps: parts of one, called by themselves,
+    leave out what does not move.
     """
     found = copy(model)
+    option = found.opt
+    gained = STEPS_AT_REST * option.timestep * norm(option.gravity)  # m/s, in falling
     tendons = model.eq_type == mujoco.mjtEq.mjEQ_TENDON
-    if not (scene.motion or tendons.any() or model.nflex):
-        found.opt.enableflags |= SLEEP
+    lingers = gained < 4.0 * option.sleep_tolerance  # in the air, for longer than those steps
+    if not (lingers or scene.motion or tendons.any() or model.nflex):
+        option.enableflags |= SLEEP
     return found

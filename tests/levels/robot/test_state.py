@@ -124,3 +124,22 @@ def test_nothing_sleeps_in_a_model_that_mujoco_would_end_the_process_for() -> No
           <fixed name="u"><joint joint="b" coef="1"/></fixed></tendon>
         <equality><tendon tendon1="t" tendon2="u"/></equality></mujoco>""")
     assert not sleeping(tied, SceneConfig()).opt.enableflags & SLEEP
+
+
+@pytest.mark.parametrize(
+    ("timestep", "gravity", "sleeps"),
+    [(5e-4, 9.81, True), (2e-5, 9.81, False), (5e-4, 0.5, False), (5e-4, 0.0, False)],
+)
+def test_nothing_sleeps_where_it_would_at_the_turning_point_of_its_flight(
+    timestep: float, gravity: float, sleeps: bool
+) -> None:
+    falling = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><option timestep="{timestep}" gravity="0 0 {-gravity}"/><worldbody>
+          <body><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
+    model = sleeping(falling, SceneConfig())
+    assert bool(model.opt.enableflags & SLEEP) is sleeps
+    data = mujoco.MjData(model)
+    data.qvel[2] = 0.2 * gravity
+    for _ in range(round(0.3 / timestep)):
+        mujoco.mj_step(model, data)
+    assert data.qvel[2] == pytest.approx(-0.1 * gravity, abs=1e-3)
