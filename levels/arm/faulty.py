@@ -6,7 +6,7 @@ The steps that act the faults are in `rack.levels.faults`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +33,19 @@ class FaultyLink:
     `Executor.acted`."""
 
     def __init__(
-        self, arm: Arm, cell: Cell, every: int, acted: dict[int, bool], link: Link | None = None
+        self,
+        arm: Arm,
+        cell: Cell,
+        every: int,
+        acted: dict[int, bool],
+        link: Link | None = None,
+        holds: Callable[[], bool] = bool,
     ) -> None:
         """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell; by its
-        `link`, if it has one of its own."""
+        `link`, if it has one of its own. `holds`: whether the gripper holds a part, for all that
+        the level knows."""
         self._arm = arm
+        self._holds = holds
         self._next: Link = link or arm
         self._every = every
         self._acted = acted
@@ -125,7 +133,7 @@ class FaultyLink:
         turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNS_FROM)
         return (
             MAX_RESTING_CONTACT_PART * self._limits
-            if self._arm.holds and turning < MIN_TURNING_JOINTS
+            if (self._arm.holds or self._holds()) and turning < MIN_TURNING_JOINTS
             else 0.0
         )
 

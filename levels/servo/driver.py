@@ -108,7 +108,9 @@ class ArmDriver(Executor):
             )
         self._sound = link
         self._link: Link = self._sound
-        self._faulty = FaultyLink(self.arm, cell, every, self.acted, self._sound)
+        self._faulty = FaultyLink(
+            self.arm, cell, every, self.acted, self._sound, lambda: self.holds
+        )
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)

@@ -163,6 +163,19 @@ def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_a_resting_arm_be
     assert acted == {0: shows}
 
 
+@pytest.mark.parametrize(("more", "shows"), [(0.0, False), (20.0, True)])
+def test_a_motor_that_is_off_shows_as_late_where_its_level_takes_a_part_for_held(
+    more: float, shows: bool
+) -> None:
+    made, acted = cell("puma560"), dict[int, bool]()
+    arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
+    assert not arm.holds
+    link = FaultyLink(arm, made, 1, acted, holds=lambda: True)
+    link.inject([fault("actuator-off", joint=1)])
+    link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
+    assert acted == {0: shows}
+
+
 def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:
     """Put a block where one finger is, so that it is held, and another so that it touches the first
     alone."""
