@@ -16,7 +16,7 @@ from rack.tools.faults.campaigns.plan import Kill, Plan, Purpose, Target, Target
 from rack.tools.faults.ending import EXTERNAL, record_of
 
 MOST_FAULTS = 40
-"""Faults of one trial: as many as fit into the task, and into the fault table."""
+"""Faults of one trial, at most: the fault table holds a few more."""
 LEAD_S = 0.1
 """Simulated time before the first fault, at least."""
 TAIL_S = 1.0
@@ -27,8 +27,15 @@ SETTLE_S = 0.1
 EPISODE = 25
 """Reads after which a reader reports the next fault of a mailbox again: those of `Episodes`, and
 some more."""
-AHEAD = 60
-"""Waiting faults that are tried for one that still fits into a trial."""
+MORE_S = 0.25
+"""Simulated time by which a window grows, at most, so that its mailbox may be struck again."""
+HOLDS_UP_S = 0.5
+"""Simulated time by which the task ends later for each fault that stops the arm: 0.5 to 1.6 s for
+NASREM's. What comes after its end does not strike, and is drawn again."""
+SHUFFLES = 20
+"""Orders that are tried for the faults of a trial."""
+BATCH = 1000
+"""Faults that are shared out between trials at a time."""
 KILL_GAP_S = 3.5
 """Simulated time between two kills from outside, at least: a restart takes up to two seconds of
 real time."""
@@ -76,13 +83,17 @@ class RackUnderTest:
 
 @dataclass(frozen=True)
 class Card:
-    """One fault that waits for its place in a trial. `ticks`: its length, 0 for a kind that strikes
-    once."""
+    """One fault that waits for its place in a trial.
+
+    `ticks`: its length, 0 for a kind that strikes once. `may_repeat`: its mailbox may be struck
+    again in the same trial, since after its window readers tell of the next fault, too.
+    """
 
     target: Target
     ticks: int
     parameters: Mapping[str, float]
     window: int
+    may_repeat: bool
     seed: int
     phase: float
 
@@ -101,15 +112,25 @@ class Card:
                 parameters["joint"] = rng.randrange(joints)
             parameters["size"] = size
         window = rack.window(target, ticks, parameters)
-        return cls(target, ticks, parameters, window, rng.randrange(SEEDS), _phase(rng))
+        told = 0
+        if target.mailbox is not None:
+            held = parameters.get("by", 0) * target.cycle if record.where == "writer" else 0
+            told = ticks + round(held) + EPISODE * max(target.reader, target.cycle)
+        if window < told <= window + MORE_S * rack.second:
+            window = told
+        return cls(
+            target, ticks, parameters, window, window >= told, rng.randrange(SEEDS), _phase(rng)
+        )
 
-    @property
-    def quiet(self) -> int:
-        """Ticks from the last message that a fault has touched to the next fault."""
-        held = 0.0
-        if self.target.record.where == "writer":
-            held = self.parameters.get("by", 0) * self.target.cycle
-        return self.window - self.ticks - round(held)
+    def prolongs(self, rack: RackUnderTest) -> int:
+        """Return the ticks by which the task ends later."""
+        record = self.target.record
+        is_stop = self.parameters.get("size", 0.0) >= (record.visible_from or 0.0)
+        return round(HOLDS_UP_S * rack.second) if record.where == "arm" and is_stop else 0
+
+    def room(self, rack: RackUnderTest) -> int:
+        """Return the ticks of a faultless run that it takes."""
+        return self.window - self.prolongs(rack)
 
     def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> Document:
         """Return the fault as a `[[fault]]` table that begins at `tick`."""
@@ -181,6 +202,31 @@ def swept_sizes(kind: str, count: int) -> list[float]:
     return swept(record.size.least, record.visible_from, count)
 
 
+class Share:
+    """The faults that one trial is given. `room`: ticks that are left for more."""
+
+    def __init__(self, rack: RackUnderTest) -> None:
+        self.cards: list[Card] = []
+        self.room = rack.last() - rack.first()
+        self._rack = rack
+        self._struck: dict[str, bool] = {}  # mailboxes, and whether others may follow
+
+    def takes(self, card: Card) -> bool:
+        """Say whether a fault fits in; the first one always does."""
+        box = card.target.mailbox
+        if box in self._struck and not (self._struck[box] and card.may_repeat):
+            return False
+        fits = card.room(self._rack) <= self.room and len(self.cards) < MOST_FAULTS
+        return fits or not self.cards
+
+    def add(self, card: Card) -> None:
+        """Take a fault in."""
+        self.cards.append(card)
+        self.room -= card.room(self._rack)
+        if card.target.mailbox is not None:
+            self._struck[card.target.mailbox] = card.may_repeat
+
+
 def _packed(
     rack: RackUnderTest,
     first: int,
@@ -189,11 +235,17 @@ def _packed(
     cards: Sequence[Card],
     rng: Random,
 ) -> list[Plan]:
-    """Return plans with all of these faults, as many in each as fit into the task."""
+    """Return plans with all of these faults, in as few trials as they fit into."""
+    shared = [card for card in cards if card.target.record.recoverable]
+    trials = [
+        share.cards
+        for at in range(0, len(shared), BATCH)
+        for share in _shared_out(rack, shared[at : at + BATCH])
+    ]
+    trials += [[card] for card in cards if not card.target.record.recoverable]
     plans = list[Plan]()
-    waiting = list(cards)
-    while waiting:
-        chosen = _chosen(rack, waiting)
+    for chosen in trials:
+        _shuffle(rack, chosen, rng)
         starts = _starts(rack, [card.window for card in chosen], rng)
         faults = list[Document]()
         kills = list[Kill]()
@@ -206,39 +258,33 @@ def _packed(
     return plans
 
 
-def _chosen(rack: RackUnderTest, waiting: list[Card]) -> list[Card]:
-    """Take the faults of one trial out of those that wait, the first of them always."""
-    if not waiting[0].target.record.recoverable:
-        return [waiting.pop(0)]
-    chosen: list[Card] = []
-    free = rack.last() - rack.first()
-    busy = set[str | None]()
-    for card in waiting[:AHEAD]:
-        target = card.target
-        fits = (
-            card.window <= free
-            and target.mailbox not in busy
-            and target.record.recoverable
-            and len(chosen) < MOST_FAULTS
-        )
-        if not chosen or fits:
-            chosen.append(card)
-            waiting.remove(card)
-            free -= card.window
-            is_quiet = card.quiet >= EPISODE * max(target.reader, target.cycle)
-            if target.mailbox is not None and not is_quiet:
-                busy.add(target.mailbox)
-    return chosen
+def _shared_out(rack: RackUnderTest, cards: Sequence[Card]) -> list[Share]:
+    """Share faults out between trials: the longest first, each where least room is left."""
+    shares: list[Share] = []
+    for card in sorted(cards, key=lambda card: -card.window):
+        fitting = [share for share in shares if share.takes(card)]
+        if not fitting:
+            fitting = [Share(rack)]
+            shares += fitting
+        min(fitting, key=lambda share: share.room).add(card)
+    return shares
+
+
+def _shuffle(rack: RackUnderTest, cards: list[Card], rng: Random) -> None:
+    """Put faults in a random order, if possible one in which each begins before the end of a task
+    that those before it have prolonged."""
+    for _ in range(SHUFFLES):
+        rng.shuffle(cards)
+        if max(accumulate(card.room(rack) for card in cards)) <= rack.last() - rack.first():
+            break
 
 
 def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
-    """Return a tick for each window, in order: the rest of the run is shared out between them at
-    random."""
-    free = max(0, rack.last() - rack.first() - sum(windows))
-    cuts = sorted(rng.randint(0, free) for _ in windows)
-    # Each without a gap before it; after the last one comes the end.
-    earliest = accumulate(windows, initial=rack.first())
-    return [cut + tick for cut, tick in zip(cuts, earliest, strict=False)]
+    """Return a tick for each window, one after the other from a random tick on: a trial goes on
+    from the checkpoint before its first fault."""
+    free = max(round(LEAD_S * rack.second), rack.last() - rack.first() - sum(windows))
+    earliest = accumulate(windows, initial=rack.first() + rng.randint(0, free))
+    return list(earliest)[:-1]
 
 
 def _phase(rng: Random) -> float:

@@ -6,6 +6,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from math import ceil
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -21,6 +22,8 @@ from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Failure
 from rack.tools.faults.campaigns.draw import (
     EPISODE,
+    HOLDS_UP_S,
+    LEAD_S,
     MOST_FAULTS,
     Card,
     RackUnderTest,
@@ -124,9 +127,42 @@ def test_faults_of_a_trial_follow_each_other_with_time_to_recover(
         ]
         ends.sort()
         assert all(later[0] > earlier[1] for earlier, later in pairwise(ends))
-        assert ends[-1][0] <= TICKS
-    # Trials are as full as they can be: a campaign is long enough as it is.
+        # The task ends later for each fault that has stopped the arm.
+        stops = 0
+        for table in plan.faults:
+            assert table.get("tick", 0) <= course.last() + (LEAD_S + stops * HOLDS_UP_S) * SECOND
+            stops += KINDS[table["kind"]].where == "arm"
     assert max(len(plan.faults) + len(plan.kills) for plan in plans) > 8
+
+
+def test_faults_of_the_arm_come_in_as_few_trials_as_they_fit_into(course: RackUnderTest) -> None:
+    # No mailbox keeps them apart.
+    kinds = [
+        kind.name for kind in KINDS if kind.where == "arm" and course.targets.by_kind[kind.name]
+    ]
+    plans = drawn(course, kinds, "6", True)
+    rng = Random("6 lockstep")
+    order = [kind for kind in kinds for _ in range(COUNT)]
+    rng.shuffle(order)
+    took = sum(Card.draw(course, kind, rng).room(course) for kind in order)
+    fewest = max(took / (course.last() - course.first()), len(order) / MOST_FAULTS)
+    assert len(plans) == ceil(fewest)
+
+
+def test_a_trial_with_room_left_begins_anywhere_in_the_task(course: RackUnderTest) -> None:
+    plans = [
+        plan
+        for seed in range(40)
+        for plan in fault_plans(
+            course, {"sensor-nan": 1, "command-nan": 1}, str(seed), True, first=1
+        )
+    ]
+    begins = [plan.first for plan in plans]
+    assert len(plans) == 40
+    assert min(begins) < 0.2 * TICKS
+    assert max(begins) > 0.7 * TICKS
+    # One follows the other closely, so that the trial can go on from a late checkpoint.
+    assert all(plan.faults[1]["tick"] - plan.first < 3 * SECOND for plan in plans)
 
 
 def _undone(kind: str, board: str, course: RackUnderTest) -> int:
