@@ -77,16 +77,14 @@ class CollisionChecker:
         self._base = self._required_distances()
         self._ease_at_home()
         self._required = self._base.copy()
-        # The last configuration checked, and its clearance.
-        self._q = np.zeros(len(cell.qpos))
-        self._least = np.inf
+        self._one = np.zeros((1, len(cell.qpos)))  # room for one configuration to check
+        self._least = np.inf  # m: the clearance of the last configuration checked
         m = self._model
         d = self._data
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
-        quaternion = np.zeros(4)
-        arrays = self._q, cell.qpos.copy(), d.qpos, *tool, self._offset, quaternion, self._required
-        self._is_free = partial(
-            is_free.load(), m._address, d._address, *arrays, *contact_views(m, d)
+        arrays = cell.qpos.copy(), d.qpos, *tool, self._offset, self._required
+        self._first_blocked = partial(
+            first_blocked.load(), m._address, d._address, *arrays, *contact_views(m, d)
         )
 
     def tool_at(self, q: Array) -> Pose:
@@ -128,10 +126,15 @@ class CollisionChecker:
     def free(self, q: Array, clearance: float | None = None) -> bool:
         """Return whether the arm at `q` (joints,), rad, keeps its distances. `clearance`, m, may
         lower the scene's."""
-        self._q[:] = q
+        self._one[0] = q
+        return self.first_blocked(self._one, clearance) == 1
+
+    def first_blocked(self, path: Array, clearance: float | None = None) -> int:
+        """Return the index of the first of the configurations `path` (n, joints), rad, that is not
+        free; n: all are. Those after it are not looked at."""
         self._least = np.inf if clearance is None else float(clearance)
         held_qpos = -1 if self.held is None else self.cell.object_qpos[self.held]
-        return self._is_free(held_qpos, self._least)
+        return self._first_blocked(held_qpos, self._least, path)
 
     def room(self, q: Array) -> float:
         """Return the largest clearance, in m and at most the scene's, with which `q` is free;
@@ -295,62 +298,58 @@ def farthest(
 
 
 @compiled
-def is_free(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
+def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     model: int,  # address
     data: int,  # address
-    q: Array,  # (joints,), rad: to be checked
     joints: NDArray[np.int64],  # (joints,): their addresses in qpos
     qpos: Array,
     tool: Array,  # (3,), m: where kinematics leave its position
     turned: Array,  # (9,): and its rotation
     offset: Array,  # (7,): pose of the held object in the tool's frame
-    quaternion: Array,  # (4,): room for the tool's
     required: Array,  # (geoms, geoms), m: distances
     number: NDArray[np.int32],  # of contacts, and so on: see `ContactViews`
     geoms: NDArray[np.int32],
     distance: Array,
     held: int,  # address of the held object in qpos; -1: none
     clearance: float,  # m: greatest distance that is required
-) -> bool:
-    """Bring arm and load to a configuration; return whether all pairs of geoms keep their
-    distances."""
-    for j in range(len(joints)):
-        qpos[joints[j]] = q[j]
-    mj_kinematics(model, data)
-    if held >= 0:
-        for i in range(3):
-            along = (
-                turned[3 * i] * offset[0]
-                + turned[3 * i + 1] * offset[1]
-                + turned[3 * i + 2] * offset[2]
-            )
-            qpos[held + i] = tool[i] + along
-        mju_mat_to_quat(quaternion.ctypes.data, turned.ctypes.data)
-        mju_mul_quat(
-            qpos[held + 3 : held + 7].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data
-        )
+    path: Array,  # (n, joints), rad: to be checked
+) -> int:
+    """Bring arm and load to one configuration after another; return the index of the first in which
+    a pair of geoms does not keep its distance; n: all do."""
+    for k in range(len(path)):
+        for j in range(len(joints)):
+            qpos[joints[j]] = path[k, j]
         mj_kinematics(model, data)
-    mj_collision(model, data)
-    for pair in range(number[0]):
-        if min(required[geoms[pair, 0], geoms[pair, 1]], clearance) - distance[pair] > 0.0:
-            return False
-    return True
+        if held >= 0:
+            carry(qpos[held : held + 7], tool, turned, offset)
+            mj_kinematics(model, data)
+        mj_collision(model, data)
+        for pair in range(number[0]):
+            if min(required[geoms[pair, 0], geoms[pair, 1]], clearance) - distance[pair] > 0.0:
+                return k
+    return len(path)
+
+
+@compiled
+def carry(pose: Array, tool: Array, turned: Array, offset: Array) -> None:
+    """Set the pose of the held object (7,), by that of the tool; arguments as above."""
+    for i in range(3):
+        along = (
+            turned[3 * i] * offset[0]
+            + turned[3 * i + 1] * offset[1]
+            + turned[3 * i + 2] * offset[2]
+        )
+        pose[i] = tool[i] + along
+    quaternion = np.empty(4)
+    mju_mat_to_quat(quaternion.ctypes.data, turned.ctypes.data)
+    mju_mul_quat(pose[3:].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data)
 
 
 def preload() -> None:
     """Load this module's compiled function."""
     data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
     none = np.zeros(0)
-    square = np.zeros((0, 0))
+    path = np.zeros((0, 0))
+    arrays = np.zeros(0, dtype=int), none, np.zeros(3), np.zeros(9), np.zeros(7), path
     room = contact_views(data.model, data)
-    arrays = (
-        none,
-        np.zeros(0, dtype=int),
-        none,
-        np.zeros(3),
-        np.zeros(9),
-        np.zeros(7),
-        np.zeros(4),
-        square,
-    )
-    is_free.load()(data.model._address, data._address, *arrays, *room, -1, 0.0)
+    first_blocked.load()(data.model._address, data._address, *arrays, *room, -1, 0.0, path)

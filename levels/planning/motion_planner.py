@@ -3,6 +3,8 @@ joint space."""
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from rack.levels.algebra import Array, mat_vec, norm
@@ -10,12 +12,12 @@ from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
 from rack.levels.motion import path as paths
 from rack.levels.motion.path import BlendedPath, Path
-from rack.levels.planning import collision
+from rack.levels.planning import collision, path_planner
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.fixed_jaw import find_fixed_jaw
 from rack.levels.planning.ik import SAME_RAD, InverseKinematics
 from rack.levels.planning.moves import VERB_NAMES, Move, Situation
-from rack.levels.planning.path_planner import MAX_SEARCHES, PathPlanner
+from rack.levels.planning.path_planner import MAX_SEARCHES, FirstBlocked, PathPlanner
 from rack.levels.planning.payload import Payloads
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import Cell
@@ -43,6 +45,7 @@ def preload() -> None:
 
     collision.preload()
     paths.preload()
+    path_planner.preload()
 
 
 class MotionPlanner:
@@ -115,19 +118,18 @@ class MotionPlanner:
     def still_free(self, move: Move, path: Path, situation: Situation) -> bool:
         """Return whether an earlier path of `move` can still be used in `situation`."""
         self.lay_out(move, situation)
-        clearance = AHEAD_PART * self.clearance
-        return self.paths.is_free(path, lambda q: self.checker.free(q, clearance))
+        first_blocked = self._with(AHEAD_PART * self.clearance)
+        return self.paths.blocked_at(path, first_blocked) is None
+
+    def _with(self, clearance: float) -> FirstBlocked:
+        return partial(self.checker.first_blocked, clearance=clearance)
 
     def _path_to(
         self, move: Move, start: Array, goal: Array, *, attempt: int, searches: int
     ) -> Path:
         clearance = self._clearance_at(start)
         path = self.paths.plan(
-            start,
-            goal,
-            lambda q: self.checker.free(q, clearance),
-            attempt=attempt,
-            searches=searches,
+            start, goal, self._with(clearance), attempt=attempt, searches=searches
         )
         if path is None:
             why = self._why_no_path(start, goal, clearance)
@@ -144,7 +146,7 @@ class MotionPlanner:
         if why:
             return why
         straight = Path(np.array([start, goal]), np.zeros(2))
-        blocked = self.paths.first_blocked(straight, lambda q: self.checker.free(q, clearance))
+        blocked = self.paths.blocked_at(straight, self._with(clearance))
         found = self.checker.why(blocked, clearance) if blocked is not None else ""
         return f"no path found around {found}" if found else "no path found"
 
@@ -157,7 +159,7 @@ class MotionPlanner:
         if goal is not None and np.max(np.abs(path.end - goal)) < SAME_RAD:
             path.waypoints[-1] = goal
         clearance = self._clearance_at(start)
-        blocked = self.paths.first_blocked(path, lambda q: self.checker.free(q, clearance))
+        blocked = self.paths.blocked_at(path, self._with(clearance))
         if blocked is not None:
             raise Refused(
                 Error.NO_PATH, f"{name} to {place}: {self.checker.why(blocked, clearance)}"

@@ -9,13 +9,13 @@ every process.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from ompl import base, geometric, util
 
 from rack.levels.algebra import Array, norm
+from rack.levels.compiled import compiled
 from rack.levels.messages import WAYPOINTS
 from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.motion.trajectory import make_trajectory
@@ -24,6 +24,10 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geoms_of
 
 Free = Callable[[Array], bool]
+"""Returns whether all of some configurations (n, joints) are free."""
+FirstBlocked = Callable[[Array], int]
+"""Returns the index of the first of configurations (n, joints), rad, that is not free; n: all
+are."""
 
 MAX_CHECKS = 24_000
 """Configurations checked by all searches of a plan together: this bounds its time."""
@@ -70,7 +74,7 @@ class PathPlanner:
         self,
         start: Array,
         goal: Array,
-        free: Free,
+        first_blocked: FirstBlocked,
         *,
         attempt: int = 0,
         searches: int = MAX_SEARCHES,
@@ -80,65 +84,60 @@ class PathPlanner:
         Another `attempt` uses other random numbers, for another try in the same world. With fewer
         `searches` the path is found sooner and is never quicker than with more.
         """
-        if not (free(start) and free(goal)):
+        ends = np.array([start, goal])
+        if first_blocked(ends) < len(ends):
             return None
-        if self._line_is_free(start, goal, free):
-            return Path(np.array([start, goal]), np.zeros(2))
-        paths = self._sampled(Query(start, goal, free), attempt, searches)
+        count = int(np.ceil(norm(goal - start) / self.step_rad)) + 1
+        line = np.linspace(start, goal, max(count, 2))
+        if first_blocked(line) == len(line):
+            return Path(ends, np.zeros(2))
+        paths = self._sampled(ends, first_blocked, attempt, searches)
         return min(paths, key=self.duration, default=None)
 
-    def rounded(self, waypoints: Array, free: Free) -> Path:
+    def rounded(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:
         """Return the path along `waypoints`, with each corner rounded as far as it stays free."""
         blend = _largest_blends(waypoints)
         for corner in range(1, len(waypoints) - 1):
-            blend[corner] = self._free_blend(waypoints, corner, float(blend[corner]), free)
+            largest = float(blend[corner])
+            blend[corner] = self._free_blend(waypoints, corner, largest, first_blocked)
         return Path(waypoints, blend)
 
-    def is_free(self, path: Path, free: Free) -> bool:
-        """Return whether all of `path` is free."""
-        return self.first_blocked(path, free) is None
-
-    def first_blocked(self, path: Path, free: Free) -> Array | None:
+    def blocked_at(self, path: Path, first_blocked: FirstBlocked) -> Array | None:
         """Return the first configuration on `path` that is not free; None when all are."""
-        return next((q for q in BlendedPath(*path).sample(self.step_rad) if not free(q)), None)
+        samples = BlendedPath(*path).sample(self.step_rad)
+        found = first_blocked(samples)
+        return samples[found] if found < len(samples) else None
 
     def duration(self, path: Path) -> float:
         """Return the time of `path`, rest to rest, in s."""
         return make_trajectory(BlendedPath(*path), self._limits).duration
 
-    def _sampled(self, query: Query, attempt: int, searches: int) -> list[Path]:
+    def _sampled(
+        self, ends: Array, first_blocked: FirstBlocked, attempt: int, searches: int
+    ) -> list[Path]:
         paths: list[Path] = []
         left = MAX_CHECKS
         for k in range(MAX_SEARCHES):
             seed = 1 + (self._seed + attempt * MAX_SEARCHES + k) % MAX_SEED
-            polyline, checks = self._search.search(query, seed, left)
+            polyline, checks = self._search.search(ends, first_blocked, seed, left)
             left -= checks
             if polyline is not None and len(polyline) <= WAYPOINTS:
-                paths.append(self.rounded(polyline, query.free))
+                paths.append(self.rounded(polyline, first_blocked))
             if left <= 0 or len(paths) == searches:
                 break
         return paths
 
-    def _line_is_free(self, one: Array, other: Array, free: Free) -> bool:
-        count = int(np.ceil(norm(other - one) / self.step_rad)) + 1
-        return all(free(q) for q in np.linspace(one, other, max(count, 2)))
-
-    def _free_blend(self, waypoints: Array, corner: int, largest: float, free: Free) -> float:
+    def _free_blend(
+        self, waypoints: Array, corner: int, largest: float, first_blocked: FirstBlocked
+    ) -> float:
         before, at, after = waypoints[corner - 1 : corner + 2]
         for part in BLENDS:
             b = part * largest
             ends = [at + b * (end - at) / max(norm(end - at), b) for end in (before, after)]
-            if self.is_free(Path(np.array([ends[0], at, ends[1]]), np.array([0.0, b, 0.0])), free):
+            path = Path(np.array([ends[0], at, ends[1]]), np.array([0.0, b, 0.0]))
+            if self.blocked_at(path, first_blocked) is None:
                 return b
         return 0.0
-
-
-class Query(NamedTuple):
-    """Start and goal (joints,), rad, of a search, and whether a configuration is free."""
-
-    start: Array
-    goal: Array
-    free: Free
 
 
 class SampledSearch:
@@ -151,29 +150,26 @@ class SampledSearch:
         self._weights = weights
         self._resolution = resolution
 
-    def search(self, query: Query, seed: int, budget: int) -> tuple[Array | None, int]:
-        """Return a free polyline (k, joints), rad, or None, and the number of configurations
-        checked.
+    def search(
+        self, ends: Array, first_blocked: FirstBlocked, seed: int, budget: int
+    ) -> tuple[Array | None, int]:
+        """Return a free polyline (k, joints), rad, between `ends` (2, joints), or None, and the
+        number of configurations checked.
 
         `budget` bounds the checks of the search; the short cuts add a few.
         """
         util.RNG.setSeed(seed)
-        start, goal, free = query
         count = 0
-        scaled = np.zeros(len(start))
 
-        def valid(state: base.State) -> bool:
+        def free(scaled: Array) -> bool:
             nonlocal count
-            count += 1
-            for j in range(len(scaled)):
-                scaled[j] = state[j]
-            return free(scaled / self._weights)
+            found = first_blocked(scaled / self._weights)
+            count += min(found + 1, len(scaled))
+            return found == len(scaled)
 
-        information = self._space(start, goal, valid)
+        information = self._space(ends, free)
         problem = base.ProblemDefinition(information)
-        problem.setStartAndGoalStates(
-            self._state(information, start), self._state(information, goal)
-        )
+        problem.setStartAndGoalStates(*(self._state(information, end) for end in ends))
         planner = geometric.RRTConnect(information)
         planner.setRange(BRANCH_PART * information.getMaximumExtent())
         planner.setProblemDefinition(problem)
@@ -182,32 +178,27 @@ class SampledSearch:
         if not problem.hasExactSolution():
             return None, count
         path = _simplified(information, problem.getSolutionPath())
-        points = [[state[j] for j in range(len(start))] for state in path.getStates()]
-        polyline = np.array(points) / self._weights
+        polyline = self._values(*path.getStates()) / self._weights
         # Scaling there and back rounds: restore the exact ends.
-        polyline[0] = start
-        polyline[-1] = goal
+        polyline[[0, -1]] = ends
         return polyline, count
 
-    def _space(
-        self, start: Array, goal: Array, valid: Callable[[base.State], bool]
-    ) -> base.SpaceInformation:
-        joints = len(start)
-        low = np.where(np.isfinite(self._low), self._low, np.minimum(start, goal) - ENDLESS_RAD)
-        high = np.where(np.isfinite(self._high), self._high, np.maximum(start, goal) + ENDLESS_RAD)
-        space = base.RealVectorStateSpace(joints)
-        bounds = base.RealVectorBounds(joints)
-        for j in range(joints):
-            # The arm may rest slightly beyond a limit: the start counts as inside.
-            bounds.setLow(
-                j, float(min(low[j], start[j], goal[j]) * self._weights[j]) - BOUND_ROUNDING
-            )
-            bounds.setHigh(
-                j, float(max(high[j], start[j], goal[j]) * self._weights[j]) + BOUND_ROUNDING
-            )
+    def _space(self, ends: Array, free: Free) -> base.SpaceInformation:
+        least = ends.min(axis=0)
+        most = ends.max(axis=0)
+        low = np.where(np.isfinite(self._low), self._low, least - ENDLESS_RAD)
+        high = np.where(np.isfinite(self._high), self._high, most + ENDLESS_RAD)
+        space = base.RealVectorStateSpace(len(least))
+        bounds = base.RealVectorBounds(len(least))
+        # The arm may rest slightly beyond a limit: the start counts as inside.
+        for j, value in enumerate(np.minimum(low, least) * self._weights - BOUND_ROUNDING):
+            bounds.setLow(j, value)
+        for j, value in enumerate(np.maximum(high, most) * self._weights + BOUND_ROUNDING):
+            bounds.setHigh(j, value)
         space.setBounds(bounds)
         information = base.SpaceInformation(space)
-        information.setStateValidityChecker(valid)
+        information.setStateValidityChecker(lambda state: free(self._values(state)))
+        information.setMotionValidator(MotionCheck(information, self._values, free))
         information.setStateValidityCheckingResolution(self._resolution / space.getMaximumExtent())
         information.setup()
         return information
@@ -215,8 +206,59 @@ class SampledSearch:
     def _state(self, information: base.SpaceInformation, q: Array) -> base.State:
         state = information.allocState()
         for j, value in enumerate(q * self._weights):
-            state[j] = float(value)
+            state[j] = value
         return state
+
+    def _values(self, *states: base.State) -> Array:
+        """Return the scaled values of states, (states, joints)."""
+        joints = range(len(self._weights))
+        return np.array([[state[j] for j in joints] for state in states])
+
+
+class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
+    """Checks a motion where, and in the order in which, OMPL's own validator does, but with one
+    call for all places: a call each took longer than the checks."""
+
+    def __init__(
+        self, information: base.SpaceInformation, values: Callable[..., Array], free: Free
+    ) -> None:
+        super().__init__(information)
+        # Not `information`, which holds this object: nothing would free the two.
+        self._space = information.getStateSpace()
+        self._values = values
+        self._free = free
+
+    def checkMotion(self, one: base.State, other: base.State) -> bool:  # noqa: N802  # OMPL's name
+        """Return whether the motion from `one`, known to be free, to `other` is free."""
+        count = max(self._space.validSegmentCount(one, other), 1)
+        return self._free(halved.load()(self._values(one, other), count))
+
+
+@compiled
+def halved(ends: Array, count: int) -> Array:
+    """Return the places at which a line between `ends` (2, joints) in `count` parts is checked,
+    (count, joints): its end, its middle, the middles of the halves, and so on."""
+    places = np.empty((count, ends.shape[1]))
+    places[0] = ends[1]
+    # First and last mark of each stretch whose middle is a place.
+    stretches = np.empty((count + 1, 2), dtype=np.int64)
+    stretches[1] = 1, count - 1
+    known = 2
+    for k in range(1, count):
+        first, last = stretches[k]
+        middle = (first + last) // 2
+        for j in range(ends.shape[1]):
+            places[k, j] = ends[0, j] + (ends[1, j] - ends[0, j]) * (middle / count)
+        for half in ((first, middle - 1), (middle + 1, last)):
+            if half[0] <= half[1]:
+                stretches[known] = half
+                known += 1
+    return places
+
+
+def preload() -> None:
+    """Load this module's compiled function."""
+    halved.load()(np.zeros((2, 0)), 1)
 
 
 def _simplified(

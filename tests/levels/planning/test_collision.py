@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rack.levels.planning import collision
-from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, is_free
+from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, first_blocked
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.robot.cell import Cell, build_cell
@@ -177,9 +177,9 @@ def test_compiled_checks_decide_as_python_does_and_are_loaded_before(
     puma: Cell, held: int | None
 ) -> None:
     collision.preload()
-    loaded = list(is_free.load().signatures)  # type: ignore[attr-defined]
+    loaded = list(first_blocked.load().signatures)  # type: ignore[attr-defined]
     checker, under_python = (CollisionChecker(puma, config("puma560")[1]) for _ in range(2))
-    under_python._is_free = partial(is_free, *under_python._is_free.args)
+    under_python._first_blocked = partial(first_blocked, *under_python._first_blocked.args)
     rng, decided = np.random.default_rng(4), set()
     for one in (checker, under_python):
         one.hold(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))
@@ -189,4 +189,15 @@ def test_compiled_checks_decide_as_python_does_and_are_loaded_before(
         assert np.array_equal(checker._data.qpos, under_python._data.qpos)
         decided.add(free)
     assert decided == {True, False}
-    assert list(is_free.load().signatures) == loaded  # type: ignore[attr-defined]
+    assert list(first_blocked.load().signatures) == loaded  # type: ignore[attr-defined]
+
+
+def test_of_several_configurations_the_first_that_is_not_free_is_found(
+    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
+) -> None:
+    in_the_wall = at(ik, puma, 0.5, 0.0, 0.7)
+    path = np.array([puma.home, puma.home, in_the_wall, puma.home, in_the_wall])
+    assert checker.first_blocked(path) == 2
+    assert checker.nearest() == checker.why(in_the_wall) != ""
+    assert checker.first_blocked(path[:2]) == 2
+    assert checker.first_blocked(path[:0]) == 0

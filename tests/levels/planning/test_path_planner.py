@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
+from ompl import base
 
 from rack.levels.messages import WAYPOINTS
 from rack.levels.motion.path import BlendedPath, Path
+from rack.levels.planning import path_planner
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.path_planner import PathPlanner
@@ -45,7 +49,7 @@ def sides(puma: Cell, checker: CollisionChecker) -> tuple[np.ndarray, np.ndarray
 def around(
     planner: PathPlanner, checker: CollisionChecker, sides: tuple[np.ndarray, np.ndarray]
 ) -> Path:
-    path = planner.plan(*sides, checker.free)
+    path = planner.plan(*sides, checker.first_blocked)
     assert path is not None
     return path
 
@@ -54,7 +58,7 @@ def test_free_straight_line_is_the_path(
     planner: PathPlanner, checker: CollisionChecker, puma: Cell
 ) -> None:
     goal = puma.home + np.array([0.2, 0.0, 0.1, 0.0, 0.1, 0.5])
-    path = planner.plan(puma.home, goal, checker.free)
+    path = planner.plan(puma.home, goal, checker.first_blocked)
     assert path is not None
     assert np.array_equal(path.waypoints, [puma.home, goal])
 
@@ -86,8 +90,8 @@ def test_equal_questions_get_equal_paths_whatever_was_planned_before(
     puma: Cell, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
 ) -> None:
     fresh = PathPlanner(puma, SCENE.clearance, SEED)
-    fresh.plan(sides[1], sides[0], checker.free)
-    again = fresh.plan(*sides, checker.free)
+    fresh.plan(sides[1], sides[0], checker.first_blocked)
+    again = fresh.plan(*sides, checker.first_blocked)
     assert again is not None
     assert np.array_equal(again.waypoints, around.waypoints)
     assert np.array_equal(again.blend, around.blend)
@@ -100,7 +104,7 @@ def test_another_attempt_takes_other_random_numbers(
     around: Path,
     sides: tuple[np.ndarray, np.ndarray],
 ) -> None:
-    other = planner.plan(*sides, checker.free, attempt=1)
+    other = planner.plan(*sides, checker.first_blocked, attempt=1)
     assert other is not None
     assert not np.array_equal(other.waypoints[1], around.waypoints[1])
 
@@ -111,7 +115,7 @@ def test_one_search_is_never_quicker_than_all(
     around: Path,
     sides: tuple[np.ndarray, np.ndarray],
 ) -> None:
-    hasty = planner.plan(*sides, checker.free, searches=1)
+    hasty = planner.plan(*sides, checker.first_blocked, searches=1)
     assert hasty is not None
     assert planner.duration(hasty) >= planner.duration(around)
 
@@ -125,8 +129,8 @@ def test_no_path_where_goal_or_start_is_blocked(
     in_the_wall = InverseKinematics(puma, SEED).reachable(
         pose((0.5, 0.0, 0.65), pointing((0, 0, -1))), puma.home
     )[0]
-    assert planner.plan(puma.home, in_the_wall, checker.free) is None
-    assert planner.plan(in_the_wall, puma.home, checker.free) is None
+    assert planner.plan(puma.home, in_the_wall, checker.first_blocked) is None
+    assert planner.plan(in_the_wall, puma.home, checker.first_blocked) is None
 
 
 def test_search_without_a_way_ends_after_a_bounded_number_of_checks(
@@ -134,10 +138,13 @@ def test_search_without_a_way_ends_after_a_bounded_number_of_checks(
 ) -> None:
     checks = 0
 
-    def walled_in(q: np.ndarray) -> bool:
+    def walled_in(configurations: np.ndarray) -> int:
         nonlocal checks
-        checks += 1
-        return not 0.3 < q[0] < 0.4
+        for k, q in enumerate(configurations):
+            checks += 1
+            if 0.3 < q[0] < 0.4:
+                return k
+        return len(configurations)
 
     assert planner.plan(puma.home, puma.home + np.array([1.0, 0, 0, 0, 0, 0]), walled_in) is None
     assert checks < 30_000
@@ -148,10 +155,58 @@ def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
 ) -> None:
     corner = np.array([[0.0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0, 0]])
 
-    def on_the_polyline(q: np.ndarray) -> bool:
-        return bool(min(q[0], q[1]) < 1e-3)
+    def on_the_polyline(configurations: np.ndarray) -> int:
+        off = configurations[:, :2].min(axis=1) >= 1e-3
+        return int(np.argmax(off)) if off.any() else len(off)
 
     path = planner.rounded(corner, on_the_polyline)
     assert path.blend[1] == 0.0
-    assert planner.is_free(path, on_the_polyline)
-    assert planner.rounded(corner, lambda q: True).blend[1] > 0.5
+    assert planner.blocked_at(path, on_the_polyline) is None
+    assert planner.rounded(corner, len).blend[1] > 0.5
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-3, 0.02, 0.3])
+@pytest.mark.parametrize("allowed", [0, 1, 5, 1000])
+def test_a_motion_is_checked_at_the_places_and_in_the_order_of_ompl(
+    planner: PathPlanner, puma: Cell, length: float, allowed: int
+) -> None:
+    search, checked = planner._search, ([], [])
+    one, other = puma.home, puma.home + length * np.array([1.0, 0.3, -0.7, 0.1, 0.9, -0.2])
+
+    def free(scaled: np.ndarray) -> bool:
+        checked[0].extend(scaled[: allowed + 1])
+        return len(scaled) <= allowed
+
+    ours = search._space(np.array([one, other]), free)
+    states = [search._state(ours, q) for q in (one, other)]
+    # Without ours, it makes its own.
+    theirs = base.SpaceInformation(ours.getStateSpace())
+
+    def valid(state: base.State) -> bool:
+        checked[1].extend(search._values(state))
+        return len(checked[1]) <= allowed
+
+    theirs.setStateValidityChecker(valid)
+    theirs.setup()
+    assert ours.checkMotion(*states) == theirs.checkMotion(*states)
+    assert np.array_equal(*checked)
+    assert (len(checked[0]) > 20) == (length == 0.3 and allowed == 1000)
+
+
+def test_search_leaves_nothing_in_memory(
+    planner: PathPlanner, sides: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alive = []
+
+    class Counted(path_planner.MotionCheck):  # type: ignore[misc]  # untyped
+        def __init__(self, *args: object) -> None:
+            super().__init__(*args)
+            alive.append(self._free)
+
+        def __del__(self) -> None:
+            alive.remove(self._free)
+
+    monkeypatch.setattr(path_planner, "MotionCheck", Counted)
+    assert planner._search.search(np.array(sides), len, 1, 100)[1] > 1
+    gc.collect()
+    assert alive == []
