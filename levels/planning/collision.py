@@ -36,6 +36,9 @@ in the gripper when it moves fast, and its support pushes it back as it is put d
 ANY_DISTANCE = -np.inf
 """Required distance of a pair that may overlap."""
 
+LINK, GRIPPER, LOAD = 1, 2, 4
+"""Contact types of the arm's geoms and of those that it holds; all others have none."""
+
 
 def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions: Array) -> None:
     """Place objects and obstacles in `data` at the world model's poses: (bodies, 3) in m, (bodies,
@@ -73,7 +76,7 @@ class CollisionChecker:
         # Fingers that swing may reach farther than open as they close: a load is planned with them
         # so.
         self.longest = self._longest() if margin > 0.0 else None
-        self._contype = self._filter_to_arm()
+        self._types = self._filter_to_arm()
         self._base = self._required_distances()
         self._ease_at_home()
         self._required = self._base.copy()
@@ -112,9 +115,12 @@ class CollisionChecker:
             self.open_gripper(opening)
         self._offset[:3] = position
         self._offset[3:] = quaternion
-        self._model.geom_contype[:] = self._contype
+        m = self._model
+        m.geom_contype[:], m.geom_conaffinity[:] = self._types
         if row is not None:
-            self._model.geom_contype[self._row_geoms[row]] = 1
+            # Gripper and load meet, which is permitted and took a fifth of a check.
+            m.geom_contype[self._row_geoms[row]] = LOAD
+            m.geom_conaffinity[self._row_geoms[row]] &= LINK
         self._apply()
 
     def permit(self, row: int | None, touch: bool = True) -> None:
@@ -178,20 +184,22 @@ class CollisionChecker:
         )
 
     def _filter_to_arm(self) -> NDArray[np.int32]:
-        """Restrict MuJoCo to the pairs that involve the arm, a tenth of the work. Return the
-        contact types."""
+        """Restrict MuJoCo to the pairs that involve the arm, a tenth of the work, but for those
+        within the gripper. Return contact types and affinities, (2, geoms)."""
         m = self._model
         solid = (m.geom_contype | m.geom_conaffinity) != 0
         arm = np.zeros(m.ngeom, dtype=bool)
         arm[self.cell.arm_geoms] = True
-        m.geom_contype[:] = arm & solid
-        m.geom_conaffinity[:] = solid
+        m.geom_contype[:] = LINK * (arm & solid)
+        m.geom_conaffinity[:] = (LINK | GRIPPER | LOAD) * solid
+        m.geom_contype[self.cell.gripper_geoms] *= GRIPPER
+        m.geom_conaffinity[self.cell.gripper_geoms] &= LINK
         # MuJoCo adds the margins of the two geoms: two links find each other within twice the
         # margin.
         m.geom_margin[:] = np.where(arm, self._margin, self.clearance)
         m.geom_gap[:] = 0.0
         m.pair_margin[:] = self.clearance
-        return np.array(m.geom_contype)
+        return np.stack((m.geom_contype, m.geom_conaffinity))
 
     def _required_distances(self) -> Array:
         """Return (geoms, geoms), in m: the clearance between arm and cell, the margin between links

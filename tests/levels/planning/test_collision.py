@@ -201,3 +201,19 @@ def test_of_several_configurations_the_first_that_is_not_free_is_found(
     assert checker.nearest() == checker.why(in_the_wall) != ""
     assert checker.first_blocked(path[:2]) == 2
     assert checker.first_blocked(path[:0]) == 0
+
+
+@pytest.mark.parametrize("held", [None, BLOCK1])
+def test_pairs_that_mujoco_leaves_out_would_change_no_answer(puma: Cell, held: int | None) -> None:
+    checker, with_all = (CollisionChecker(puma, config("puma560")[1], 1e-3) for _ in range(2))
+    for one in (checker, with_all):
+        one.hold(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))
+    with_all._model.geom_contype[:] = with_all._model.geom_contype != 0
+    with_all._model.geom_conaffinity[:] = 1
+    rng, fewer = np.random.default_rng(5), 0
+    for q in puma.home + rng.normal(0.0, 0.6, (300, len(puma.home))):
+        assert checker.free(q) == with_all.free(q)
+        assert checker.nearest() == with_all.nearest()
+        fewer += checker._data.ncon < with_all._data.ncon
+        assert checker.room(q) == with_all.room(q)
+    assert fewer == (0 if held is None else 300)
