@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +82,6 @@ class BlendedPath:
         self._corners = np.concatenate(([0.0], np.cumsum(lengths)))
         self.length = float(self._corners[-1])  # rad
         self._lay_pieces()
-        self.bounds = self._bound_pieces()
         self._marks, self._table = self._tabulate()
         self._point = np.zeros((3, self.joints))
 
@@ -147,7 +147,9 @@ class BlendedPath:
                 table[k, 2] = self._changes[corner]
         return marks, table
 
-    def _bound_pieces(self) -> PathBounds:
+    @cached_property
+    def bounds(self) -> PathBounds:
+        """Bounds of every piece; many a path is only sampled."""
         first, second, third = (np.zeros((len(self._pieces), self.joints)) for _ in range(3))
         for k, (line, corner) in enumerate(self._pieces):
             if corner >= 0:

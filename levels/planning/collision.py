@@ -284,8 +284,8 @@ class CollisionChecker:
             self._require(gripper, supports, self._margin)
 
     def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:
-        self._required[np.ix_(some, others)] = distance
-        self._required[np.ix_(others, some)] = distance
+        self._required[some[:, None], others] = distance
+        self._required[others[:, None], some] = distance
 
 
 def farthest(

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from rack.levels.algebra import Array, gram, norm, transposed_mat_vec
-from rack.levels.planning.pose import Pose, pose, site_pose
+from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
 
 MAX_RESTARTS = 60
@@ -27,8 +27,8 @@ MAX_ITERATIONS = 25
 STALLED_ITERATIONS = 5
 STALLED_PART = 0.7
 """A descent is abandoned when its error has not fallen to this part within `STALLED_ITERATIONS`."""
-POSITION_TOLERANCE_M = 1e-5
-ANGLE_TOLERANCE_RAD = 1e-5
+TOLERANCE = 1e-5
+"""Of each part of the tool's error, in m and in rad."""
 SAME_RAD = 1e-2
 """Solutions closer than this in every joint count as one."""
 LIMIT_MARGIN_RAD = 1e-2
@@ -63,7 +63,7 @@ class InverseKinematics:
         """Return the tool's pose at `q` (joints,), rad."""
         self._data.qpos[self._cell.qpos] = q
         mujoco.mj_kinematics(self._cell.model, self._data)
-        return pose(*site_pose(self._data, self._cell.tool))
+        return site_pose(self._data, self._cell.tool)
 
     def reach(self, target: Pose, start: Array, turned: bool = True) -> Array | None:
         """Return the configuration (joints,) at `target` found by one descent from `start`, or
@@ -72,11 +72,9 @@ class InverseKinematics:
         errors: list[float] = []
         for _ in range(MAX_ITERATIONS):
             error = self._error(target, q)
-            error[3:] *= turned
-            if (
-                max(abs(error[:3])) < POSITION_TOLERANCE_M
-                and max(abs(error[3:])) < ANGLE_TOLERANCE_RAD
-            ):
+            if not turned:
+                error[3:] = 0.0
+            if (np.abs(error) < TOLERANCE).all():
                 return q
             errors.append(norm(error))
             if (
@@ -160,11 +158,12 @@ class InverseKinematics:
         d = self._data
         mujoco.mj_comPos(m, d)
         mujoco.mj_jacSite(m, d, self._jacobian[:3], self._jacobian[3:], self._cell.tool)
-        jacobian = np.take(self._jacobian, self._cell.dof, axis=1)
-        jacobian[3:] *= turned
+        jacobian = self._jacobian.take(self._cell.dof, axis=1)
+        if not turned:
+            jacobian[3:] = 0.0
         hessian = gram(jacobian)
         step = np.zeros(len(q))
-        hessian.flat[:: len(q) + 1] += DAMPING * (1.0 + norm(error) ** 2)
+        hessian.ravel()[:: len(q) + 1] += DAMPING * (1.0 + norm(error) ** 2)
         gradient = transposed_mat_vec(jacobian, -error)
         low = LIMIT_PART * (self._inner_low - q)
         high = LIMIT_PART * (self._inner_high - q)

@@ -92,6 +92,8 @@ class PathPlanner:
         if first_blocked(line) == len(line):
             return Path(ends, np.zeros(2))
         paths = self._sampled(ends, first_blocked, attempt, searches)
+        if len(paths) == 1:
+            return paths[0]
         return min(paths, key=self.duration, default=None)
 
     def rounded(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:

@@ -110,9 +110,11 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
     with _naming(k, place):
         situation = rehearsal.situation
         row = handling.row
+        cell = rehearsal.motion.cell
+        data = cell.start()
         standing_goals = [
-            [standing(rehearsal.motion.cell, situation, row, goal) for goal in group]
-            for group in goals(action, situation.object_pose(row), rehearsal.motion.cell)
+            [standing(cell, data, row, situation.with_body(row, goal)) for goal in group]
+            for group in goals(action, situation.object_pose(row), cell)
         ]
 
     def choices() -> Iterator[tuple[list[Spot], list[Pose]]]:

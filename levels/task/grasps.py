@@ -108,13 +108,15 @@ def _turned(action: Transfer, at: Pose, turn: float) -> Pose:
     return pose(action.to, quaternion)
 
 
-def standing(cell: Cell, situation: Situation, row: int, goal: Pose) -> Pose:
-    """Return `goal` at the height at which object `row` stands on the support below it.
+def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) -> Pose:
+    """Return the pose of object `row` in `situation`, for which `data` is changed, at the height at
+    which it stands on the support below it.
 
     Raises `Refused` for a goal over no support, or far above or below one.
     """
     model = cell.model
-    data = _laid_out(cell, situation.with_body(row, goal))
+    _lay_out(cell, data, situation)
+    goal = situation.object_pose(row)
     name = model.body(cell.bodies[row]).name
     x, y, z = goal.position
     support = _geom_below(cell, data, row, goal.position)
@@ -152,17 +154,16 @@ def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
         begin[2] -= distance + SKIN_M
 
 
-def _laid_out(cell: Cell, situation: Situation) -> mujoco.MjData:
-    """Return data of the cell with the bodies as in `situation`."""
-    data = cell.start()
+def _lay_out(cell: Cell, data: mujoco.MjData, situation: Situation) -> None:
+    """Place the bodies in `data` as in `situation`."""
     place_bodies(cell, data, situation.positions, situation.quaternions)
     mujoco.mj_kinematics(cell.model, data)
-    return data
 
 
 def _top(cell: Cell, situation: Situation, row: int) -> float:
     """Return the height of the highest point of object `row`, from its bounding boxes, in m."""
     model = cell.model
-    data = _laid_out(cell, situation)
+    data = cell.start()
+    _lay_out(cell, data, situation)
     parts = geoms_of(model, below(model, cell.bodies[[row]]))
     return farthest(model, data, parts, UP)
