@@ -87,6 +87,9 @@ class Slots:
     words.
     """
 
+    # Thousands of views, which no checkpoint needs to look at: they never change.
+    found_again = ("places", "heads")
+
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.spec = spec
         self.dtype = message_dtype(spec.fields, spec.size)

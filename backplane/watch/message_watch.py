@@ -52,6 +52,8 @@ class MessageWatch(ReadFindings):
     release tick.
     """
 
+    found_again = ("_heads_and_bodies",)
+
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         super().__init__(reader, episodes)
         self.seen = -1

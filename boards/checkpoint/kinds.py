@@ -32,6 +32,9 @@ import numpy as np
 from pydantic import BaseModel
 
 from rack.backplane.byte_lock import ByteLock
+from rack.backplane.fault_table import FaultEntry
+from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.operator_table import RequestEntry
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import Semaphore
 from rack.boards.errors import CheckpointError
@@ -179,10 +182,16 @@ KINDS = (
     PartKind("program", (type, ModuleType, compiled, Struct, "CPUDispatcher")),
     PartKind(
         "config",
-        (LevelContext, Keeping, BaseModel, Enum, PurePath, range, np.dtype, np.ufunc, "MjModel"),
+        (
+            *(LevelContext, Layout, MailboxSpec, TaskSpec, Keeping, BaseModel, Enum, PurePath),
+            *(range, np.dtype, np.ufunc, "MjModel"),
+        ),
     ),
     # Of one process alone, or of the whole rack.
-    PartKind("process", (Segment, Semaphore, ByteLock, Keeper, mmap, CArray, "PyCapsule")),
+    PartKind(
+        "process",
+        (Segment, FaultEntry, RequestEntry, Semaphore, ByteLock, Keeper, mmap, CArray, "PyCapsule"),
+    ),
     # What it holds is made again when it is asked for.
     PartKind("cache", (_lru_cache_wrapper,)),
     PartKind("tuple", (tuple,), enumerate),
