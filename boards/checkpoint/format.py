@@ -19,7 +19,7 @@ from rack.backplane.segment import VERSION as SEGMENT_VERSION
 from rack.boards.errors import CheckpointError
 
 MAGIC = b"RACKCKPT"
-VERSION = 2
+VERSION = 3
 FOLDER = "checkpoints"
 """Where they lie in the folder of a run."""
 NAME = "{:09d}.checkpoint"

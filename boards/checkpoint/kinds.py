@@ -49,6 +49,7 @@ ATOMS = (int, float, complex, str, bytes, frozenset, type(None), np.number, np.b
 FOUND_AGAIN = "found_again"
 """Attribute of a class: the names of those that its objects find again where they are not set."""
 _ABSENT = object()
+_WORD = np.dtype(np.uint64)
 
 
 class Keeper:
@@ -122,21 +123,29 @@ def _put_array(thing: np.ndarray, found: tuple[bytes, bytes]) -> None:
     flat[np.frombuffer(places, np.int32)] = np.frombuffer(elements, flat.dtype)
 
 
-def _data(thing: Any) -> tuple[bytes, ...]:
-    """Return all of a MjData but the model that its state carries along: what is before and after
-    that."""
+def _data(thing: Any) -> tuple[bytes, int, bytes, bytes, bytes]:
+    """Return all of a MjData but the model that its state carries along: what is before that; of
+    what is after it the number of words, and, as most are 0, the places and values of the others;
+    and the bytes that are left."""
     state: bytes = thing.__getstate__()
-    return tuple(state.split(thing.model.__getstate__(), 1))
+    before, after = state.split(thing.model.__getstate__(), 1)
+    words = np.frombuffer(after, _WORD, len(after) // _WORD.itemsize)
+    places = np.flatnonzero(words != 0)
+    rest = after[words.nbytes :]
+    return before, words.size, places.astype(np.int32).tobytes(), words[places].tobytes(), rest
 
 
-def _put_data(thing: Any, found: tuple[bytes, ...]) -> None:
+def _put_data(thing: Any, found: tuple[bytes, int, bytes, bytes, bytes]) -> None:
     """Put a MjData back where it is, since others know its addresses."""
     import mujoco
 
     from rack.levels.robot.engine import mj_update_sleep
 
+    before, size, places, values, rest = found
+    words = np.zeros(size, _WORD)
+    words[np.frombuffer(places, np.int32)] = np.frombuffer(values, _WORD)
     source = mujoco.MjData.__new__(mujoco.MjData)
-    source.__setstate__(thing.model.__getstate__().join(found))
+    source.__setstate__(b"".join((before, thing.model.__getstate__(), words.tobytes(), rest)))
     mujoco.mj_copyData(thing, thing.model, source)
     if (thing.tree_asleep >= 0).any():
         # The state has who sleeps, but not how many are awake.

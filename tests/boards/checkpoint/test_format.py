@@ -40,7 +40,7 @@ def test_another_version_is_named(written: tuple[Checkpoint, Path]) -> None:
     _, path = written
     content = path.read_bytes()
     path.write_bytes(content[:8] + bytes([9]) + content[9:])
-    with pytest.raises(CheckpointError, match="checkpoint version 9; this program reads 2"):
+    with pytest.raises(CheckpointError, match="checkpoint version 9; this program reads 3"):
         read(path)
 
 
