@@ -11,8 +11,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from ctypes import Array as CArray
 from dataclasses import fields, is_dataclass
+from dis import opmap
 from enum import Enum
 from functools import _lru_cache_wrapper, partial
+from gc import get_referents
+from itertools import chain
 from mmap import mmap
 from operator import is_
 from pathlib import PurePath
@@ -20,6 +23,7 @@ from struct import Struct
 from types import (
     BuiltinFunctionType,
     CellType,
+    CodeType,
     FunctionType,
     MappingProxyType,
     MethodType,
@@ -65,7 +69,8 @@ class PartKind(NamedTuple):
     """One kind. `types`: its types, or names of types, of libraries that not every rack loads.
 
     `contents` returns a copy of what may change (None: nothing), `put` puts what `changes` found
-    back.
+    back. `is_same` says of a thing, sooner than that, whether it is as in contents of before; where
+    it denies it, the contents tell.
     """
 
     name: str
@@ -73,6 +78,7 @@ class PartKind(NamedTuple):
     inner: Callable[[Any], Inner] = nothing
     contents: Callable[[Any], Any] | None = None
     put: Callable[[Any, Any], None] | None = None
+    is_same: Callable[[Any, Any], bool] | None = None
 
 
 def _put_dict(thing: dict[Any, Any], found: list[Any]) -> None:
@@ -152,15 +158,58 @@ def _put_data(thing: Any, found: tuple[bytes, int, bytes, bytes, bytes]) -> None
         mj_update_sleep(thing.model._address, thing._address)
 
 
-def _fields(slots: tuple[str, ...], again: tuple[str, ...], thing: Any) -> dict[str, Any]:
-    fields = dict(getattr(thing, "__dict__", ()))
-    for name in slots:
-        value = getattr(thing, name, _ABSENT)
-        if value is not _ABSENT:
-            fields[name] = value
+class ObjectState(NamedTuple):
+    """The attributes of an object by name; and, unless it has a dictionary of them, all that it
+    refers to: their values, in an order of their own, and its class."""
+
+    named: dict[str, Any]
+    referents: list[Any]
+
+
+def _fields(names: tuple[str, ...], again: tuple[str, ...], thing: Any) -> ObjectState:
+    """Return the attributes of an object: those in `names`, if what it refers to shows that these
+    are all, else those in its dictionary.
+
+    Before Python 3.13 a look at `__dict__` makes that dictionary, for good, and every access to an
+    attribute then takes twice as long: a tenth of all processor time of a rack.
+    """
+    values = ((name, getattr(thing, name, _ABSENT)) for name in names)
+    named = {name: value for name, value in values if value is not _ABSENT}
+    found = get_referents(thing)
+    if len(found) != len(named) + 1 or not {*map(id, found)}.issuperset(map(id, named.values())):
+        named = dict(sorted((named | getattr(thing, "__dict__", {})).items()))
+        found = []
     for name in again:
-        fields.pop(name, None)
-    return fields
+        named.pop(name, None)
+    return ObjectState(named, found)
+
+
+def _has_same_fields(thing: Any, before: ObjectState) -> bool:
+    """Say whether an object has the attributes of before, without a look at each, by what it refers
+    to. One that was deleted, while another one was set to the same object, does not show."""
+    now = get_referents(thing)
+    return len(now) == len(before.referents) and all(map(is_, now, before.referents))
+
+
+def _names(kind: type) -> tuple[str, ...]:
+    """Return the names of the slots of a class, and of other attributes that its methods set."""
+    bases = [vars(base) for base in kind.__mro__]
+    slots = [base["__slots__"] for base in bases if "__slots__" in base]
+    found = {name for names in slots for name in ([names] if isinstance(names, str) else names)}
+    if not hasattr(kind, "__getattr__"):
+        values = (value for base in bases for value in base.values())
+        codes = (value.__code__ for value in values if isinstance(value, FunctionType))
+        # What a class has by that name an object need not have set.
+        found |= {name for code in codes for name in _set_in(code)} - {*chain(*bases)}
+        if is_dataclass(kind):
+            found |= {field.name for field in fields(kind) if field.init}
+    return tuple(sorted(found - {"__dict__", "__weakref__"}))
+
+
+def _set_in(code: CodeType) -> Iterable[str]:
+    """Yield the names of attributes that code sets."""
+    steps = zip(code.co_code[::2], code.co_code[1::2], strict=True)
+    return (code.co_names[name] for step, name in steps if step == opmap["STORE_ATTR"])
 
 
 def _put_fields(thing: Any, found: tuple[dict[str, Any], list[str]]) -> None:
@@ -247,13 +296,16 @@ def _object(kind: type) -> PartKind:
     dataclass, and those that its objects find again."""
     if is_dataclass(kind) and kind.__dataclass_params__.frozen:  # type: ignore[attr-defined]
         return PartKind("frozen dataclass", (kind,), _frozen)
-    declared = [base.__dict__["__slots__"] for base in kind.__mro__ if "__slots__" in vars(base)]
-    if not (kind.__dictoffset__ or declared):
+    if not (kind.__dictoffset__ or any("__slots__" in vars(base) for base in kind.__mro__)):
         raise CheckpointError(f"a {kind.__module__}.{kind.__qualname__} has no checkpoint")
-    slots = [name for names in declared for name in ([names] if isinstance(names, str) else names)]
-    attributes = partial(_fields, tuple(slots), getattr(kind, FOUND_AGAIN, ()))
+    attributes = partial(_fields, _names(kind), getattr(kind, FOUND_AGAIN, ()))
     return PartKind(
-        "object", (kind,), lambda thing: attributes(thing).items(), attributes, _put_fields
+        "object",
+        (kind,),
+        lambda thing: attributes(thing).named.items(),
+        attributes,
+        _put_fields,
+        _has_same_fields,
     )
 
 
@@ -264,13 +316,11 @@ def changes(now: Any, before: Any) -> Any:
     an array the elements, after their places; otherwise all.
     """
     match now:
-        case dict():
-            # Most objects have not changed, and this says so without a step of Python for each
-            # attribute.
-            if list(now) == list(before) and all(map(is_, now.values(), before.values())):
-                return None
-            changed = {name: v for name, v in now.items() if before.get(name, _ABSENT) is not v}
-            gone = [name for name in before if name not in now]
+        case ObjectState(now):
+            changed = {
+                name: v for name, v in now.items() if before.named.get(name, _ABSENT) is not v
+            }
+            gone = [name for name in before.named if name not in now]
             return (changed, gone) if changed or gone else None
         case Elements(raw, size):
             if raw == before.raw:

@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.boards.checkpoint.kinds import ATOMS, Elements, changes, part_kind
+from rack.boards.checkpoint.kinds import ATOMS, Elements, ObjectState, changes, part_kind
 from rack.boards.errors import CheckpointError
 
 _T = TypeVar("_T")
@@ -96,9 +96,11 @@ class Parts:
         changed = {}
         for number, before in self._before.items():
             thing = self._all[number]
-            contents = part_kind(type(thing)).contents
-            assert contents is not None, "it had some before"
-            if (found := changes(contents(thing), before)) is not None:
+            kind = part_kind(type(thing))
+            if kind.is_same is not None and kind.is_same(thing, before):
+                continue
+            assert kind.contents is not None, "it had some before"
+            if (found := changes(kind.contents(thing), before)) is not None:
                 changed[number] = found
         return changed
 
@@ -168,8 +170,8 @@ def _form(contents: Any) -> str:
     """Return what must be the same of contents: names of attributes, size of an array; a list may
     have any length."""
     match contents:
-        case dict():
-            return " ".join(contents)
+        case ObjectState(named):
+            return " ".join(named)
         case Elements():
             return str(len(contents.raw))
         case _:

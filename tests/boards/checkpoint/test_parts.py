@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import pickle
 import re
@@ -60,6 +61,38 @@ def test_what_nothing_has_changed_stays_as_the_constructor_made_it() -> None:
     other = Whole(gain=4.0)
     Parts(other, "other").load(parts.save(), ())
     assert (other.gain, other.list) == (4.0, [1.5, 2.5, 9.5])
+
+
+class Slotted:
+    """Attributes in slots, and others."""
+
+    __slots__ = ("__dict__", "kept", "unset")
+
+    def __init__(self) -> None:
+        self.kept = 1
+
+
+def test_attributes_are_found_wherever_they_are_set() -> None:
+    one, other = Whole(), Whole()
+    for each in (one, other):
+        each.slotted = Slotted()  # type: ignore[attr-defined]
+    parts, again = Parts(one, "one"), Parts(other, "other")
+    one.slotted.kept = 2  # type: ignore[attr-defined]
+    one.slotted.unset = 3  # type: ignore[attr-defined]
+    one.slotted.foreign = 4  # type: ignore[attr-defined]
+    one.new = 5  # type: ignore[attr-defined]
+    again.load(parts.save(), ())
+    found = other.slotted  # type: ignore[attr-defined]
+    assert (found.kept, found.unset, found.foreign, other.new) == (2, 3, 4, 5)  # type: ignore[attr-defined]
+
+
+def test_a_look_at_parts_makes_no_dictionary_of_the_attributes_of_an_object() -> None:
+    one = Whole()
+    parts = Parts(one, "one")
+    one.gain = 2.5
+    parts.save()
+    # It would refer to the dictionary alone.
+    assert any(found is one.list for found in gc.get_referents(one))
 
 
 def test_another_shape_is_another_class_attribute_or_size() -> None:
