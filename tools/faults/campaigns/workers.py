@@ -71,12 +71,13 @@ class Workers:
         """Make trials and yield each that is done and has its file; a signal ends those in
         progress, which leave none.
 
-        Trials that are `alone` have the machine for themselves. Others get one core each: boards
-        that share a core hand messages to each other sooner.
+        Trials that are `alone` have the machine for themselves. Others share its cores: many get
+        one each, where their boards hand messages to each other sooner; a single one gets all.
         """
         waiting = list(jobs)
         busy = dict[Any, TrialJob]()
-        cores = [set(self._cores)] if alone else [{core} for core in self._cores]
+        shares = 1 if alone else min(len(self._cores), max(1, len(waiting)))
+        cores = [set(self._cores[first::shares]) for first in range(shares)]
         while (waiting or busy) and not INTERRUPT.number:
             lines = self._some(min(len(cores), len(waiting) + len(busy)))
             for line, its_cores in zip(lines, cores, strict=False):
