@@ -23,6 +23,7 @@ from rack.levels.robot.engine import (
     mj_kinematics,
     mju_mat_to_quat,
     mju_mul_quat,
+    set_margins,
 )
 from rack.levels.robot.lookup import geom_name
 from rack.levels.tables import SceneConfig
@@ -56,7 +57,8 @@ class CollisionChecker:
 
     The arm, with its open gripper and its load, keeps `scene.clearance` from everything else. Links
     may be close to each other and to the body that carries the arm, but keep `margin`, m, as the
-    gripper does from supports. One instance serves one task; a check takes some microseconds.
+    gripper does from supports; the first may be near what it stands on. One instance serves one
+    task; a check takes some microseconds.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, margin: float = 0.0) -> None:
@@ -196,7 +198,7 @@ class CollisionChecker:
         m.geom_conaffinity[self.cell.gripper_geoms] &= LINK
         # MuJoCo adds the margins of the two geoms: two links find each other within twice the
         # margin.
-        m.geom_margin[:] = np.where(arm, self._margin, self.clearance)
+        set_margins(m, np.where(arm, self._margin, self.clearance))
         m.geom_gap[:] = 0.0
         m.pair_margin[:] = self.clearance
         return np.stack((m.geom_contype, m.geom_conaffinity))
@@ -222,13 +224,15 @@ class CollisionChecker:
         return required
 
     def _ease_at_home(self) -> None:
-        """Require of links that are closer than twice the margin at home only half their distance
-        there: some always are."""
-        mujoco.mj_fwdPosition(self._model, self._data)
+        """Require of links that are close to each other at home, or the first to what is fixed,
+        only half their distance there: some always are."""
+        m = self._model
+        mujoco.mj_fwdPosition(m, self._data)
         contact = self._data.contact
-        own = np.union1d(self.cell.arm_geoms, self._carriers())
+        own = np.isin(np.arange(m.ngeom), (*self.cell.arm_geoms, *self._carriers()))
+        foot = np.isin(m.body_weldid[m.geom_bodyid], (0, m.dof_bodyid[self.cell.dof[0]]))
         for pair, distance in zip(contact.geom, contact.dist, strict=True):
-            if np.isin(pair, own).all():
+            if own[pair].all() or foot[pair].all():
                 one, other = pair
                 eased = min(self._base[one, other], max(0.5 * distance, 0.0))
                 self._base[one, other] = self._base[other, one] = eased

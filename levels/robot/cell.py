@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rack.levels.errors import RobotError
 from rack.levels.level import LevelContext
 from rack.levels.robot import lookup
+from rack.levels.robot.engine import set_margins
 from rack.levels.robot.hand import Hand, find_hand, fit_tendons
 from rack.levels.robot.limits import (
     Bounds,
@@ -343,7 +344,7 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: NDArray[np.f
             )
     # Surfaces that meet at 0.0 mm do not touch yet, but in the first motion.
     near = copy(cell.model)
-    near.geom_margin[:] += TOUCHING_M
+    set_margins(near, near.geom_margin + TOUCHING_M)
     data = replace(cell, model=near).start()
     for pair in unintended_contacts(data, cell.touch, TOUCHING_M):
         first, second = (lookup.geom_name(cell.model, geom) for geom in pair)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rack.levels.compiled import compiled
 
@@ -88,6 +88,16 @@ def one_view(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
         _view(first, np.float64, ((max(ends) - first) // item,), (item,)),
         (begins - first) // item,
     )
+
+
+def set_margins(model: mujoco.MjModel, margins: ArrayLike) -> None:
+    """Have geoms find each other at the sum of their `margins`, (geoms,) or one for all, m.
+
+    MuJoCo rules out bodies first, by margins of their own, which its compiler sets.
+    """
+    model.geom_margin[:] = margins
+    model.body_margin[:] = 0.0
+    np.maximum.at(model.body_margin, model.geom_bodyid, model.geom_margin)
 
 
 class ContactViews(NamedTuple):

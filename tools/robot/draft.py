@@ -20,6 +20,7 @@ from rack.levels.planning.ik import sampling_range
 from rack.levels.robot.abilities import Statics
 from rack.levels.robot.cell import Cell, build_cell, check_fingers, unchecked_cell
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.robot.engine import set_margins
 from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
 from rack.levels.servo.control import LoopGains
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -252,7 +253,7 @@ def _add_gripper(made: Draft) -> None:
 def _exclude(made: Draft) -> None:
     """Exclude contacts of bodies whose shapes always overlap."""
     cell = made.cell()
-    cell.model.geom_margin[:] = SKIN_M
+    set_margins(cell.model, SKIN_M)
     data = cell.start()
     count: Counter[tuple[str, str]] = Counter()
     for q in poses(cell):
@@ -362,7 +363,7 @@ def _home(
         if left(starts[name]) > 0:
             return starts[name].round(5).tolist(), ""
     data = cell.start()
-    cell.model.geom_margin[:] = 0.5 * APART_M  # of two geoms they add up
+    set_margins(cell.model, 0.5 * APART_M)
 
     def rating(q: Array) -> float:
         is_near = bool(touching(cell, data, q, APART_M))
