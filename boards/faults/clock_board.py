@@ -167,14 +167,22 @@ def _step(entry: FaultEntry) -> ClockStep:
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
 
+def _next_change(entry: FaultEntry, tick: int) -> int:
+    """Return the first tick after `tick` at which a fault may begin, act or end."""
+    if entry.stage == Stage.WAITING:
+        return tick + 1 if entry[Entry.WHEN_BOX] >= 0 else max(tick + 1, entry[Entry.FROM])
+    if entry.stage == Stage.ACTIVE:
+        may_end_early = kind_of(entry).once or _step(entry) is not ELSEWHERE
+        return tick + 1 if may_end_early else entry[Entry.UNTIL]
+    return NEVER
+
+
 class FaultStage:
     """Begins and ends faults at ticks, before any task of the tick is released; sees messages flow
     again after them.
 
     In real time a fault with a phase strikes within its tick, after the releases. There is nothing
-    to do in a tick if no fault is `open` (waiting or active), none but the first `injected` ones
-    have come, and no messages are `awaited`: by mailbox, as an index, the tick from which one must
-    be.
+    to do before `next_tick` unless more than the first `injected` faults have come.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
@@ -187,27 +195,24 @@ class FaultStage:
             lambda box: open_observer(segment, segment.layout.mailboxes[box].name)
         )
         self.injected = 0
-        self.awaited: dict[int, int] = {}
+        self.next_tick = 0
+        self._awaited: dict[int, int] = {}
+        """By mailbox, as an index, the tick from which a message must be."""
         if self._words[System.STATE] == Run.RUNNING:
             # A restarted clock does not know what its predecessor has seen.
             for entry in self._table.staged((Stage.OVER,)):
                 self._await_messages(entry)
-        self.open: list[FaultEntry] = []
         self._phased: list[FaultEntry] = []
 
     def advance(self, tick: int) -> None:
         """Begin the faults due at `tick`, and end those that are over."""
         self.injected = self._words[System.INJECTED]
-        self.open = self._table.staged(OPEN)
+        faults = self._table.staged(OPEN)
         over = [
-            entry
-            for entry in self.open
-            if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)
+            entry for entry in faults if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)
         ]
         due = [
-            entry
-            for entry in self.open
-            if entry.stage == Stage.WAITING and self._is_due(entry, tick)
+            entry for entry in faults if entry.stage == Stage.WAITING and self._is_due(entry, tick)
         ]
         if over or due:
             # A running cycle finishes with the faults with which it began.
@@ -216,15 +221,19 @@ class FaultStage:
             self._finish(entry, tick)
         for entry in due:
             self._begin(entry, tick)
-        active = [entry for entry in self.open if entry.stage == Stage.ACTIVE]
+        active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
         for entry in active:
             _step(entry).during(self._rack, entry, tick)
         self._rack.driver.is_flooded = any(kind_of(entry).step is Babble for entry in active)
-        for box, since in list(self.awaited.items()):
+        for box, since in list(self._awaited.items()):
             observer = self._observer(box)
             if observer.read(tick - 1).is_there and observer.newest >= since:
-                del self.awaited[box]
+                del self._awaited[box]
                 self._alarms.ring(tick, Alarm.FLOWS, box, tick - since, since)
+        # While rings are flooded, ticks must come one at a time: the recorder keeps up with each.
+        must_look = self._awaited or self._rack.driver.is_flooded
+        changes = [tick + 1] if must_look else [_next_change(entry, tick) for entry in faults]
+        self.next_tick = min(changes, default=NEVER)
 
     def within(self, tick: int) -> None:
         """Let the faults with a phase in `tick` strike at their times; call it after the
@@ -287,4 +296,4 @@ class FaultStage:
         layout = self._segment.layout
         if kind_of(entry).takes_mailbox:
             for box in struck_mailboxes(layout, entry[Entry.MAILBOX], board_of(entry, layout)):
-                self.awaited[layout.mailboxes.index(box)] = entry[Entry.UNTIL]
+                self._awaited[layout.mailboxes.index(box)] = entry[Entry.UNTIL]

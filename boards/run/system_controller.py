@@ -73,9 +73,9 @@ class SystemController:
         words = self._words
         faults = self._faults
         desk = self._desk
-        if faults.open or faults.awaited or words[_INJECTED] != faults.injected:
+        if tick >= faults.next_tick or words[_INJECTED] != faults.injected:
             faults.advance(tick)
-        if desk.waiting or desk.leased or words[_REQUESTED] != desk.requested:
+        if tick >= desk.next_tick or words[_REQUESTED] != desk.requested:
             desk.advance(tick)
         if self._settled != (
             words[_LOSSES],
@@ -92,11 +92,9 @@ class SystemController:
     def rests_until(self, tick: int) -> int:
         """Return the first tick after `tick` that needs `begin`, or may end the run, as far as is
         known."""
-        faults = self._faults
-        desk = self._desk
-        if faults.open or faults.awaited or desk.waiting or desk.leased or self._settled is None:
+        if self._settled is None:
             return tick + 1
-        return self._end_of_run.next_tick
+        return min(self._faults.next_tick, self._desk.next_tick, self._end_of_run.next_tick)
 
     def _handle_losses(self, tick: int) -> None:
         """Let restarted boards rejoin, latch for those given up, and set the demand for all other
@@ -156,8 +154,8 @@ class OperatorDesk:
     """Issues operator commands at the start of a tick, each into its level's mailbox, before any
     task is released.
 
-    There is nothing to do in a tick if no command is `waiting` or `leased` and none but the first
-    `requested` ones have come.
+    There is nothing to do before `next_tick` unless more than the first `requested` commands have
+    come.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -177,8 +175,9 @@ class OperatorDesk:
             at: open_observer(segment, name) for at, name in statuses.items() if name in there
         }
         self.requested = -1
-        self.waiting: list[RequestEntry] = []
-        self.leased: list[RequestEntry] = []
+        self.next_tick = 0
+        self._waiting: list[RequestEntry] = []
+        self._leased: list[RequestEntry] = []
         self._newest: dict[int, int] = {}
         """Of each mailbox, the serial of the newest command that takes the place of others."""
         # A tick of lockstep has no length.
@@ -189,12 +188,12 @@ class OperatorDesk:
         """Issue all commands due at `tick`."""
         if self._words[_REQUESTED] != self.requested:
             self.requested = self._words[_REQUESTED]
-            self.waiting = self._table.waiting()
-            self.leased = self._table.leased()
-        for entry in list(self.leased):
+            self._waiting = self._table.waiting()
+            self._leased = self._table.leased()
+        for entry in list(self._leased):
             self._check_lease(entry, tick)
-        for entry in [entry for entry in self.waiting if entry[RequestWord.TICK] <= tick]:
-            self.waiting.remove(entry)
+        for entry in [entry for entry in self._waiting if entry[RequestWord.TICK] <= tick]:
+            self._waiting.remove(entry)
             # Mark first, then check that it still waits; a client that withdraws it uses the
             # opposite order.
             entry.words[RequestWord.GIVEN_TICK] = tick
@@ -202,6 +201,8 @@ class OperatorDesk:
                 self._give(entry, tick)
             else:
                 entry.words[RequestWord.GIVEN_TICK] = -1
+        due = [tick + 1] if self._leased else [entry[RequestWord.TICK] for entry in self._waiting]
+        self.next_tick = min(due, default=sys.maxsize)
 
     def _give(self, entry: RequestEntry, tick: int) -> None:
         words = entry.words
@@ -220,7 +221,7 @@ class OperatorDesk:
             self._newest[words[RequestWord.MAILBOX]] = message.id
         self._alarms.ring(tick, Alarm.COMMANDED, entry.index, words[RequestWord.SERIAL])
         if words[RequestWord.CLIENT] == Client.LEASES:
-            self.leased.append(entry)
+            self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
         """Have a level hold whose operator has gone while the command is in force."""
@@ -239,7 +240,7 @@ class OperatorDesk:
             writer.write(tick, self._clock.now())
             self._table.release(entry)
             self._alarms.ring(tick, Alarm.OPERATOR_GONE, entry.index, writer.message.id)
-        self.leased.remove(entry)
+        self._leased.remove(entry)
 
     def _is_over(self, entry: RequestEntry) -> bool:
         """Return whether the level has refused the command, or accepted a newer one in its

@@ -53,7 +53,7 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:  # n
 
     class Controller:
         def begin(self, tick: int) -> None:
-            if stage.open or segment.words[System.INJECTED] != stage.injected:
+            if tick >= stage.next_tick or segment.words[System.INJECTED] != stage.injected:
                 stage.advance(tick)
 
         def released(self, tick: int) -> None:
@@ -120,8 +120,9 @@ def test_a_fault_lasts_from_its_tick_for_its_ticks(site: Site) -> None:
     entry = site.add("mute", tick=5, ticks=3)
     generation = site.table.generation
     assert (site.advance(3, 4), entry.stage) == ([], Stage.WAITING)
-    assert [found.index for found in site.stage.open] == [entry.index]
+    assert site.stage.next_tick == 5
     assert site.advance(5) == [(Alarm.FAULT_BEGINS, 5, entry.index, 0.0)]
+    assert site.stage.next_tick == 8
     assert (entry[Entry.FROM], entry[Entry.UNTIL], entry.stage) == (5, 8, Stage.ACTIVE)
     assert site.table.generation == generation + 1
     assert site.advance(6, 7) == []
@@ -129,7 +130,7 @@ def test_a_fault_lasts_from_its_tick_for_its_ticks(site: Site) -> None:
     assert site.advance(8) == [(Alarm.FAULT_ENDS, 8, entry.index, 2.0)]
     assert (entry[Entry.UNTIL], entry.stage) == (8, Stage.OVER)
     assert site.table.generation == generation + 2
-    assert (site.advance(9), site.stage.open, site.stage.injected) == ([], [], 1)
+    assert (site.advance(9), site.stage.injected) == ([], 1)
 
 
 def test_a_fault_without_an_end_lasts_to_the_end_of_the_run(site: Site) -> None:
@@ -156,22 +157,47 @@ def test_messages_are_seen_to_flow_again_after_a_fault_of_them(site: Site) -> No
     site.advance(5)
     box = site.segment.layout.mailboxes.index(site.segment.layout.mailbox(NAME))
     # A message made while it was active is none of those after it.
-    assert (site.stage.awaited, site.advance(6)) == ({box: 5}, [])
+    assert (site.stage.next_tick, site.advance(6)) == (6, [])
     site.write_other.write(6)
     assert site.advance(7, 8) == []
     writer.write(8)
     # Visible a tick later, and read as of the tick before.
     assert site.advance(9) == []
     assert site.advance(10) == [(Alarm.FLOWS, 10, box, 5.0)]
-    assert (site.stage.awaited, site.advance(11)) == ({}, [])
+    assert (site.stage.next_tick, site.advance(11)) == (NEVER, [])
 
 
 def test_a_restarted_clock_awaits_the_messages_that_its_predecessor_did(site: Site) -> None:
     site.add("mute", tick=2, ticks=3)
     site.advance(2, 5)
     site.segment.words[System.STATE] = Run.RUNNING
-    restarted = FaultStage(site.segment, site.driver)
-    assert restarted.awaited == site.stage.awaited == {0: 5}
+    site.alarms()
+    site.stage = FaultStage(site.segment, site.driver)
+    writer = open_writer(site.segment, NAME)
+    writer.write(5)
+    assert site.advance(6, 7) == [(Alarm.FLOWS, 7, 0, 2.0)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "next_ticks"),
+    [
+        ("drop", {"tick": 4, "ticks": 3, "mailbox": 0}, [4, 4, 7, 7]),
+        ("drop", {"ticks": 3, "mailbox": 0, "when": (1, 0, 7)}, [3, 4, 5, 6]),  # read in each tick
+        ("sensor-bias", {"tick": 4, "ticks": 3}, [4, 4, 7, 7]),
+        ("hang", {"tick": 4, "ticks": 3}, [4, 4, 5, 6]),  # may end early, with its process
+        ("babble", {"tick": 4, "ticks": 3}, [4, 4, 5, 6]),  # the recorder keeps up with each tick
+        ("clock-jitter", {"tick": 4, "ticks": 3, "task": -1}, [4, 4, 5, 6]),  # acts in each tick
+    ],
+)
+def test_ticks_in_which_no_fault_can_change_are_left_out(
+    site: Site, kind: str, more: dict[str, Any], next_ticks: list[int]
+) -> None:
+    site.add(kind, **more)
+    found = []
+    for tick in (2, 3, 4, 5):
+        site.advance(tick)
+        found.append(site.stage.next_tick)
+    assert found == next_ticks
 
 
 def test_a_condition_holds_as_of_the_tick_before(site: Site) -> None:
