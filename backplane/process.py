@@ -140,16 +140,17 @@ def _reserve(reservation: Reservation) -> bool:
     return number is not None and _libc.syscall(number, 0, wanted, 0) == 0
 
 
-def take_processor(spec: TaskSpec, reservation: Reservation | None = None) -> int:
-    """Take core and scheduling as `take_core`, lock the process's memory, stop the garbage
-    collector."""
+def take_processor(
+    spec: TaskSpec, reservation: Reservation | None = None, lockstep: bool = False
+) -> int:
+    """Take core and scheduling as `take_core`, and hold the process's memory."""
     obtained = take_core(spec.core, spec.priority, reservation)
     # Ordinary processes wake up to 50 us late without this, to save power.
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     # Here, not above: it needs numpy, for which `rack list` and the like should not wait.
-    from rack.backplane.memory import lock_memory
+    from rack.backplane.memory import hold_memory
 
-    lock_memory()
+    hold_memory(lockstep)
     return obtained
 
 

@@ -246,11 +246,13 @@ class Resolved:
             raise LaunchError(f"rack '{self.config.name}': {why}")
 
     def _unlocked(self, segment: Segment) -> list[str]:
+        if self.config.clock.mode == "lockstep":
+            return []
         memory = {
             t.name: mapped_and_locked(segment.block(t.name)[Block.PID]) for t in self.layout.tasks
         }
         unlocked = {name: mapped for name, (mapped, locked) in memory.items() if not locked}
-        if not unlocked or self.config.clock.mode == "lockstep":
+        if not unlocked:
             return []
         limit = (
             f"the limit is {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps"

@@ -11,7 +11,7 @@ from importlib import import_module
 
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
-from rack.backplane.memory import lock_memory, touch_memory
+from rack.backplane.memory import hold_memory, touch_memory
 from rack.backplane.process import (
     cores_kept_awake,
     die_with_parent,
@@ -94,11 +94,12 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
             raise LevelError("self-test failed: injected by a fault in the config")
         UtilityLines(segment).release_sysfail(spec.slot)
         is_fast = spec.every * segment.layout.clock_ns <= FAST_NS
-        if is_fast and spec.priority and not segment.words[System.LOCKSTEP]:
+        lockstep = bool(segment.words[System.LOCKSTEP])
+        if is_fast and spec.priority and not lockstep:
             # Still at ordinary priority: a board that is restarted must not delay another board's
             # cycle.
             touch_memory()
-        block[Block.PRIORITY] = take_processor(spec, wiring.reservation)
+        block[Block.PRIORITY] = take_processor(spec, wiring.reservation, lockstep)
         block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
             level.open()
@@ -120,7 +121,7 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> in
     take_core(wiring.core, wiring.priority, wiring.reservation)
     # Not touched: every board waits for the clock's start, and its lead over the grid has room for
     # a page fault.
-    lock_memory()
+    hold_memory(wiring.lockstep)
     with cores_kept_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention)
     return 0

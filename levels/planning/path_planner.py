@@ -291,26 +291,26 @@ def lever_arms(cell: Cell, seed: int) -> Array:
 
     A joint step dq moves no point of the arm by more than sum |lever_j dq_j|.
     """
-    data = mujoco.MjData(cell.model)
-    rng = np.random.default_rng(seed)
-    levers = np.zeros(len(cell.qpos))
-    low, high = sampling_range(cell)
-    for _ in range(LEVER_SAMPLES):
-        data.qpos[cell.qpos] = rng.uniform(low, high)
-        mujoco.mj_kinematics(cell.model, data)
-        np.maximum(levers, [_lever(cell, data, j) for j in range(len(levers))], out=levers)
-    return levers
-
-
-def _lever(cell: Cell, data: mujoco.MjData, joint: int) -> float:
     m = cell.model
-    dof = cell.dof[joint]
-    index = int(m.dof_jntid[dof])
-    if m.jnt_type[index] == mujoco.mjtJoint.mjJNT_SLIDE:
-        return 1.0
-    carried = geoms_of(m, below(m, m.jnt_bodyid[[index]]))
-    moved = np.intersect1d(carried, cell.arm_geoms)
-    if not moved.size:
-        return 0.0
-    from_axis = np.cross(data.geom_xpos[moved] - data.xanchor[index], data.xaxis[index])
-    return float(np.max(np.linalg.norm(from_axis, axis=1) + m.geom_rbound[moved]))
+    data = mujoco.MjData(m)
+    rng = np.random.default_rng(seed)
+    low, high = sampling_range(cell)
+    places = np.empty((LEVER_SAMPLES, m.ngeom, 3))
+    anchors, axes = np.empty((2, LEVER_SAMPLES, m.njnt, 3))
+    for sample in range(LEVER_SAMPLES):
+        data.qpos[cell.qpos] = rng.uniform(low, high)
+        mujoco.mj_kinematics(m, data)
+        places[sample] = data.geom_xpos
+        anchors[sample] = data.xanchor
+        axes[sample] = data.xaxis
+
+    def lever(joint: int) -> float:
+        if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+            return 1.0
+        carried = geoms_of(m, below(m, m.jnt_bodyid[[joint]]))
+        moved = np.intersect1d(carried, cell.arm_geoms)
+        from_anchor = places[:, moved] - anchors[:, [joint]]
+        from_axis = np.linalg.norm(np.cross(from_anchor, axes[:, [joint]]), axis=2)
+        return float(np.max(from_axis + m.geom_rbound[moved], initial=0.0))
+
+    return np.array([lever(joint) for joint in m.dof_jntid[cell.dof]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import resource
 import signal
@@ -206,11 +207,16 @@ def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
         assert mapped >= locked > 0
         return os.sched_getparam(0).sched_priority == 5
 
+    def take_for_lockstep() -> bool:
+        assert take_processor(replace(task("level"), core=core, priority=5), lockstep=True) == 5
+        return not gc.isenabled() and mapped_and_locked(os.getpid())[1] == 0
+
     def be_ordinary() -> bool:
         assert take_processor(replace(task("level"), core=core)) == 0
         return Path("/proc/self/timerslack_ns").read_text().strip() == "1"
 
     assert exit_status(fork(take)) == 0
+    assert exit_status(fork(take_for_lockstep)) == 0
     assert exit_status(fork(be_ordinary)) == 0
 
 

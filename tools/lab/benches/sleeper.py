@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from rack.backplane.memory import lock_memory
+from rack.backplane.memory import hold_memory
 from rack.backplane.process import pin, set_priority
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.cyclictest import WakeGrid
@@ -28,7 +28,7 @@ def measure(grid: WakeGrid) -> list[int]:
     """Sleep to every point, in a process of its own; return how late, ns; -1: skipped."""
     pin(grid.cores[0])
     set_priority(grid.priority)
-    lock_memory()
+    hold_memory()
     late_ns = [-1] * grid.wakes
     period = grid.period_ns
     monotonic_ns = time.monotonic_ns
