@@ -24,14 +24,18 @@ from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_rea
 from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult, kept
 from rack.tools.faults.campaigns.trial import restart_s
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
-from rack.tools.faults.ending import EXTERNAL
+from rack.tools.faults.ending import EXTERNAL, record_of
 
 LAUNCH_S = 2.0
 """About the time of a launch and an end, for the progress bar."""
 SHORTEST_S = 1.0
 """Shortest run of faultless time."""
 ROUNDS = 8
-"""Draws of a fault that does not strike, each at another instant; then it is missing."""
+"""Rounds in which faults that do not strike are drawn again, at other instants; then they are
+missing."""
+MOST_AGAIN = 4
+"""Draws of one fault in a round, at most: more from round to round, since the fewer are left, the
+less does one more cost."""
 ORDER = "order.json"
 TRIALS = "trials"
 BASE = "base"
@@ -144,17 +148,24 @@ class Campaign:
         # Unary plus leaves out the kinds that lack nothing.
         lacking = +Counter(dict.fromkeys(kinds, order.injections))
         rack = self._under_test(lockstep)
+        tried = set[str]()
+        # Faults that have trials of their own come later: what is drawn again leaves cores free.
+        now = [kind for kind in lacking if record_of(kind).recoverable] or list(lacking)
         for turn in range(ROUNDS):
             seed = f"{order.seed} {turn}"
-            found = self._made(fault_plans(rack, lacking, seed, lockstep, self._number + 1))
+            again = min(turn + 1, MOST_AGAIN)
+            counts = {kind: lacking[kind] * (again if kind in tried else 1) for kind in now}
+            found = self._made(fault_plans(rack, counts, seed, lockstep, self._number + 1))
             results.trials += found
             faults = [fault for run in found for fault in run.faults]
             lacking -= Counter(f.kind for f in faults if f.is_judged and f.seen != "not struck")
             if not lacking or INTERRUPT.number:
                 break
+            tried.update(now)
+            now = list(lacking)
         wanted = order.injections
         results.lacking += [
-            f"{kind}: struck {wanted - count} of {wanted} times, in {ROUNDS} draws"
+            f"{kind}: struck {wanted - count} of {wanted} times, in {ROUNDS} rounds"
             for kind, count in lacking.items()
         ]
 

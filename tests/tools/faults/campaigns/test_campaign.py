@@ -135,8 +135,26 @@ def test_what_did_not_strike_is_drawn_again_and_in_the_end_said(make: MakeCampai
     campaign, trials = make(never_mute)
     results = campaign.run()
     kinds = [table["kind"] for plan in trials.made for table in plan.faults]
-    assert (kinds.count("mute"), kinds.count("drop")) == (3 * module.ROUNDS, 3)
-    assert results.lacking == [f"mute: struck 0 of 3 times, in {module.ROUNDS} draws"]
+    # Each round more of them, up to four of each that is missing.
+    again = sum(min(turn + 1, module.MOST_AGAIN) for turn in range(1, module.ROUNDS))
+    assert (kinds.count("mute"), kinds.count("drop")) == (3 + 3 * again, 3)
+    assert results.lacking == [f"mute: struck 0 of 3 times, in {module.ROUNDS} rounds"]
+
+
+def test_trials_of_one_fault_come_after_those_of_many(make: MakeCampaign) -> None:
+    def not_at_first(plan: Plan) -> TrialResult:
+        found = struck(plan)
+        unseen = [replace(one, seen="not struck") for one in found.faults]
+        return replace(found, faults=tuple(unseen)) if plan.number == 1 else found
+
+    campaign, trials = make(not_at_first, kinds="mute,self-test")
+    campaign.run()
+    first, *later = [[table["kind"] for table in plan.faults] for plan in trials.made[1:]]
+    alone = [kinds for kinds in later if kinds == ["self-test"]]
+    assert (set(first), alone) == ({"mute"}, [["self-test"]] * 3)
+    drawn_again = later[: -len(alone)]
+    assert later[-len(alone) :] == alone
+    assert sum(map(len, drawn_again)) == 3 - len(first) + 2 * len(first)
 
 
 def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
