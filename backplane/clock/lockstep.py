@@ -55,7 +55,8 @@ class LockstepDriver(ClockDriver):
     the next tick before which it must be called.
 
     `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for
-    each. Protocols whose messages are visible at once need this to be repeatable.
+    each. Protocols whose messages are visible at once need this to be repeatable; so does a task
+    that floods a mailbox, since messages that others still read are overwritten in the same tick.
     """
 
     def __init__(
@@ -131,11 +132,12 @@ class LockstepDriver(ClockDriver):
 
     def _step(self, due: list[ReleasedTask], tick: int, end: int) -> bool:
         """Do one tick, or a batch before `end`; False when the launcher is gone."""
+        one_at_a_time = self._one_at_a_time or self.is_flooded
         for task in due:
             task.release(tick, end - tick - 1)
             if task.is_posted:
                 task.wake()
-            if self._one_at_a_time and not self._wait(task, task.is_settled):
+            if one_at_a_time and not self._wait(task, task.is_settled):
                 return False
         self.check(due, tick)
         return self._wait_for_all(end)

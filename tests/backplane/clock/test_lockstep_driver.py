@@ -41,7 +41,7 @@ def serve(
 
 
 def lockstep(
-    segment: Segment, stop: int, one_at_a_time: bool
+    segment: Segment, stop: int, one_at_a_time: bool, flooded: bool = False
 ) -> tuple[list[tuple[str, str, int]], list[int]]:
     """Run lockstep over slow tasks; return the log of their cycles, and the ticks in the order
     given out."""
@@ -64,7 +64,9 @@ def lockstep(
     ]
     for thread in threads:
         thread.start()
-    LockstepDriver(segment, ended, one_at_a_time, HISTORY).run()
+    driver = LockstepDriver(segment, ended, one_at_a_time, HISTORY)
+    driver.is_flooded = flooded
+    driver.run()
     for thread in threads:
         thread.join(BOUND_S)
         assert not thread.is_alive()
@@ -98,13 +100,16 @@ def test_a_lockstep_tick_begins_when_every_task_due_has_finished(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("flooded", [False, True])
 @pytest.mark.parametrize("wake", get_args(Wake))
-def test_one_at_a_time_means_one_after_the_other(make_bus: MakeBus, wake: Wake) -> None:
+def test_one_at_a_time_means_one_after_the_other(
+    make_bus: MakeBus, wake: Wake, flooded: bool
+) -> None:
     planner = task("planner", slot=4, role="planner", wake=wake)
     segment = make_bus(
         planner, task("slow", every=2, slot=3, wake=wake), task("fast", slot=2, wake=wake)
     )
-    log, _ = lockstep(segment, 6, True)
+    log, _ = lockstep(segment, 6, not flooded, flooded)
     expected: list[tuple[str, str, int]] = []
     for tick in range(6):
         expected.append(("tick", "clock", tick))
