@@ -27,7 +27,10 @@ MOST = 100_000
 """Faults of a kind, kills or sizes of one campaign."""
 
 Injections = Annotated[
-    int, typer.Option("--injections", metavar="N", min=0, max=MOST, help="strikes of each kind")
+    int,
+    typer.Option(
+        "--injections", metavar="N", min=0, max=MOST, help="strikes of each kind, at least"
+    ),
 ]
 Seed = Annotated[
     int, typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans")

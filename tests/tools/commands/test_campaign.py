@@ -119,9 +119,9 @@ def test_a_trial_that_falls_short_is_kept_as_a_file_that_repeats_it(
         "safely stopped",
         "safely stopped",
     )
-    assert sorted(fault["seen"] for fault in first["faults"]) == ["detected", "not struck"]
-    assert [fault["seen"] for fault in second["faults"]] == ["detected"]
-    assert (report["summary"]["injected"], report["summary"]["not_struck"]) == (2, 1)
+    for trial in (first, second):  # again, two for the one that did not strike
+        assert sorted(fault["seen"] for fault in trial["faults"]) == ["detected", "not struck"]
+    assert (report["summary"]["injected"], report["summary"]["not_struck"]) == (2, 2)
     assert all(
         "no restart follows" in line or "never undone" in line for line in report["shortfalls"]
     )
