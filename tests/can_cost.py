@@ -1,5 +1,4 @@
-"""Measures what the bus of the example `can-arm` costs in a cycle: `python -m tests.can_cost`,
-with --json for `rack claims`.
+"""Measures what the bus of the example `can-arm` costs in a cycle: `python -m tests.can_cost`.
 
 Its arm, held by torques, is exchanged with at 500 Hz; each drive is a process.
 """

@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.process import DEADLINE, Reservation, take_core
-from rack.tools.lab.benches.network import Lab
 from rack.tools.recording.cores import STAT, STEAL
+from tests.network_lab import Lab
 
 WAIT_S = 600.0
 """Bound of a wait for one's turn: twice the longest time-out of a test. It does not count in the

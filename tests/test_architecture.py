@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("backplane", "levels", "boards", "tools")
 """From the ground up; each may import itself and those before it."""
 ROOMS = (
-    ("tools/lab", "", {f"tools/commands/{name}.py" for name in ("bench", "claims", "reproduce")}),
+    ("tools/lab", "", {f"tools/commands/{name}.py" for name in ("bench", "reproduce")}),
     ("levels/systems", "levels", set()),
 )
 """A room, the floor whose other files do not import it, and those that do."""

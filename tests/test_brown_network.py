@@ -22,10 +22,10 @@ from rack.backplane.segment import SHM_FOLDER, Segment
 from rack.boards.config import CONFIGS, load, resolve
 from rack.boards.errors import ConfigError
 from rack.levels.operator import Answer
-from rack.tools.lab.benches.network import Lab
 from tests import golden
 from tests.boards.lan.racks import RackProcess, ended, running, watch
 from tests.machine import needs_fifo, needs_lab
+from tests.network_lab import Lab
 from tests.processes import RACK, wait_until
 from tests.snapshots import Snapshots
 from tests.test_cell_page import ONE_MACHINE, OWN_MEMORY

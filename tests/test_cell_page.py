@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from rack.boards.config import CONFIGS
-from rack.tools.lab.benches.network import Lab
 from tests import golden
 from tests.machine import needs_fifo, needs_lab
+from tests.network_lab import Lab
 from tests.processes import BOUND_S, RACK
 from tests.snapshots import Snapshots
 

@@ -117,11 +117,6 @@ COMMANDS = (
         "rack.tools.commands.reproduce:reproduce",
         "Reproduce the paper, claim by claim, as one page.",
     ),
-    (
-        "claims",
-        "rack.tools.commands.claims:claims",
-        "List the measured figures of the pages, or measure one anew.",
-    ),
 )
 """Name, module and function or `typer.Typer` in it, and one line of help."""
 GROUPS = {
@@ -129,7 +124,7 @@ GROUPS = {
     "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "export", "report"),
     "Command and disturb": ("command", "set", "prompt", "estop", "inject", "campaign"),
     "Predict": ("check", "analyze", "gantt"),
-    "Compare": ("bench", "reproduce", "claims"),
+    "Compare": ("bench", "reproduce"),
     "Bring up": ("robot",),
     "Reach others": ("lan",),
     "Look up": ("schema",),

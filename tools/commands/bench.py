@@ -122,18 +122,6 @@ def lockstep(
 
 
 @bench.command()
-def recording(config: Config = "nasrem", plot: Plot = None, as_json: Json = False) -> None:
-    """What does recording cost: lateness, misses, processor time?
-
-    One rack runs without a recorder, with one, and with a live viewer, by turns; ratios are to
-    without.
-    """
-    from rack.tools.lab.benches.recording import measure
-
-    show(lambda progress: measure(config, progress), plot, as_json)
-
-
-@bench.command()
 def switch(as_json: Json = False) -> None:
     """What does a context switch cost, t_cs of eqs 3.8 and 3.9?
 
@@ -222,8 +210,8 @@ def clock(
     """How late does a board start its cycle on this machine?
 
     Lateness is the time from grid point to start. An empty board waits in each of the ways that a
-    config permits. By turns with it, on the same core at the same rate and priority: `cyclictest`,
-    a bare loop of clock_nanosleep in Python, and a thread of LinuxCNC. Ratios are to `cyclictest`.
+    config permits. By turns with it, on the same core at the same rate and priority: `cyclictest`
+    and a bare loop of clock_nanosleep in Python. Ratios are to `cyclictest`.
     A board that sleeps and `cyclictest` also run with idle cores held awake, as root; all others
     let them sleep. The last line says which `clock.idle_cores` suits this machine: with fewer
     wake-ups late by a period, beyond chance, or else with the better worst one. Let nothing else
@@ -386,61 +374,3 @@ def systems(
     )
     if not found.worked:
         raise typer.Exit(1)
-
-
-@bench.command()
-def hand(
-    rounds: Rounds = 1,
-    share: Share = False,
-    plot: Plot = None,
-    as_json: Json = False,
-) -> None:
-    """Buffers by tables, or messages by interrupts, for a hand?
-
-    The racks hic and condor grasp a can, keep it while it is pulled, and release it, by turns. In
-    real time, then in lockstep, where everything is exact: what the workstation of condor sent in
-    real time enters again.
-
-    The output shows how far the pulls move the can, the processor time of messages, cycles missed
-    or skipped; and of every link, under the type of its messages: the jitter of arrival, the age of
-    messages when they are read, and how many were lost. Exit status 1 if a rack did not do its
-    task.
-    """
-    from rack.tools.lab.benches.hand import measure
-
-    found = show(lambda progress: measure(rounds, share, progress), plot, as_json)
-    if not found.worked:
-        raise typer.Exit(1)
-
-
-@bench.command()
-def lan(
-    racks: Annotated[
-        list[int] | None, typer.Option(metavar="N", min=1, max=64, help="racks; several times")
-    ] = None,
-    rate: Rates = None,
-    seconds: Seconds = 3.0,
-    rounds: Rounds = 1,
-    loss: Annotated[
-        float, typer.Option(metavar="SHARE", min=0, max=0.2, help="share of packets lost")
-    ] = 0.0,
-    plot: Plot = None,
-    as_json: Json = False,
-) -> None:
-    """What does exchange over a network cost?
-
-    A coordinator exchanges with 1 to 32 racks at 1, 10 and 50 Hz, each on a machine of its own: a
-    network namespace (root only). By turns with a rack's network link, with TLS and without: bare
-    UDP, and the DDS `cyclonedds`.
-
-    The output shows round trips, ages of messages when a cycle takes them, bytes a second on the
-    coordinator's cable, processor time, and the time to see a cable pulled, plugged in, or a
-    process killed; also messages that never came, and false deaths. All machines share the cores of
-    this one: with many racks these are the limit, not the network.
-    """
-    from rack.tools.lab.benches.lan import COUNTS, RATES_HZ, LanRuns, measure
-
-    runs = LanRuns(
-        sorted(set(racks or COUNTS)), sorted(set(rate or RATES_HZ)), seconds, rounds, loss
-    )
-    show(lambda progress: measure(runs, progress), plot, as_json)

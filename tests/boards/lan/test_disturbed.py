@@ -20,10 +20,10 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.levels.peer import Presence
-from rack.tools.lab.benches.network import LINK, NET, Lab
 from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.racks import RackProcess, rack_text
 from tests.machine import needs_fifo, needs_lab
+from tests.network_lab import LINK, NET, Lab
 from tests.processes import BOUND_S, wait_until
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough, needs_lab, needs_fifo]

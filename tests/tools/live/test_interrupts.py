@@ -10,7 +10,6 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.lab.benches.exchange_times import ExchangeTimes, exchange_times
 from rack.tools.live.interrupts import Inboxes, replayed
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.recording.recording import Recording
@@ -31,11 +30,6 @@ def recorded(folder: Path, name: str, *settings: str) -> Recording:
         found = Written.on(rack.segment)
     traces = {task: rows.tolist() for task, rows in found.cycles.items()}
     return write_recording(folder / "run", config, traces, messages=found.messages)
-
-
-def times(recording: Recording) -> dict[str, ExchangeTimes]:
-    """Return the times of what the hub reads, by writer."""
-    return {one.writer: one for one in exchange_times(recording) if one.reader == "hub"}
 
 
 @pytest.mark.slow
@@ -81,71 +75,3 @@ def test_the_report_holds_losses_and_latencies(tmp_path: Path, rack_name: str) -
         f"Interrupts of hub: {3 * TICKS} messages served, at most 2 waiting, room for 2,"
         f" {2 * TICKS} lost" in text
     )
-
-
-@pytest.mark.slow
-def test_interrupts_come_at_even_times_and_a_tick_old(tmp_path: Path, rack_name: str) -> None:
-    found = times(recorded(tmp_path, rack_name, SMALL))
-    assert {name: one.lost for name, one in found.items()} == {
-        "figure0": TICKS,
-        "figure1": TICKS,
-        **{f"figure{at}": 0 for at in range(2, BOARDS)},
-    }
-    for one in found.values():
-        assert (one.mailbox, one.protocol, one.sent, one.overtaken) == (
-            f"{one.writer}.status",
-            "interrupt",
-            TICKS,
-            0,
-        )
-    first, last = found["figure4"], found["figure0"]
-    assert first.jitter_ms is not None
-    assert first.age_ms is not None
-    assert (first.jitter_ms["max"], first.age_ms["min"], first.age_ms["max"]) == (0.0, 2.5, 2.5)
-    assert last.jitter_ms is last.age_ms is None
-
-
-@pytest.mark.slow
-def test_an_overloaded_handler_makes_arrivals_uneven_and_old(
-    tmp_path: Path, rack_name: str
-) -> None:
-    found = times(recorded(tmp_path, rack_name, OVERLOADED))
-    jitter = [one.jitter_ms["max"] for one in found.values() if one.jitter_ms is not None]
-    ages = [one.age_ms["p50"] for one in found.values() if one.age_ms is not None]
-    assert max(jitter) > 0.5
-    assert max(ages) > 10.0
-
-
-@pytest.mark.slow
-def test_messages_visible_at_once_are_measured_alike(tmp_path: Path, rack_name: str) -> None:
-    found = times(recorded(tmp_path, rack_name, "protocol.default=double-buffer"))
-    assert len(found) == BOARDS
-    for one in found.values():
-        assert (one.protocol, one.sent, one.lost) == ("double-buffer", TICKS, 0)
-        assert one.jitter_ms is not None
-        assert one.age_ms is not None
-        # In lockstep the hub, which is released first, reads what the tick before has left.
-        assert (one.jitter_ms["max"], one.age_ms["p50"]) == (0.0, 2.5)
-
-
-@pytest.mark.slow
-def test_a_slow_reader_is_overtaken(tmp_path: Path, rack_name: str) -> None:
-    found = times(
-        recorded(tmp_path, rack_name, "board.hub.every=10", "protocol.default=time-slice")
-    )
-    for one in found.values():
-        assert (one.protocol, one.sent, one.lost) == ("time-slice", TICKS, 0)
-        # Of ten messages it sees one.
-        assert one.overtaken == 90 - 1 - 8
-        assert one.jitter_ms is not None
-        assert one.jitter_ms["max"] == 0.0
-
-
-@pytest.mark.slow
-def test_real_time_without_ticks_is_measured_by_the_clock(tmp_path: Path, rack_name: str) -> None:
-    modes = ("clock.mode=realtime", "protocol.default=double-buffer")
-    for one in times(recorded(tmp_path, rack_name, *modes)).values():
-        assert one.jitter_ms is not None
-        assert one.jitter_ms["max"] > 0.0
-        assert one.age_ms is not None
-        assert one.age_ms["max"] >= 0.0

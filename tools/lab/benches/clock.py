@@ -32,7 +32,6 @@ from rack.tools.lab.benches.cyclictest import (
     permits_fifo,
 )
 from rack.tools.lab.benches.harness import Absent, Comparison, Sample, interleaved, shown
-from rack.tools.lab.benches.linuxcnc import LINUXCNC, absent_linuxcnc, linuxcnc
 from rack.tools.lab.benches.observed import SETTLE_NS, Runs, observe
 from rack.tools.lab.benches.sleeper import sleep_loop
 
@@ -73,8 +72,7 @@ def measure(rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Compar
                 )
         progress.end(cost_s)
     refused = "" if is_fifo else "; SCHED_FIFO is refused, so all run under ordinary scheduling"
-    own_grid = f"; {LINUXCNC}: after its earliest run" if LINUXCNC in contestants else ""
-    title = f"lateness: from grid point to start, on core {core}{own_grid}{refused}"
+    title = f"lateness: from grid point to start, on core {core}{refused}"
     baselines = {f"{rate:g} Hz": CYCLICTEST for rate in rates_hz}
     return Comparison("clock", title, tuple(samples), baselines, tuple(absent), suiting(samples))
 
@@ -141,13 +139,10 @@ def _contestants(share: bool) -> tuple[Contestants, list[Absent]]:
             )
         )
     found[BARE] = sleep_loop
-    for who, missing, peer in (
-        (CYCLICTEST, absent_cyclictest(), cyclictest),
-        (LINUXCNC, absent_linuxcnc(), linuxcnc),
-    ):
-        absent += missing
-        if not missing:
-            found[who] = peer
+    missing = absent_cyclictest()
+    absent += missing
+    if not missing:
+        found[CYCLICTEST] = cyclictest
     found |= {who + AWAKE: found[who] for who in BOTH_WAYS if who in found}
     return found, absent
 

@@ -21,19 +21,6 @@ REFUSED = """\
 import sys
 sys.exit("Unable to change scheduling policy!")
 """
-HALRUN = """\
-import ctypes, os, sys
-for line in sys.stdin:
-    words = line.split()
-    if words[0] == "loadrt" and words[1] == "threads":
-        ctypes.CDLL(None).prctl(15, b"rtapi_app:T#0", 0, 0, 0)
-        period = int(words[3].partition("=")[2])
-    if words[:3] == ["loadusr", "-w", "halsampler"]:
-        early = ["0", "203155", str(period + 7)]
-        others = [str(period), str(period + 5000), str(period - 5000)] * (int(words[4]) // 3)
-        print("\\n".join([*early, *others]))
-"""
-"""A thread whose every third run is 5 us late, behind LinuxCNC's command line."""
 
 
 def program(folder: Path, name: str, text: str) -> Path:

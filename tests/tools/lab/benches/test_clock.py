@@ -17,7 +17,6 @@ from rack.tools.lab.benches import clock
 from rack.tools.lab.benches.clock import AWAKE, BARE, BOTH_WAYS, board, measure, suiting
 from rack.tools.lab.benches.cyclictest import CYCLICTEST, WakeGrid
 from rack.tools.lab.benches.harness import Sample
-from rack.tools.lab.benches.linuxcnc import LINUXCNC
 from rack.tools.lab.benches.observed import Runs
 from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
@@ -31,7 +30,6 @@ def test_boards_and_peers_are_measured_at_one_rate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
-    peers.program(tmp_path, "halrun", peers.HALRUN)
     monkeypatch.setenv("PATH", str(tmp_path))
     found = measure((400,), Runs(0.25, 1, True), Progress())
     assert found.cases == ["400 Hz"]
@@ -43,7 +41,6 @@ def test_boards_and_peers_are_measured_at_one_rate(
     assert {*measured} | named == {
         *(f"board, {wake}" for wake in get_args(Wake)),
         BARE,
-        LINUXCNC,
         *both_ways,
     }
     assert 0 < measured["board, signal"].count <= 100
@@ -60,10 +57,9 @@ def test_peers_that_the_machine_lacks_are_named(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     found = measure((1000,), Runs(0.1, 1, True), Progress())
-    assert {CYCLICTEST, LINUXCNC} <= {one.who for one in found.absent}
+    assert CYCLICTEST in {one.who for one in found.absent}
     lines = list(found.lines())
     assert any("apt-get install rt-tests" in line for line in lines)
-    assert any("apt-get install linuxcnc-uspace" in line for line in lines)
     # Without its baseline a case has no ratios.
     assert all(found.ratio(sample) is None for sample in found.samples)
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches import network
-from rack.tools.lab.benches.network import NAMESPACES, Lab
+from tests import network_lab as network
 from tests.machine import needs_lab
+from tests.network_lab import NAMESPACES, Lab
 from tests.processes import BOUND_S, runs, wait_until
 
 PORT = 5000
@@ -43,7 +43,7 @@ signal.pause()
 """
 ABANDONED = """
 import signal, sys
-from rack.tools.lab.benches.network import Lab
+from tests.network_lab import Lab
 with Lab(2) as lab:
     process = lab.popen(0, ["sleep", "1000"])
     print(process.pid, *lab._names, flush=True)
