@@ -2,6 +2,9 @@
 
 Each lock has its own file description, so two holders in one process exclude each other too. The
 kernel releases it when the process ends, even if it is killed.
+
+Alternative considered: record locks of a process, which a fork does not inherit. The kernel would
+release them as soon as their process closes any other descriptor of the same file.
 """
 
 from __future__ import annotations
@@ -9,7 +12,9 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
+from threading import Thread
 
+_HELD: set[ProcessLock] = set()
 _FLOCK = struct.Struct("hhqqi4x")
 """`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description
 have none)."""
@@ -42,12 +47,51 @@ class ByteLock:
             self._fd = -1
 
 
+class ProcessLock(ByteLock):
+    """A lock that ends with the process that made it. Processes that this one forks lose it."""
+
+    def __init__(self, fd: int, address: int) -> None:
+        super().__init__(fd, address)
+        _HELD.add(self)
+
+    def close(self) -> None:
+        """Release the lock and its descriptor; may be called again."""
+        _HELD.discard(self)
+        super().close()
+
+
+def _close_inherited() -> None:
+    # The parent keeps its lock: it belongs to the file description, which both have open.
+    for lock in [*_HELD]:
+        lock.close()
+
+
+os.register_at_fork(after_in_child=_close_inherited)
+
+
 def is_locked(fd: int, address: int) -> bool:
-    """Say whether the byte at a bus address of an open segment is locked, without taking the
+    """Return whether the byte at a bus address of an open segment is locked, without taking the
     lock."""
-    asked = _one_byte(fcntl.F_WRLCK, address)
+    # A shared lock: those who wait for the end of the exclusive one do not count as its holder.
+    asked = _one_byte(fcntl.F_RDLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK
+
+
+def await_unlocked(fd: int, address: int, timeout_s: float) -> bool:
+    """Wait until no process has locked the byte at a bus address; return False after the timeout.
+
+    Args:
+        fd: Descriptor of the segment, which nobody else uses for a wait.
+        address: Bus address of the byte.
+        timeout_s: Longest wait.
+    """
+    shared = _one_byte(fcntl.F_RDLCK, address)
+    # The kernel's wait has no time-out.
+    waiter = Thread(target=fcntl.fcntl, args=(fd, fcntl.F_OFD_SETLKW, shared), daemon=True)
+    waiter.start()
+    waiter.join(timeout_s)
+    return not waiter.is_alive()
 
 
 def _one_byte(kind: int, address: int) -> bytes:

@@ -21,6 +21,10 @@ class SegmentError(BackplaneError):
     """A segment that cannot be made, attached or removed."""
 
 
+class RackInUseError(SegmentError):
+    """The segment of a rack that is running."""
+
+
 class MailboxError(BackplaneError):
     """A mailbox that cannot be opened, claimed or matched with a message type."""
 

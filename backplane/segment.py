@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Self
 import posix_ipc
 
 from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
-from rack.backplane.byte_lock import is_locked
+from rack.backplane.byte_lock import ProcessLock, await_unlocked, is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.layout import (
     ExchangeSpec,
@@ -29,14 +29,18 @@ from rack.backplane.layout import (
     MailboxSpec,
     TaskSpec,
 )
-from rack.backplane.process import is_alive, start_time
+from rack.backplane.process import is_alive
 from rack.backplane.words import Block, Box, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 15
+VERSION = 16
+LOCKED_SINCE = 16
+"""First version in which the launcher holds a lock."""
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
+_LIFE = 8 * Head.LAUNCHER_PID
+"""Bus address on which the launcher holds a lock for as long as it lives."""
 PROCESSOR = "x86_64"
 """Stores become visible to other cores in program order: mailboxes, rings and control blocks need
 that (see `rack.backplane.mailbox.slots`). On arm64 they would need barriers, which nobody has
@@ -69,6 +73,7 @@ class Segment:
     def __init__(self, rack: str, memory: mmap.mmap, fd: int = -1) -> None:
         self.rack = rack
         self.fd = fd
+        self._life: ProcessLock | None = None
         self.bytes = memoryview(memory)
         self.words = self.bytes.cast("q")
         self.layout: Layout
@@ -89,6 +94,7 @@ class Segment:
         size = pages(places.size + sum(len(t) for t in texts))
         try:
             fd = os.open(SHM_FOLDER, os.O_TMPFILE | os.O_RDWR, 0o600)
+            life = ProcessLock(fd, _LIFE)
         except OSError as error:
             raise SegmentError(f"rack '{layout.rack}': {SHM_FOLDER}: {error.strerror}") from None
         try:
@@ -99,9 +105,13 @@ class Segment:
             segment.config = config
             segment.map = places
             segment._fill_head(texts)
+            segment._life = life
+            # Before it has a name: nobody ever finds the segment of a live rack without this lock.
+            life.take()
             segment._take_name()
         except OSError as error:
             os.close(fd)
+            life.close()
             if isinstance(error, FileExistsError):
                 why = (
                     "already has a segment: it is running, or was killed; see 'rack list', 'rack"
@@ -139,7 +149,7 @@ class Segment:
         self.words[Head.VERSION] = VERSION
         self.words[Head.SIZE] = len(self.bytes)
         self.words[Head.LAUNCHER_PID] = os.getpid()
-        self.words[Head.LAUNCHER_START] = start_time(os.getpid())
+        self.words[Head.LAUNCHER_NAMESPACE] = _pid_namespace()
         self.words[Head.CREATED_NS] = time.time_ns()
         self.words[Head.CREATED_MONOTONIC_NS] = time.monotonic_ns()
         # Last, so that no process attaches to half a segment.
@@ -246,16 +256,31 @@ class Segment:
 
     @property
     def launcher(self) -> int:
-        """Process id of the program that made the segment."""
-        return self.words[Head.LAUNCHER_PID]
+        """Process id of the program that made the segment; 0 if that has another PID namespace than
+        this process, as in another container: there the number means another process."""
+        words = self.words
+        is_here = words[Head.LAUNCHER_NAMESPACE] == _pid_namespace()
+        return words[Head.LAUNCHER_PID] if is_here else 0
+
+    @property
+    def launcher_text(self) -> str:
+        """The launcher for messages, as in "process 12"."""
+        return f"process {self.launcher}" if self.launcher else "a process of another PID namespace"
 
     @property
     def launcher_is_alive(self) -> bool:
         """Whether the process that made the segment, of any version, still runs."""
         words = self.words
-        return words[Head.MAGIC] == MAGIC and is_alive(
-            words[Head.LAUNCHER_PID], words[Head.LAUNCHER_START]
-        )
+        if words[Head.VERSION] < LOCKED_SINCE:
+            # In earlier versions that word is the start time of the process.
+            return words[Head.MAGIC] == MAGIC and is_alive(
+                words[Head.LAUNCHER_PID], words[Head.LAUNCHER_NAMESPACE]
+            )
+        return is_locked(self.fd, _LIFE)
+
+    def await_launcher(self, timeout_s: float) -> bool:
+        """Wait until the launcher has ended or closed the rack; return False after the timeout."""
+        return await_unlocked(self.fd, _LIFE, timeout_s)
 
     @property
     def run_is_over(self) -> bool:
@@ -272,8 +297,15 @@ class Segment:
             return False
         return os.path.samestat(named, os.fstat(self.fd))
 
+    def release(self) -> None:
+        """Release the launcher's lock: the rack then counts as dead."""
+        if self._life is not None:
+            self._life.close()
+
     def close(self) -> None:
-        """Close the file descriptor; the mapping lasts as long as views of it."""
+        """Close the file descriptor; the mapping lasts as long as views of it. A launcher counts as
+        ended then."""
+        self.release()
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
@@ -323,6 +355,10 @@ def no_room(rack: str, needed: str, error: OSError) -> SegmentError:
 def shm_path(rack: str) -> Path:
     """Return the path of a rack's segment."""
     return SHM_FOLDER / f"{PREFIX}{rack}"
+
+
+def _pid_namespace() -> int:
+    return Path("/proc/self/ns/pid").stat().st_ino
 
 
 def _shm_name(rack: str) -> str:

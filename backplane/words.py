@@ -30,8 +30,8 @@ class Head(IntEnum):
     MAGIC = 0
     VERSION = 1
     SIZE = 2
-    LAUNCHER_PID = 3
-    LAUNCHER_START = 4  # start time of that process, in kernel clock ticks since boot
+    LAUNCHER_PID = 3  # the launcher holds the kernel's lock on this word
+    LAUNCHER_NAMESPACE = 4  # inode of the PID namespace in which it has that process id
     CREATED_NS = 5  # CLOCK_REALTIME
     LAYOUT_AT = 6
     LAYOUT_SIZE = 7

@@ -22,10 +22,9 @@ from typing import Protocol
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.released_task import ReleasedTask, Watchdog, by_priority
 from rack.backplane.clock.wake import CHECK_S
-from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
-from rack.backplane.words import Block, Head, Run, System
+from rack.backplane.words import Block, Run, System
 
 # Plain integers for the hot path.
 _TICK, _TICK_NS, _STOP_TICK, _STOP_REQUEST = (
@@ -82,7 +81,7 @@ class ClockDriver(ABC):
         self.alarms = alarms or AlarmWriter(segment, CLOCK)
         self.watchdog = Watchdog(self.alarms, self.words[System.PERIOD_NS])
         self._ended = ended
-        self._launcher = self.words[Head.LAUNCHER_PID], self.words[Head.LAUNCHER_START]
+        self._segment = segment
 
     def task(self, name: str) -> ReleasedTask:
         """Return the task of that name. Raises `KeyError`."""
@@ -171,7 +170,7 @@ class ClockDriver(ABC):
     @property
     def launcher_is_alive(self) -> bool:
         """Whether the launcher still lives."""
-        return is_alive(*self._launcher)
+        return self._segment.launcher_is_alive
 
     def end(self) -> None:
         """End the run, and wake every task so that it sees that."""

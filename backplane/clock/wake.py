@@ -22,11 +22,11 @@ from collections.abc import Callable
 from time import monotonic_ns, sleep
 
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.process import GONE, STOPPED, WAITING, is_alive, state_of
+from rack.backplane.process import GONE, STOPPED, WAITING, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
-from rack.backplane.words import Block, Head, Run, System
+from rack.backplane.words import Block, Run, System
 
 # Plain integers for the hot path.
 _RELEASED = int(Block.RELEASED)
@@ -62,7 +62,7 @@ class NextCycle:
         self._words = segment.words
         self._block = segment.block(task)
         self._semaphore = wake_semaphore(segment.rack, task)
-        self._launcher = segment.words[Head.LAUNCHER_PID], segment.words[Head.LAUNCHER_START]
+        self._segment = segment
         is_lockstep = bool(segment.words[System.LOCKSTEP])
         self._sleeps = spec.wake == "timer" and not is_lockstep
         self._is_posted = not self._sleeps and spec.wake != "poll"
@@ -176,13 +176,13 @@ class NextCycle:
             if block[_RELEASED] >= due:
                 return True
         os.sched_yield()
-        return is_alive(*self._launcher)
+        return self._segment.launcher_is_alive
 
     def _look_around(self) -> bool:
         """Check the clock, after a wait without a release; return False if the launcher is gone."""
         if self._silent_clock is not None and self._has_begun:
             self._silent_clock.check()
-        return is_alive(*self._launcher)
+        return self._segment.launcher_is_alive
 
     @property
     def _has_begun(self) -> bool:

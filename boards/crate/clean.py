@@ -9,7 +9,7 @@ from contextlib import suppress
 from rack.backplane import semaphores
 from rack.backplane.address_map import HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
-from rack.backplane.errors import SegmentError
+from rack.backplane.errors import RackInUseError, SegmentError
 from rack.backplane.segment import Segment, racks, shm_path, stranger, unlink
 from rack.backplane.words import Head
 
@@ -17,7 +17,8 @@ from rack.backplane.words import Head
 def remove_dead(rack: str) -> bool:
     """Remove the segment of a rack that is not running; return whether there was one.
 
-    Raises `SegmentError` if its launcher is alive, or the segment is another user's or not a file.
+    Raises `RackInUseError` if its launcher is alive, and `SegmentError` if the segment is another
+    user's or not a file.
     """
     if rack not in racks():
         return False
@@ -49,8 +50,8 @@ def _is_too_small(rack: str) -> bool:
 def _remove(segment: Segment) -> bool:
     rack = segment.rack
     if segment.launcher_is_alive:
-        raise SegmentError(
-            f"rack '{rack}' is already running, launched by process {segment.launcher}; stop it, or"
+        raise RackInUseError(
+            f"rack '{rack}' is already running, launched by {segment.launcher_text}; stop it, or"
             " choose another name"
         )
     removal = ByteLock(segment.fd, 8 * Head.MAGIC)
@@ -90,6 +91,8 @@ def clean() -> tuple[list[str], list[str], list[str]]:
         try:
             if remove_dead(rack):
                 removed.append(rack)
+        except RackInUseError:
+            in_use.append(rack)
         except SegmentError as error:
-            strange.append(str(error)) if stranger(rack) is not None else in_use.append(rack)
+            strange.append(str(error))
     return removed, in_use, strange

@@ -24,17 +24,17 @@ from rack.boards.config.schema import RackConfig
 
 @dataclass(frozen=True)
 class Holder:
-    """A rack that occupies a core, and its tasks there. Of another user's `launcher` is one of the
-    boards."""
+    """A rack that occupies a core, and its tasks there. Of another user's rack, `process` is one of
+    the boards, otherwise the launcher."""
 
     rack: str
-    launcher: int
+    process: str
     tasks: tuple[str, ...]
 
     def __str__(self) -> str:
         """Return the holder as text."""
         return (
-            f"rack '{self.rack}' (process {self.launcher}) runs {', '.join(self.tasks)} on it at"
+            f"rack '{self.rack}' ({self.process}) runs {', '.join(self.tasks)} on it at"
             " real-time priority"
         )
 
@@ -53,7 +53,7 @@ def holders(own: str) -> dict[int, Holder]:
             continue
         if segment.launcher_is_alive and not segment.words[System.LOCKSTEP]:
             for core, tasks in _held(segment).items():
-                found.setdefault(core, Holder(name, segment.launcher, tuple(tasks)))
+                found.setdefault(core, Holder(name, segment.launcher_text, tuple(tasks)))
         segment.close()
     return found
 
@@ -69,7 +69,9 @@ def _seen(rack: str) -> dict[int, Holder]:
             if name.startswith(f"{rack}:"[:15]) and policy in (os.SCHED_FIFO, SCHED_DEADLINE):
                 for core in os.sched_getaffinity(pid):
                     others = held[core].tasks if core in held else ()
-                    held[core] = Holder(rack, pid, (*others, name.removeprefix(f"{rack}:")))
+                    held[core] = Holder(
+                        rack, f"process {pid}", (*others, name.removeprefix(f"{rack}:"))
+                    )
     return held
 
 

@@ -51,7 +51,8 @@ class HostBus:
             self.close()
             raise
         self._semaphore = wake_semaphore(segment.rack, wiring.board)
-        self.block[Block.PID] = os.getpid()
+        # Faults signal this process. From another PID namespace they would strike another one.
+        self.block[Block.PID] = os.getpid() if segment.launcher else 0
         self.block[Block.WAITS_UNTIL] = 0
         self.block[Block.STATE] = TaskState.RUNNING
 
@@ -194,8 +195,9 @@ def _claim(segment: Segment, board: str) -> ByteLock:
     claim = ByteLock(segment.fd, segment.map.blocks[board] + WORD * Block.PID)
     if not claim.take():
         claim.close()
-        pid = segment.block(board)[Block.PID]
-        raise MailboxError(f"host board '{board}' is run by process {pid} already; permitted: one")
+        pid = segment.launcher and segment.block(board)[Block.PID]
+        where = f" (process {pid})" if pid else " in another PID namespace"
+        raise MailboxError(f"host board '{board}' is already running{where}")
     return claim
 
 

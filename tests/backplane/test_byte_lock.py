@@ -11,7 +11,7 @@ from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, descriptors, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
-ADDRESS = 24
+ADDRESS = 400
 
 
 def test_two_holders_in_one_process_exclude_each_other(make_bus: MakeBus) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import resource
+import signal
 import stat
 import time
 from collections.abc import Callable
@@ -18,7 +19,17 @@ from rack.backplane.segment import VERSION, Segment, racks, shm_path, unlink
 from rack.backplane.words import Block, Head, System
 from tests.backplane.bus import layout, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, descriptors, exit_status, fork, forked, kill
+from tests.processes import (
+    BOUND_S,
+    FORKS,
+    descriptors,
+    exit_status,
+    fork,
+    forked,
+    in_thread,
+    kill,
+    runs,
+)
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 STRANGER, ANOTHER = 65_533, 65_532
@@ -230,10 +241,49 @@ def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str
     assert complete
 
 
-def test_a_launcher_is_distinguished_from_a_later_process_with_its_pid(make_bus: MakeBus) -> None:
+def test_a_launcher_lives_until_it_gives_its_lock_back(make_bus: MakeBus) -> None:
     segment = make_bus()
-    segment.words[Head.LAUNCHER_START] += 1
-    assert not segment.launcher_is_alive
+    # Record locks of a process would be gone by now.
+    Segment.attach(segment.rack).close()
+    other = Segment.attach(segment.rack)
+    assert (segment.launcher_is_alive, other.launcher_is_alive) == (True, True)
+    assert not other.await_launcher(0.01)
+    with in_thread(lambda: other.await_launcher(BOUND_S)):
+        segment.release()
+    assert (segment.launcher_is_alive, other.launcher_is_alive) == (False, False)
+    other.close()
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_a_killed_launcher_is_dead_though_a_process_that_it_forked_lives_on(rack_name: str) -> None:
+    reading, writing = os.pipe()
+
+    def launch() -> None:
+        segment = Segment.create(layout(rack_name), "")
+        os.write(writing, b"%d\n" % fork(signal.pause))
+        assert segment.launcher_is_alive
+        signal.pause()
+
+    with forked(launch) as launcher:
+        orphan = int(os.read(reading, 20))
+        found = Segment.attach(rack_name)
+        assert found.launcher_is_alive
+        os.kill(launcher, signal.SIGKILL)
+        try:
+            assert found.await_launcher(BOUND_S)
+            assert runs(orphan)
+            assert not found.launcher_is_alive
+        finally:
+            os.kill(orphan, signal.SIGKILL)
+            unlink(rack_name)
+            found.close()
+
+
+def test_a_launcher_of_another_pid_namespace_has_no_process_id_here(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    assert segment.launcher_text == f"process {os.getpid()}"
+    segment.words[Head.LAUNCHER_NAMESPACE] += 1
+    assert (segment.launcher, segment.launcher_is_alive) == (0, True)
 
 
 def test_a_segment_knows_when_its_name_means_another(make_bus: MakeBus) -> None:

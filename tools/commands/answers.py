@@ -26,8 +26,9 @@ def list_racks(as_json: bool) -> None:
         print_answer(found, "no racks", as_json)
 
 
-def describe(name: str) -> dict[str, str | int | float]:
-    """Return the name, as "rack", the state and details of a rack; its age is in seconds."""
+def describe(name: str) -> dict[str, str | int | float | None]:
+    """Return the name, as "rack", the state and details of a rack; its age is in seconds. The
+    launcher's process id is None in another PID namespace."""
     from rack.backplane.errors import SegmentError
     from rack.backplane.segment import Segment
     from rack.backplane.words import Head, Run, System
@@ -38,15 +39,15 @@ def describe(name: str) -> dict[str, str | int | float]:
         return {"rack": name, "state": "foreign", "detail": str(error)}
     words = segment.words
     age_s = time.time() - words[Head.CREATED_NS] * 1e-9
-    launcher = words[Head.LAUNCHER_PID]
     alive = segment.launcher_is_alive
     state = Run(words[System.STATE]).name.lower() if alive else "dead"
     gone = "its launcher is gone: 'rack clean' removes it"
-    by = f"launched {age_s:.0f} s ago by process {launcher}" if alive else gone
+    by = f"launched {age_s:.0f} s ago by {segment.launcher_text}" if alive else gone
     boards = len({task.board for task in segment.layout.tasks})
     hosts = len(segment.layout.hosts)
     side = f" and {hosts} on the host side" if hosts else ""
     detail = f"{boards} boards{side}, tick {words[System.TICK]}, {by}"
+    launcher = segment.launcher or None
     segment.close()
     return {
         "rack": name,
@@ -60,7 +61,6 @@ def describe(name: str) -> dict[str, str | int | float]:
 def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly
     one."""
-    from rack.backplane.words import System
     from rack.tools.live.snapshot import RackMonitor
     from rack.tools.live.watched import watched
     from rack.tools.recording.recorder_process import recorded_by, size_of, size_text
@@ -68,8 +68,7 @@ def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> 
     with watched(rack or only_rack(), asker) as one:
         segment = one.segment
         found = RackMonitor(segment).look()
-        # A process of another machine has a number of this one.
-        run = None if segment.is_mirror else recorded_by(segment.words[System.FOLLOWER_PID])
+        run = recorded_by(segment)
     size = 0 if run is None else size_of(run)
     if as_json:
         recording = None if run is None else {"folder": str(run), "bytes": size}

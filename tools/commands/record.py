@@ -127,7 +127,7 @@ def _saved(rack: WatchedRack, folder: Path) -> tuple[Document, str]:
     name = segment.layout.rack
     if segment.is_mirror:
         raise Failure(f"--save {name}: the rack is on another machine; save it there", 2)
-    run = recorded_by(segment.words[System.FOLLOWER_PID])
+    run = recorded_by(segment)
     if run is None:
         raise Failure(f"--save {name}: nothing records it; 'rack record {name}' begins to")
     with INTERRUPT.raising():

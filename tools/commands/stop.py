@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack, closing, suppress
 from typing import Annotated
 
 import typer
 
-from rack.backplane.process import is_alive, readable
+from rack.backplane.process import readable
 from rack.backplane.segment import Segment
-from rack.backplane.words import Head, System
+from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 
@@ -39,23 +40,19 @@ def stop(rack: RackName, wait: Wait = 10.0, as_json: Json = False) -> None:
 
 def stop_rack(rack: str, timeout_s: float) -> bool:
     """Request a rack's end and wait for its launcher to end; return False if it still runs after
-    `timeout_s`.
+    `timeout_s`. In another PID namespace, wait until the launcher has closed the rack.
 
     Raises `SegmentError` when there is no such rack.
     """
-    segment = Segment.attach(rack)
-    pid = segment.words[Head.LAUNCHER_PID]
-    started = segment.words[Head.LAUNCHER_START]
-    segment.words[System.STOP_REQUEST] = 1
-    segment.close()
-    if not is_alive(pid, started):
-        return True
-    try:
-        launcher = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return True
-    try:
-        # Another process may have taken the pid between the two calls.
-        return not is_alive(pid, started) or readable(launcher, timeout_s)
-    finally:
-        os.close(launcher)
+    with ExitStack() as stack:
+        segment = stack.enter_context(closing(Segment.attach(rack)))
+        launcher = -1
+        with suppress(ProcessLookupError):
+            if segment.launcher:
+                launcher = os.pidfd_open(segment.launcher)
+                stack.callback(os.close, launcher)
+        # In this order: a later process may have the number of a dead launcher, and one that has
+        # closed the rack still writes the report.
+        is_own = launcher >= 0 and segment.launcher_is_alive
+        segment.words[System.STOP_REQUEST] = 1
+        return readable(launcher, timeout_s) if is_own else segment.await_launcher(timeout_s)

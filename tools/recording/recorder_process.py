@@ -13,6 +13,7 @@ from math import inf
 from pathlib import Path
 
 from rack.backplane.process import STOPPED, processor_ns, readable, state_of
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 
@@ -216,8 +217,12 @@ class RecorderProcess:
         return bool(block)
 
 
-def recorded_by(pid: int) -> Path | None:
-    """Return the folder into which a process records; None if it does not."""
+def recorded_by(segment: Segment) -> Path | None:
+    """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
+    seen from this PID namespace or machine."""
+    if segment.is_mirror or not segment.launcher:
+        return None
+    pid = segment.words[System.FOLLOWER_PID]
     with suppress(OSError):
         for file in Path(f"/proc/{pid}/fd").iterdir():
             # Descriptors come and go.

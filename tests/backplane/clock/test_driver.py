@@ -16,7 +16,7 @@ from rack.backplane.clock.released_task import by_priority
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.watch.alarms import Alarm, alarm_ring
-from rack.backplane.words import Block, Head, Run, System
+from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import layout, task
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, in_thread
@@ -260,7 +260,7 @@ def test_nothing_is_released_to_a_planner_within_its_time_slice(make_bus: MakeBu
 def test_a_clock_without_a_launcher_ends(make_bus: MakeBus, driver: str) -> None:
     segment = make_bus()
     start(segment)
-    segment.words[Head.LAUNCHER_START] += 1
+    segment.release()
     never: Ended = lambda tick: None  # noqa: E731
     clock: ClockDriver = RealtimeDriver(segment, never)
     if driver == "lockstep":

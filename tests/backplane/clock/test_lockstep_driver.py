@@ -252,7 +252,7 @@ def test_a_wait_without_a_report_looks_around(make_bus: MakeBus) -> None:
     assert not driver._look_around(level)
     segment.words[System.STOP_REQUEST] = 0
     assert driver._look_around(level)
-    driver._launcher = driver._launcher[0], driver._launcher[1] + 1
+    segment.release()
     assert not driver._look_around(level)
 
 
@@ -297,7 +297,7 @@ def test_the_host_holds_the_clock_before_a_tick_and_lets_it_go(make_bus: MakeBus
     words[System.STOP_REQUEST] = 1
     assert driver._wait_for_step(7)
     words[System.STOP_REQUEST] = 0
-    driver._launcher = driver._launcher[0], driver._launcher[1] + 1
+    segment.release()
     assert not driver._wait_for_step(7)
 
 

@@ -19,7 +19,7 @@ from rack.backplane.process import processor_ns, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.words import Block, Head, Run, System
+from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
@@ -165,7 +165,7 @@ def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment) -> None:
 @pytest.mark.slow
 @WAKES
 def test_the_launchers_end_ends_a_wait(bus: Segment) -> None:
-    bus.words[Head.LAUNCHER_START] += 1
+    bus.release()
     assert NextCycle(bus, "level").wait() is None
 
 

@@ -12,9 +12,18 @@ import pytest
 
 from rack.backplane import semaphores
 from rack.backplane.byte_lock import ByteLock
-from rack.backplane.errors import SegmentError
+from rack.backplane.errors import RackInUseError, SegmentError
 from rack.backplane.layout import Layout
-from rack.backplane.segment import SHM_FOLDER, VERSION, Segment, racks, shm_path, unlink
+from rack.backplane.process import start_time
+from rack.backplane.segment import (
+    LOCKED_SINCE,
+    SHM_FOLDER,
+    VERSION,
+    Segment,
+    racks,
+    shm_path,
+    unlink,
+)
 from rack.backplane.words import Head, System
 from rack.boards.crate.clean import clean, remove_dead, remove_own
 from tests.backplane.bus import layout, mailbox
@@ -74,8 +83,20 @@ def test_a_live_rack_of_another_version_is_refused_too(spec: Layout) -> None:
     segment.words[Head.VERSION] = VERSION + 1
     with pytest.raises(SegmentError, match="is already running"):
         remove_dead(spec.rack)
-    segment.words[Head.LAUNCHER_START] += 1
+    segment.release()
     assert remove_dead(spec.rack)
+    segment.close()
+
+
+@pytest.mark.parametrize(("later", "is_removed"), [(0, False), (1, True)])
+def test_a_rack_of_a_version_without_a_lock_is_judged_by_its_process(
+    spec: Layout, later: int, is_removed: bool
+) -> None:
+    segment = Segment.create(spec, "")
+    segment.release()
+    segment.words[Head.VERSION] = LOCKED_SINCE - 1
+    segment.words[Head.LAUNCHER_NAMESPACE] = start_time(os.getpid()) + later
+    assert (spec.rack in clean()[0]) == is_removed
     segment.close()
 
 
@@ -102,7 +123,9 @@ def test_another_users_rack_is_left_alone(spec: Layout) -> None:
         os.setuid(STRANGER)
         with pytest.raises(SegmentError, match="belongs to another user"):
             remove_dead(spec.rack)
-        assert spec.rack in clean()[1]
+        removed, in_use, strange = clean()
+        assert spec.rack not in removed + in_use
+        assert any(line.startswith(f"rack '{spec.rack}' belongs to another") for line in strange)
 
     assert exit_status(fork(remove)) == 0
     assert spec.rack in racks()
@@ -253,6 +276,17 @@ def test_a_foreign_entry_is_named_and_left_alone(rack_name: str, tmp_path: Path,
         assert target.read_bytes() == bytes(8192)
     finally:
         place.rmdir() if kind == "directory" else place.unlink()
+
+
+def test_a_rack_of_another_pid_namespace_is_not_taken_for_the_own_one(spec: Layout) -> None:
+    # Every container has a process 1.
+    segment = Segment.create(spec, "")
+    segment.words[Head.LAUNCHER_NAMESPACE] += 1
+    remove_own(spec.rack, killed=[os.getpid()])
+    assert segment.has_its_name
+    with pytest.raises(RackInUseError, match="launched by a process of another PID namespace"):
+        remove_dead(spec.rack)
+    segment.close()
 
 
 def test_only_the_own_racks_of_a_process_are_removed_by_it(spec: Layout, rack_name: str) -> None:

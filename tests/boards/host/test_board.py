@@ -309,7 +309,7 @@ def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConf
         (wiring,) = resolve(found).hosts
         first = HostBus(rack.segment, wiring)
         with pytest.raises(
-            MailboxError, match=f"'program' is run by process {os.getpid()} already; permitted: one"
+            MailboxError, match=rf"'program' is already running \(process {os.getpid()}\)"
         ):
             HostBus(rack.segment, wiring)
         assert first.send("numbers", value=2.0)

@@ -8,7 +8,7 @@ import pytest
 
 from rack.backplane.errors import MailboxError
 from rack.backplane.semaphores import done_semaphore, wake_semaphore
-from rack.backplane.words import Block, System, TaskState
+from rack.backplane.words import Block, Head, System, TaskState
 from rack.boards.host.bus import WORD, HostBus
 from tests.boards.host.test_bus_adapter import (  # noqa: F401  fixtures
     MakeSite,
@@ -26,10 +26,22 @@ def test_an_open_bus_has_claimed_its_board(make_site: MakeSite, open_bus: OpenBu
     site.host[Block.WAITS_UNTIL] = 9
     bus = open_bus(site)
     assert (site.host[Block.STATE], site.host[Block.WAITS_UNTIL]) == (TaskState.RUNNING, 0)
-    with pytest.raises(MailboxError, match="host board 'program' is run by process"):
+    with pytest.raises(MailboxError, match="host board 'program' is already running"):
         HostBus(site.segment, site.plan.hosts[0])
     bus.close()
     HostBus(site.segment, site.plan.hosts[0]).close()
+
+
+def test_no_fault_can_signal_a_program_of_another_pid_namespace(
+    make_site: MakeSite,  # noqa: F811
+    open_bus: OpenBus,  # noqa: F811
+) -> None:
+    site = make_site()
+    site.segment.words[Head.LAUNCHER_NAMESPACE] += 1
+    open_bus(site)
+    assert site.host[Block.PID] == 0
+    with pytest.raises(MailboxError, match="already running in another PID namespace"):
+        HostBus(site.segment, site.plan.hosts[0])
 
 
 def test_a_message_without_an_id_has_its_number(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811

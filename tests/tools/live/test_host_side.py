@@ -160,8 +160,7 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
             second = rack("prompt", rack_name)
             assert second.returncode == 1
             assert (
-                second.stderr
-                == f"host board 'program' is run by process {first.pid} already; permitted: one\n"
+                second.stderr == f"host board 'program' is already running (process {first.pid})\n"
             )
             status = rack("status", rack_name).stdout
             assert f"program  {first.pid}  running     1         0" in status

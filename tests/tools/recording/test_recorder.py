@@ -3,6 +3,7 @@ written."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,16 @@ import pytest
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Field, MessageType
+from rack.backplane.words import Head, System
+from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.parquet import columns_of
+from rack.tools.recording.recorder.recorder import Recorder
+from rack.tools.recording.recorder_process import recorded_by
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.report import report_of
 from tests.shared_runs import SMALL_S, small_run
@@ -81,6 +86,24 @@ def test_recording_changes_nothing_in_a_run(
 ) -> None:
     unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, Display())
     assert unrecorded.outcome.digest == report_of(recording)["digest"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_same_namespace", [True, False])
+def test_lockstep_waits_for_no_recorder_of_another_pid_namespace(
+    small: Path, rack_name: str, tmp_path: Path, is_same_namespace: bool
+) -> None:
+    with Rack(load(small, [f"name={rack_name}"])) as rack:
+        words = rack.segment.words
+        namespace = words[Head.LAUNCHER_NAMESPACE]
+        words[Head.LAUNCHER_NAMESPACE] += not is_same_namespace
+        try:
+            with Recorder(rack.segment, tmp_path):
+                assert words[System.FOLLOWER_PID] == (os.getpid() if is_same_namespace else 0)
+                found = recorded_by(rack.segment)
+                assert found == (tmp_path if is_same_namespace else None)
+        finally:
+            words[Head.LAUNCHER_NAMESPACE] = namespace
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:

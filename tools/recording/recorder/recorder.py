@@ -201,8 +201,10 @@ class Recorder:
         self._cores = None if self._words[System.LOCKSTEP] or refresh is not None else CoreMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
-        is_awaited = follower == os.getpid()
-        self._is_follower = is_awaited or not is_alive(follower)
+        # The clock cannot see a process of another PID namespace, so it does not wait for it.
+        is_visible = bool(segment.launcher)
+        is_awaited = is_visible and follower == os.getpid()
+        self._is_follower = is_awaited or (is_visible and not is_alive(follower))
         # All rows up to here are in the spool's file. The launcher's recorder still has to read
         # those after, even if the one before it died with no row in the file; another one begins
         # now.
