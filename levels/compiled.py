@@ -13,6 +13,7 @@ it calls.
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import shutil
@@ -79,8 +80,10 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
 
 def _jit(marked: compiled[..., Any]) -> Any:
     """Compile a function; those that it calls, if marked, are replaced by their compiled selves."""
-    from numba import njit
+    from numba import config, njit
 
+    # NUMBA_DISABLE_JIT is for a user's own functions: these call the C library's by address.
+    config.DISABLE_JIT = 0
     function: Any = marked._function
     known = function.__globals__
     called = {
@@ -115,15 +118,17 @@ class _Kept:
         from numba.core.compiler import CompileResult
 
         target.refresh()
-        path = self._path(types, target.codegen())
-        if path.exists():
-            content = path.read_bytes() if path.is_file() else b""
-            code = content[DIGEST:]
-            # Damaged machine code must never run.
-            if content[:DIGEST] == _digest(code):
-                return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
-            _say(f"{path}: damaged; compiled again")
-            _remove(path)
+        # Without a home, or permission to read there, nothing is kept.
+        with suppress(OSError):
+            path = self._path(types, target.codegen())
+            if path.exists():
+                content = path.read_bytes() if path.is_file() else b""
+                code = content[DIGEST:]
+                # Damaged machine code must never run.
+                if content[:DIGEST] == _digest(code):
+                    return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
+                _say(f"{path}: damaged; compiled again")
+                _remove(path)
         on_compile(self._name)
         return None
 
@@ -135,22 +140,24 @@ class _Kept:
         if result.library.has_dynamic_globals:
             # It holds addresses of this process.
             return
-        path = self._path(types, result.codegen)
         code: bytes = dumps(result._reduce())  # type: ignore[no-untyped-call]
-        part = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
         try:
+            path = self._path(types, result.codegen)
+            part = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
             path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(_digest(code) + code)
-            part.replace(path)
+            try:
+                part.write_bytes(_digest(code) + code)
+                part.replace(path)
+            finally:
+                _remove(part)
+            for old in path.parent.glob(f"{self._name}-*"):
+                if not old.name.startswith(f"{self._name}-{self._source}-"):
+                    _remove(old)
         except OSError as error:
-            _remove(part)
             _say(
-                f"{path.parent}: compiled code cannot be kept, and every launch compiles:"
-                f" {error.strerror}; {CURE}"
+                "compiled code cannot be kept, and every launch compiles:"
+                f" {error.filename}: {error.strerror}; {CURE}"
             )
-        for old in path.parent.glob(f"{self._name}-*"):
-            if not old.name.startswith(f"{self._name}-{self._source}-"):
-                _remove(old)
 
     def _path(self, types: Any, codegen: Any) -> Path:
         from numba import __version__
@@ -185,8 +192,12 @@ def _value(value: object) -> Iterator[bytes]:
 
 @cache
 def _folder() -> Path:
-    """Return the folder of the code that is compiled from this checkout."""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
+    """Return the folder of the code that is compiled from this checkout. Raises `OSError` if the
+    user has no home folder."""
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
+    except RuntimeError:
+        raise FileNotFoundError(errno.ENOENT, "the user has no home folder", "~") from None
     return home / _digest(bytes(Path(__file__).parent)).hex()
 
 

@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from importlib import import_module
 from io import StringIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rack.tools.console.interrupt import INTERRUPT, Interrupted
@@ -191,6 +192,8 @@ def run_commands() -> None:
         fail(str(failure), failure.status)
     except OSError as error:
         if error.filename is None:
+            if Path("/proc/self/cwd").readlink().name.endswith(" (deleted)"):
+                fail("the working folder has been removed; change to another one", 2)
             if error.errno not in (errno.EAGAIN, errno.EMFILE):
                 raise
             fail(refusal(error), 1)

@@ -175,6 +175,55 @@ def test_processes_that_find_the_damage_at_once_all_get_the_code(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("is_readable", [True, False])
+def test_without_a_home_or_permission_to_read_it_code_is_compiled_in_memory(
+    is_readable: bool, tmp_path: Path
+) -> None:
+    """A user without a home, and one whose HOME is another user's, as after `setpriv`."""
+
+    def call() -> bool:
+        os.environ.pop("XDG_CACHE_HOME")
+        os.environ.pop("HOME")
+        if not is_readable:
+            os.environ["HOME"] = str(tmp_path)
+        tmp_path.chmod(0o700)
+        os.setuid(65_533)
+        return [called(), called()] == [3.0, 3.0]
+
+    if os.getuid() != 0:
+        pytest.skip("only root can become another user")
+    assert exit_status(fork(call), 60.0) == 0
+
+
+@pytest.mark.slow
+def test_a_user_without_a_home_is_told_once(
+    heard: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(Path, "home", no_home)
+    assert [called(), called()] == [3.0, 3.0]
+    assert capsys.readouterr().err == (
+        "compiled code cannot be kept, and every launch compiles: ~: the user has no home folder;"
+        " XDG_CACHE_HOME=FOLDER names one that can be written\n"
+    )
+    assert len(heard) == 2
+
+
+@pytest.mark.slow
+def test_code_is_compiled_though_numba_is_told_not_to(
+    heard: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from numba import config
+
+    monkeypatch.setattr(config, "DISABLE_JIT", 1)
+    assert called() == 3.0
+    assert len(heard) == 1
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["cache", "cache/nasrem-rack"])
 def test_a_cache_that_cannot_be_written_is_said_once_with_its_cure(
     place: str, heard: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import tomllib
 from pathlib import Path
@@ -127,6 +128,24 @@ def test_a_reader_that_has_seen_enough_hears_of_no_error(
             os.close(writer)
         assert done.returncode == 1, arguments
         assert not done.stderr or done.stderr.startswith(f"rack '{rack_name}' does not exist")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        (("list",), ""),
+        (("check", "nasrem"), "the working folder has been removed; change to another one"),
+        (("robot", "new", "arm.xml"), "the working folder has been removed; change to another one"),
+    ],
+)
+def test_in_a_removed_working_folder_a_command_works_or_says_why_not(
+    tmp_path: Path, arguments: tuple[str, ...], answer: str
+) -> None:
+    command = shlex.join([*RACK, *arguments])
+    script = f'cd "{tmp_path}" && rmdir "{tmp_path}" && exec {command}'
+    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, timeout=BOUND_S)
+    assert (done.stderr.strip(), done.returncode) == (answer, 2 if answer else 0)
 
 
 @pytest.mark.slow
