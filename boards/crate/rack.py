@@ -32,7 +32,7 @@ from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.neighbours import conflicts, holders, placed
+from rack.boards.crate.neighbours import conflicts, holders, occupied, placed
 from rack.boards.crate.patience import Patience, RackAwaited, await_opened
 from rack.boards.crate.recovery import HostBoards, LostBoards, Recovery, Supervision
 from rack.boards.crate.requests import (
@@ -158,6 +158,9 @@ class Rack:
         shared = conflicts(self.config, held)
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
+        # First of all: the steps that follow are those that take long on occupied cores.
+        for note in shared or occupied(held):
+            self._journal.add("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
         # A level's module may have ended it: then resolving says which.
@@ -186,7 +189,7 @@ class Rack:
         self._await_ready()
         plan.check_realtime(self.segment)
         self._inject()
-        for note in (*moved, *shared, *plan.notes(self.segment)):
+        for note in (*moved, *plan.notes(self.segment)):
             self._journal.add("ready", "", note)
 
     def _set_words(self) -> None:
