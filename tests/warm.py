@@ -170,6 +170,7 @@ def served(line: socket.socket) -> Order | None:
         data, fds, _, _ = socket.recv_fds(line, MOST_BYTES, MOST_FDS)
         if not data:
             return None
+        reading, writing = os.pipe()
         starter = os.fork()
         if starter == 0:
             starter = os.getpid()
@@ -177,13 +178,16 @@ def served(line: socket.socket) -> Order | None:
                 os._exit(0)
             while os.getppid() == starter:
                 os.sched_yield()
-            line.send(str(os.getpid()).encode())
+            os.write(writing, str(os.getpid()).encode())
             order: Order = pickle.loads(data)
             _take_over(order, fds)
             return order
         os.waitpid(starter, 0)
-        for fd in fds:
+        for fd in (*fds, writing):
             os.close(fd)
+        # Last: when the program ends, nothing else may hold its sockets open.
+        line.send(os.read(reading, MOST_BYTES))
+        os.close(reading)
 
 
 def _take_over(order: Order, fds: Sequence[int]) -> None:
