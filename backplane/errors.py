@@ -3,6 +3,7 @@
 `BackplaneError` is the root: catch it and every refusal of this package is caught.
 
 - `SegmentError`: a rack name that is in use, a segment of another layout or owner, a full /dev/shm.
+- `DamageError`: shared memory that holds what no process of the rack writes.
 - `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
 - `ClockError`: a rate that does not divide the clock, or is not a rate.
 - `FaultTableError`: more faults than one run can have.
@@ -23,6 +24,13 @@ class SegmentError(BackplaneError):
 
 class RackInUseError(SegmentError):
     """The segment of a rack that is running."""
+
+
+class DamageError(SegmentError):
+    """Shared memory that holds what no process of the rack writes there."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"the rack's shared memory is damaged: {what}")
 
 
 class MailboxError(BackplaneError):

@@ -15,6 +15,7 @@ from time import monotonic_ns
 
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES, FAULT_ENTRY_SIZE
 from rack.backplane.byte_lock import ByteLock
+from rack.backplane.checked import as_named
 from rack.backplane.errors import FaultTableError
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -90,7 +91,7 @@ class FaultEntry:
     @property
     def stage(self) -> Stage:
         """The stage of the fault."""
-        return Stage(self.words[Entry.STAGE])
+        return as_named(Stage, self.words[Entry.STAGE])
 
     def acted(self, tick: int, shows: bool = True) -> None:
         """Note one action of the fault, and the time of the first one; count those that show: they

@@ -203,6 +203,13 @@ def reason_of(status: Message) -> str:
     return str(getattr(status, "reason", ""))
 
 
+def state_name(state: int | None, otherwise: str = "") -> str:
+    """Return the name of a level's state; of a user's level that has others, `otherwise` or the
+    number."""
+    names = {known.value: known.name.lower() for known in State}
+    return names.get(state, otherwise or str(state))
+
+
 def copied(message: Message) -> Message:
     """Return a copy of a message, in memory of its own."""
     copy = Message(message.record.dtype)

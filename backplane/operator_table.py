@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 from rack.backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
 from rack.backplane.byte_lock import ByteLock
+from rack.backplane.checked import as_named
 from rack.backplane.errors import OperatorTableError
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -87,7 +88,7 @@ class RequestEntry:
     @property
     def stage(self) -> RequestStage:
         """Stage of the request."""
-        return RequestStage(self.words[RequestWord.STAGE])
+        return as_named(RequestStage, self.words[RequestWord.STAGE])
 
     def becomes(self, issued: Request) -> bool:
         """Say whether this request may be the one that was issued so."""

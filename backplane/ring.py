@@ -8,6 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane.address_map import oldest_kept
+from rack.backplane.errors import DamageError
+
+MOST = 1 << 48
+"""No ring is written so often."""
 
 
 class Drained(NamedTuple):
@@ -46,7 +50,14 @@ class Ring:
     @property
     def waiting(self) -> int:
         """Records written and not yet read."""
-        return self._head[0] - self._taken
+        return self._written - self._taken
+
+    @property
+    def _written(self) -> int:
+        """Records written so far. Raises `DamageError` for an impossible number."""
+        if not 0 <= (count := self._head[0]) < MOST:
+            raise DamageError(f"a ring of {count} records")
+        return count
 
     def resume(self, taken: int) -> None:
         """Continue after the first `taken` records, which another reader has read."""
@@ -54,11 +65,11 @@ class Ring:
 
     def drain(self) -> Drained:
         """Read every record written since the last call."""
-        head = self._head[0]
+        head = self._written
         first = max(self._taken + 1, head - self._depth + 1, self._oldest())
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
         # Rows that the writer reached during the copy.
-        torn = max(0, oldest_kept(self._head[0], self._depth) - first)
+        torn = max(0, oldest_kept(self._written, self._depth) - first)
         lost = first - self._taken - 1 + min(torn, len(rows))
         self._taken = head
         return Drained(rows[torn:], lost)

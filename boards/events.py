@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State, reason_of
+from rack.backplane.message import Message, State, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
@@ -214,7 +214,7 @@ class Ending:
             if silent_s
             else reason_of(status)
         )
-        return State(status.state).name.lower(), reason
+        return state_name(status.state), reason
 
     def latched(self) -> list[str]:
         """Return a line for every level whose last status reports an error, except the level that

@@ -4,24 +4,34 @@ from __future__ import annotations
 
 import numpy as np
 
+from rack.backplane.checked import as_named, pick
+from rack.backplane.errors import DamageError
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry, RequestWord
-from rack.levels.operator import Goal, Operation
+from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 
 
 def level_of(entry: RequestEntry, layout: Layout) -> str:
     """Return the board whose level a request addresses."""
-    return layout.mailboxes[entry[RequestWord.MAILBOX]].name.partition(".")[0]
+    return _mailbox(entry, layout).name.partition(".")[0]
 
 
 def message_of(entry: RequestEntry, layout: Layout) -> Message:
     """Return a copy of a request's message, an `OPERATOR_COMMAND`."""
-    spec = layout.mailboxes[entry[RequestWord.MAILBOX]]
+    spec = _mailbox(entry, layout)
     message = Message(message_dtype(spec.fields, spec.size))
     message.raw[:] = entry.message[: spec.size]
     return message
+
+
+def _mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
+    """Return the mailbox of a request. Raises `DamageError` if it is no operator's."""
+    found = pick(layout.mailboxes, entry[RequestWord.MAILBOX], "mailbox")
+    if found.message != OPERATOR_COMMAND.name:
+        raise DamageError(f"a command for '{found.name}'")
+    return found
 
 
 def hold(mailbox: MailboxSpec) -> Message:
@@ -33,7 +43,7 @@ def hold(mailbox: MailboxSpec) -> Message:
 
 def describe(message: Message) -> str:
     """Return a command as one line: its verb, what it names, and its goal."""
-    what = Operation(message.what).name.lower()
+    what = as_named(Operation, message.what).name.lower()
     goal = message.goal
     if goal == Goal.JOINTS:
         return f"{what} joints {_numbers(message.joints[: message.count])}"
@@ -47,7 +57,7 @@ def describe(message: Message) -> str:
             f"{what} position {_numbers(message.position)} direction {_numbers(message.direction)}"
         )
     name = f" {message.name}" if message.name else ""
-    kind = f" {Goal(goal).name.lower()}" if goal else ""
+    kind = f" {as_named(Goal, goal).name.lower()}" if goal else ""
     return f"{what}{name}{kind}"
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rack.backplane.checked import pick
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.levels.errors import RobotError
@@ -39,10 +40,11 @@ def cell_sizes(config: RackConfig) -> dict[str, int]:
 
 
 def geom_name(config: RackConfig, geom: int) -> str:
-    """Return the name of a geom of the cell."""
+    """Return the name of a geom of the cell, by its number in shared memory."""
     from rack.levels.robot import lookup
 
-    return lookup.geom_name(built_cell(config).model, geom)
+    model = built_cell(config).model
+    return lookup.geom_name(model, pick(range(model.ngeom), geom, "geom"))
 
 
 def built_cell(config: RackConfig) -> Cell:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
+from rack.backplane.checked import pick
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.levels.tables import Finite, Moment, Table, Tick
 
@@ -92,8 +93,8 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
 
 def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
     """Return a condition as a user writes it: the inverse of `condition`."""
-    mailbox = layout.mailboxes[when[0]]
-    field = mailbox.fields[when[1]]
+    mailbox = pick(layout.mailboxes, when[0], "mailbox")
+    field = pick(mailbox.fields, when[1], "field")
     names = {number: name for name, number in field.values}
     return f"{mailbox.name}.{field.name} == {names.get(when[2], when[2])}"
 

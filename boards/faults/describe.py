@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.checked import as_whole, pick
 from rack.backplane.fault_table import NEVER, Entry, FaultEntry, Stage
 from rack.backplane.layout import Layout
 from rack.boards.faults.kind import kind_of
@@ -15,15 +16,15 @@ ALL_JOINTS = "all joints"
 
 def board_of(entry: FaultEntry, layout: Layout) -> str:
     """Return the task that a fault strikes; "clock" for the clock."""
-    return CLOCK if entry[Entry.TASK] < 0 else layout.processes[entry[Entry.TASK]].name
+    return CLOCK if (at := entry[Entry.TASK]) < 0 else pick(layout.processes, at, "task").name
 
 
 def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
     """Return the mailbox or the joint that a fault affects; empty if it affects its task alone."""
     if entry[Entry.MAILBOX] >= 0:
-        return layout.mailboxes[entry[Entry.MAILBOX]].name
+        return pick(layout.mailboxes, entry[Entry.MAILBOX], "mailbox").name
     joint = kind_of(entry).values(entry).get("joint")
-    return "" if joint is None else joint_name(int(joint), joints)
+    return "" if joint is None else joint_name(as_whole(joint), joints)
 
 
 def joint_name(at: int, joints: Sequence[str]) -> str:
@@ -39,7 +40,7 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     stage = entry.stage
     mailbox = ""
     if entry[Entry.MAILBOX] >= 0:
-        mailbox = layout.mailboxes[entry[Entry.MAILBOX]].name
+        mailbox = pick(layout.mailboxes, entry[Entry.MAILBOX], "mailbox").name
     until = None
     if stage in (Stage.ACTIVE, Stage.OVER) and entry[Entry.UNTIL] != NEVER:
         until = entry[Entry.UNTIL]

@@ -29,18 +29,20 @@ def list_racks(as_json: bool) -> None:
 def describe(name: str) -> dict[str, str | int | float | None]:
     """Return the name, as "rack", the state and details of a rack; its age is in seconds. The
     launcher's process id is None in another PID namespace."""
+    from rack.backplane.checked import as_named
     from rack.backplane.errors import SegmentError
     from rack.backplane.segment import Segment
     from rack.backplane.words import Head, Run, System
 
     try:
         segment = Segment.attach(name)
+        state = as_named(Run, segment.words[System.STATE]).name.lower()
     except SegmentError as error:
         return {"rack": name, "state": "foreign", "detail": str(error)}
     words = segment.words
     age_s = time.time() - words[Head.CREATED_NS] * 1e-9
     alive = segment.launcher_is_alive
-    state = Run(words[System.STATE]).name.lower() if alive else "dead"
+    state = state if alive else "dead"
     gone = "its launcher is gone: 'rack clean' removes it"
     by = f"launched {age_s:.0f} s ago by {segment.launcher_text}" if alive else gone
     boards = len({task.board for task in segment.layout.tasks})

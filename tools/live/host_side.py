@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from rack.backplane.checked import as_named
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
@@ -55,7 +56,7 @@ def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
     block = segment.block(host.name)
     # The process that runs a host board locks this word, and the kernel unlocks it.
     runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
-    state = TaskState(block[Block.STATE])
+    state = as_named(TaskState, block[Block.STATE])
     shown = state.name.lower() if runs else AWAY
     if state == TaskState.ENDED:
         shown = DONE

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 
+from rack.backplane.checked import as_named
 from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment, racks
@@ -82,7 +83,7 @@ def _described(host: str, rack: RemoteRack) -> FoundRack:
     segment = rack.segment
     words = segment.words
     layout = segment.layout
-    state = Run(words[System.STATE]).name.lower()
+    state = as_named(Run, words[System.STATE]).name.lower()
     peers = tuple(_peers(segment))
     boards = len({task.board for task in layout.tasks})
     shown = "".join(f", {name} {presence}" for name, presence in peers)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import State
+from rack.backplane.message import state_name
 from rack.boards.config import RackConfig
 from rack.levels.messages import SCENE, TASK_STATUS
 from rack.tools.recording.recording import Recording
@@ -45,7 +45,7 @@ def task_outcome(recording: Recording) -> Report | None:
         name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")
     }
     return {
-        "state": State(int(last("state"))).name.lower(),
+        "state": state_name(int(last("state"))),
         "reason": recording.reason(mailbox, -1),
         **counts,
     }
