@@ -10,11 +10,13 @@ from __future__ import annotations
 import json
 import mmap
 import os
+import re
 import stat
 import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple, Self
+from zlib import crc32
 
 import posix_ipc
 
@@ -36,7 +38,12 @@ MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 16
 LOCKED_SINCE = 16
 """First version in which the launcher holds a lock."""
+TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
+"""Words with the addresses of the texts; the word after each has its size."""
 PREFIX = "nasrem-rack."
+KIND = re.compile(r"[<>|]?[biufcSUV]\d+")
+"""Kinds of fields. A layout may be another user's: numpy would take an object of Python's from the
+number in a message."""
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
 _LIFE = 8 * Head.LAUNCHER_PID
@@ -61,8 +68,8 @@ class Launch(NamedTuple):
 
 
 class Segment:
-    """An attached segment: `layout`, `config` (TOML text), `map`, and its memory as `words` and
-    `bytes`.
+    """An attached segment: `layout`, `config` (TOML text), `published` (JSON text: the facts about
+    its levels), `map`, and its memory as `words` and `bytes`.
 
     A mirror of one on another machine has no file, thus no `fd`: it learns who is alive there by
     other ways.
@@ -78,18 +85,25 @@ class Segment:
         self.words = self.bytes.cast("q")
         self.layout: Layout
         self.config: str
+        self.published: str
         self.map: AddressMap
 
     @classmethod
-    def create(cls, layout: Layout, config: str) -> Self:
+    def create(cls, layout: Layout, config: str, published: str = "{}") -> Self:
         """Make the segment of a rack, mode 0600, all of it allocated.
 
-        Raises `SegmentError` when the name is in use, memory is short, or the processor is another.
+        Args:
+            layout: Layout of the backplane.
+            config: The resolved config, as TOML.
+            published: Facts about the levels, as JSON.
+
+        Raises:
+            SegmentError: The name is in use, memory is short, or the processor is another.
         """
         if (machine := os.uname().machine) != PROCESSOR:
             why = f"the backplane's memory order is argued for {PROCESSOR} alone"
             raise SegmentError(f"rack '{layout.rack}': the processor here is {machine}; {why}")
-        texts = [json.dumps(asdict(layout)).encode(), config.encode()]
+        texts = [json.dumps(asdict(layout)).encode(), config.encode(), published.encode()]
         places = AddressMap(layout)
         size = pages(places.size + sum(len(t) for t in texts))
         try:
@@ -103,6 +117,7 @@ class Segment:
             segment = cls(layout.rack, mmap.mmap(fd, size), fd)
             segment.layout = layout
             segment.config = config
+            segment.published = published
             segment.map = places
             segment._fill_head(texts)
             segment._life = life
@@ -136,7 +151,8 @@ class Segment:
 
     def _fill_head(self, texts: list[bytes]) -> None:
         address = self.map.size
-        for at, text in zip((Head.LAYOUT_AT, Head.CONFIG_AT), texts, strict=True):
+        self.words[Head.CHECK] = crc32(b"".join(texts))
+        for at, text in zip(TEXTS, texts, strict=True):
             self.words[at] = address
             self.words[at + 1] = len(text)
             self.bytes[address : address + len(text)] = text
@@ -197,7 +213,8 @@ class Segment:
         return cls(rack, mmap.mmap(shm.fd, found.st_size), shm.fd)
 
     def read_head(self) -> None:
-        """Read layout and config. Raises `SegmentError` when size or version is wrong."""
+        """Read the texts. Raises `SegmentError` when size or version is wrong, or a text is
+        damaged."""
         if self.words[Head.MAGIC] != MAGIC or self.words[Head.VERSION] != VERSION:
             raise SegmentError(
                 f"rack '{self.rack}': layout version {self.words[Head.VERSION]}; this program"
@@ -209,17 +226,24 @@ class Segment:
                 f" {self.words[Head.SIZE]}"
             )
         try:
-            self.layout = layout_of(json.loads(self._text(Head.LAYOUT_AT)))
-        except (TypeError, KeyError, ValueError) as error:
+            texts = [self._text(at) for at in TEXTS]
+            if crc32(b"".join(texts)) != self.words[Head.CHECK]:
+                raise ValueError("the texts in its head are damaged")
+            layout, self.config, self.published = (text.decode() for text in texts)
+            self.layout = layout_of(json.loads(layout))
+            self.map = AddressMap(self.layout)
+            if self.map.size != self.words[Head.LAYOUT_AT]:
+                raise ValueError(f"a layout of {self.map.size} bytes")
+        except (TypeError, LookupError, ValueError, AttributeError, RecursionError) as error:
             raise SegmentError(
-                f"rack '{self.rack}': layout unreadable, from another program: {error}"
+                f"rack '{self.rack}': layout unreadable, damaged or from another program: {error}"
             ) from None
-        self.config = self._text(Head.CONFIG_AT)
-        self.map = AddressMap(self.layout)
 
-    def _text(self, at: int) -> str:
-        start = self.words[at]
-        return bytes(self.bytes[start : start + self.words[at + 1]]).decode()
+    def _text(self, at: int) -> bytes:
+        start, size = self.words[at : at + 2]
+        if not 0 <= start <= start + size <= len(self.bytes):
+            raise ValueError(f"a text of {size} bytes at {start}")
+        return bytes(self.bytes[start : start + size])
 
     def view(self, address: int, size: int) -> memoryview:
         """Return the bytes at a bus address."""
@@ -366,6 +390,8 @@ def _shm_name(rack: str) -> str:
 
 
 def _field(entry: dict[str, Any]) -> FieldSpec:
+    if not KIND.fullmatch(entry["kind"]):
+        raise ValueError(f"a field of kind {entry['kind']}")
     shape = tuple(entry["shape"])
     fields = tuple(map(_field, entry["fields"]))
     values = tuple((name, number) for name, number in entry["values"])

@@ -38,6 +38,9 @@ class Head(IntEnum):
     CONFIG_AT = 8
     CONFIG_SIZE = 9
     CREATED_MONOTONIC_NS = 10  # the same moment as CREATED_NS, CLOCK_MONOTONIC
+    PUBLISHED_AT = 11
+    PUBLISHED_SIZE = 12
+    CHECK = 13  # CRC-32 of the three texts
 
 
 class System(IntEnum):

@@ -1,7 +1,8 @@
 """Configs: from TOML to a rack.
 
 - `load(name, overrides, faults)`, `loads(text)`: read and validate the tables, return a
-  `RackConfig`.
+  `RackConfig`, whose levels can be imported from now on.
+- `read_stored(text)`: read the config of a rack or a run, and import nothing.
 - `resolve(config)`: check and wire everything, return `Resolved`: config, layout, wiring, faults,
   commands.
 - `wire(config)`: the layout alone.
@@ -21,7 +22,14 @@ from rack.backplane.exports import on_first_use
 if TYPE_CHECKING:
     from rack.boards.config.files import CONFIGS, FAULTS, names
     from rack.boards.config.layout import shared_out
-    from rack.boards.config.resolved import Resolved, load, loads, resolve, wire
+    from rack.boards.config.resolved import (
+        Resolved,
+        load,
+        loads,
+        read_stored,
+        resolve,
+        wire,
+    )
     from rack.boards.config.schema import RackConfig
     from rack.boards.config.timing import budgets, rack_timing
 
@@ -35,6 +43,7 @@ __all__ = [
     "loads",
     "names",
     "rack_timing",
+    "read_stored",
     "resolve",
     "shared_out",
     "wire",
@@ -42,7 +51,14 @@ __all__ = [
 _PLACES = {
     "rack.boards.config.files": ("CONFIGS", "FAULTS", "names"),
     "rack.boards.config.layout": ("shared_out",),
-    "rack.boards.config.resolved": ("Resolved", "load", "loads", "resolve", "wire"),
+    "rack.boards.config.resolved": (
+        "Resolved",
+        "load",
+        "loads",
+        "read_stored",
+        "resolve",
+        "wire",
+    ),
     "rack.boards.config.schema": ("RackConfig",),
     "rack.boards.config.timing": ("budgets", "rack_timing"),
 }

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,57 +13,26 @@ from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import Request
 from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.published import Levels, PublishedLevel
 from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.config.timing import first_tick
-from rack.boards.config.wiring import commandable, executor_of
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import norm
-from rack.levels.errors import LevelError
-from rack.levels.operator import NAMED, Commands, Goal, Operation, goal_names
-from rack.levels.tables import live_keys, read_params
+from rack.levels.operator import Goal, Operation, goal_names
 
 DOWN = (0.0, 0.0, -1.0)
 
 
-def takes(config: RackConfig, board: str, commands: Commands) -> str:
+def takes(level: PublishedLevel) -> str:
     """Return the commands that a level takes as text, with the names that it knows: "hold, resume,
     table saw|slow"."""
-    executor = executor_of(config, board)
     words = []
-    for what, goals in commands.items():
-        names: Sequence[str] = ()
-        if what is Operation.SET:
-            names = live_keys(executor.params)
-        elif what in NAMED:
-            # A table may be in the middle of being edited.
-            with suppress(LevelError):
-                names = executor.wording(what, config.board[board].params, config.scene)
+    for what, goals in level.commands.items():
+        names = level.live if what is Operation.SET else level.wording.get(what, ())
         wording = (what.name.lower(), "|".join(names), goal_names(goals))
         words.append(" ".join(word for word in wording if word))
     return ", ".join(words)
-
-
-def live_params(config: RackConfig) -> dict[str, Sequence[str]]:
-    """Return the params that an operator may set live, by board; boards without any are omitted."""
-    return {
-        name: live_keys(executor_of(config, name).params)
-        for name, commands in commandable(config).items()
-        if Operation.SET in commands
-    }
-
-
-def launched_with(config: RackConfig, board: str, key: str) -> Any:
-    """Return a parameter of a board as it was launched; None: there is no such."""
-    kind = executor_of(config, board).params
-    if kind is None:
-        return None
-    return getattr(read_params(kind, config.board[board].params), key, None)
-
-
-def setting_name(config: RackConfig, board: str, number: int) -> str:
-    """Return the name that a board's level gives to something by `number`: see `Executor.names`."""
-    return executor_of(config, board).names(config.board[board].params)[number]
 
 
 def asked(given: Mapping[str, Any]) -> CommandConfig:
@@ -76,9 +44,9 @@ def asked(given: Mapping[str, Any]) -> CommandConfig:
         raise ConfigError(mistakes_of(error, CommandConfig, given)) from None
 
 
-def request(command: CommandConfig, config: RackConfig, layout: Layout) -> Request:
+def request(command: CommandConfig, config: RackConfig, levels: Levels, layout: Layout) -> Request:
     """Return the request of one command. Raises `ConfigError` with every mistake."""
-    if mistakes := command_mistakes([("", command)], config):
+    if mistakes := command_mistakes([("", command)], config, levels):
         raise ConfigError(mistakes)
     return _request(command, layout)
 

@@ -7,6 +7,7 @@ from zlib import crc32
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
+from rack.boards.config.published import Levels
 from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import first_tick
@@ -29,9 +30,9 @@ def injections(config: RackConfig, layout: Layout) -> tuple[Injection, ...]:
     return tuple(_injection(fault, config, layout, place) for place, fault in places(config))
 
 
-def injection(fault: FaultConfig, config: RackConfig, layout: Layout) -> Injection:
+def injection(fault: FaultConfig, config: RackConfig, levels: Levels, layout: Layout) -> Injection:
     """Return the entry of a fault injected live. Raises `ConfigError` with every mistake."""
-    if mistakes := fault_mistakes([("", fault)], config, layout):
+    if mistakes := fault_mistakes([("", fault)], config, levels, layout):
         raise ConfigError(mistakes)
     return _injection(fault, config, layout, "")
 

@@ -30,6 +30,7 @@ from rack.boards.config.faults import injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
 from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.published import Published, publish
 from rack.boards.config.rules import broken_rules, network_rules
 from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.rules.faults import fault_mistakes
@@ -89,9 +90,22 @@ def load(
 
 
 def loads(text: str) -> RackConfig:
-    """Return the config in TOML text, as `RackConfig.text` writes it. Raises `ConfigError` as
-    `load` does."""
+    """Return the config in TOML text, as `RackConfig.text` writes it, and add its levels to the
+    import path. Raises `ConfigError` as `load` does."""
     return validated(anchor(parse(text), CONFIGS))
+
+
+def read_stored(text: str) -> RackConfig:
+    """Return the config that a rack or a run holds as text, which may be somebody else's.
+
+    Nothing that it names is imported, and its levels do not come into the import path. Raises
+    `ConfigError` with every mistake in a single table.
+    """
+    tables = anchor(parse(text), CONFIGS)
+    try:
+        return with_derived(RackConfig.model_validate(tables))
+    except ValidationError as error:
+        raise ConfigError(mistakes_of(error, RackConfig, tables)) from None
 
 
 def resolve(config: RackConfig) -> Resolved:
@@ -123,6 +137,7 @@ class Resolved:
     hosts: tuple[HostWiring, ...]
     faults: tuple[Injection, ...]
     commands: tuple[Request, ...]
+    published: Published
     goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
     def for_run(
@@ -329,8 +344,11 @@ class _Examined:
             self._contexts = self._contexts_of_boards()
             self.mistakes += [*memory(layout), *neighbours(self._wiring, self._contexts)]
             self._layout = None if self.mistakes else layout
-        self.mistakes += fault_mistakes(faults, config, self._layout, self._wiring.broken_boards)
-        self.mistakes += command_mistakes(commands, config, self._wiring.broken_boards)
+        self._published = publish(config)
+        levels = self._published.levels
+        broken_boards = self._wiring.broken_boards
+        self.mistakes += fault_mistakes(faults, config, levels, self._layout, broken_boards)
+        self.mistakes += command_mistakes(commands, config, levels, broken_boards)
         if (network := network_rules(config)) is not None:
             self.mistakes = [network.at_adapter(mistake, config) for mistake in self.mistakes]
 
@@ -352,7 +370,8 @@ class _Examined:
         programs = [program.model_validate(config.task) for program in self._wiring.programs]
         goals = [goal for program in programs for goal in program.goals()]
         at = {rows(goal.object): goal for goal in (*goals, *config.scene.goal)}
-        return Resolved(config, layout, tasks, hosts, faults, requests(config, layout), at)
+        commands = requests(config, layout)
+        return Resolved(config, layout, tasks, hosts, faults, commands, self._published, at)
 
     def _host(self, ports: TaskPorts) -> HostWiring:
         config = self._config

@@ -337,18 +337,13 @@ class Wiring:
         return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
 
 
-def executor_of(config: RackConfig, board: str) -> type[Executor]:
-    """Return the class of a board's executor. Raises `LookupError`: it is missing."""
-    return find_class(config.board[board].executor, Executor)
-
-
 def executors(config: RackConfig) -> dict[str, type[Executor] | None]:
     """Return the class of each board's executor; None where it is missing, which is reported
     elsewhere."""
     found: dict[str, type[Executor] | None] = dict.fromkeys(config.board)
-    for name in config.board:
+    for name, board in config.board.items():
         with suppress(LookupError):
-            found[name] = executor_of(config, name)
+            found[name] = find_class(board.executor, Executor)
     return found
 
 

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.checked import as_named, as_whole, pick
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
 from rack.backplane.message import Message
 from rack.backplane.operator_table import OperatorTable
@@ -18,7 +19,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
-from rack.boards.config.commands import launched_with, setting_name
+from rack.boards.config.published import Levels, Published, PublishedLevel, PublishedParam
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
 from rack.boards.faults.bounds import counting
@@ -139,31 +140,29 @@ class AlarmWatch:
         }
         # The cell is built at the first collision.
         geom = str if config.robot is None else partial(geom_name, config)
-        name = partial(setting_name, config)
-        param = partial(launched_with, config)
-        self._events = AlarmEvents(segment, config.joints, geom, name, param)
+        levels = Published.of_rack(segment).levels
+        self._events = AlarmEvents(segment, config.joints, geom, levels)
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:
         """Return the alarms since the last call, by time."""
-        found = []
+        found: list[RungAlarm] = []
         for owner, ring in self._rings.items():
             if not ring.waiting:
                 continue
             rows, lost = ring.drain()
             self.lost += lost
-            found += [
-                RungAlarm(Alarm(row["code"]), int(row["subject"]), self._events.of(row, owner))
-                for row in rows
-            ]
+            for row in rows:
+                alarm = as_named(Alarm, row["code"])
+                found.append(RungAlarm(alarm, int(row["subject"]), self._events.of(row, owner)))
         return sorted(found, key=lambda one: one.event.time_ns)
 
 
 class AlarmEvents:
     """Turns a rack's alarms into events.
 
-    `joints` are the robot's; `geom` returns the name of a geom of the cell, `name` one of
-    `Executor.names` of a board, `param` the parameter that a board was launched with, by key.
+    `joints` are the robot's; `geom` returns the name of a geom of the cell; `levels` are those that
+    the rack has published.
     """
 
     def __init__(
@@ -171,16 +170,14 @@ class AlarmEvents:
         segment: Segment,
         joints: Sequence[str],
         geom: Callable[[int], str],
-        name: Callable[[str, int], str],
-        param: Callable[[str, str], object],
+        levels: Levels,
     ) -> None:
         self._layout = segment.layout
         self._faults = FaultTable(segment)
         self._operator = OperatorTable(segment)
         self._joints = joints
         self._geom = geom
-        self._name = name
-        self._param = param
+        self._levels = levels
         self._live: dict[tuple[str, str], object] = {}  # by board and key: params set since
 
     def of(self, row: np.void, owner: str) -> Event:
@@ -190,7 +187,7 @@ class AlarmEvents:
         The event's board is the one that raised the alarm; for a fault, restart or command, the one
         affected.
         """
-        alarm = Alarm(row["code"])
+        alarm = as_named(Alarm, row["code"])
         number = int(row["subject"])
         value = float(row["value"])
         kind = KIND_OF.get(alarm, "detection")
@@ -199,7 +196,7 @@ class AlarmEvents:
         fault = -1
         since = row["since"]
         if kind == "fault":
-            entry = self._faults.entries[number]
+            entry = pick(self._faults.entries, number, "fault")
             fault = number
             subject = subject_of(entry, self._layout, self._joints)
             board = board_of(entry, self._layout)
@@ -207,22 +204,22 @@ class AlarmEvents:
             what = describe_fault(entry, self._layout, self._joints, with_board=False)
             text = f"{what} {code}{self._duration(entry, code)}"
         elif alarm == Alarm.COMMANDED:
-            request = self._operator.entries[number]
+            request = pick(self._operator.entries, number, "command")
             subject = board = level_of(request, self._layout)
             message = message_of(request, self._layout)
             kind = "command"
             since = -1
-            code = Operation(message.what).name.lower()
+            code = as_named(Operation, message.what).name.lower()
             before = self._before(board, message) if message.what == Operation.SET else ""
             text = f"{describe(message)}{before} (command {value:.0f})"
         elif alarm == Alarm.OPERATOR_GONE:
-            request = self._operator.entries[number]
+            request = pick(self._operator.entries, number, "command")
             subject = board = level_of(request, self._layout)
             kind = "command"
             what = describe(message_of(request, self._layout))
             text = f"{what}: its operator is gone: hold (command {value:.0f})"
         elif alarm == Alarm.DEMAND:
-            demand = Demand(int(value))
+            demand = as_named(Demand, value)
             subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
             kind = "reaction" if demand else "recovery"
             text = _demand(demand, subject)
@@ -256,15 +253,20 @@ class AlarmEvents:
         elif about == "joint":
             subject = joint_name(number, self._joints)
         elif about == "name":
-            subject = self._name(owner, number)
+            subject = pick(self._levels[owner].names, number, "name")
         elif about == "brakes":
-            subject = Error(number).name.lower() if number > 0 else ENGAGED_BY[-number]
+            subject = (
+                as_named(Error, number).name.lower()
+                if number > 0
+                else pick(ENGAGED_BY, -number, "reason to brake")
+            )
         elif about == "geom":
             subject = self._geom(number)
-            writer = self._geom(int(value))
+            writer = self._geom(as_whole(value))
         elif about == "mailbox":
-            subject = layout.mailboxes[number].name
-            writer = layout.mailboxes[number].writer
+            box = pick(layout.mailboxes, number, "mailbox")
+            subject = box.name
+            writer = box.writer
         counted = {f"{noun}s": counting(value, noun) for noun in ("release", "message", "tick")}
         named = {"subject": subject, "writer": writer, "since": int(row["since"]), **counted}
         return subject, text.format(
@@ -277,7 +279,9 @@ class AlarmEvents:
             key, value = read_setting(command.name)
         except LevelError:  # given past the checks of a config: the level refuses it
             return ""
-        before = self._live.get((board, key), self._param(board, key))
+        level = self._levels.get(board, PublishedLevel())
+        launched = level.params.get(key, PublishedParam()).launched
+        before = self._live.get((board, key), launched or None)
         self._live[board, key] = value
         return f", before {before}"
 
@@ -288,7 +292,7 @@ class AlarmEvents:
         return f", for {self._span(entry[Entry.TICKS])}" if entry[Entry.TICKS] else ""
 
     def _task(self, number: int, other: str) -> str:
-        return self._layout.processes[number].name if number >= 0 else other
+        return pick(self._layout.processes, number, "task").name if number >= 0 else other
 
     def _span(self, ticks: float) -> str:
         return f"{counting(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Self
 
 from rack.backplane import semaphores
 from rack.backplane.address_map import CLOCK
+from rack.backplane.checked import pick
 from rack.backplane.errors import EmergencyStopError
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.lines import UtilityLines
@@ -171,7 +172,9 @@ class Rack:
             self._origin = import_module(RESTORING).origin(plan, self._keeping)
         plan.check_files()
         remove_dead(self.config.name)
-        self.segment = self._journal.segment = Segment.create(plan.layout, self.config.text())
+        self.segment = self._journal.segment = Segment.create(
+            plan.layout, self.config.text(), plan.published.text()
+        )
         self._set_words()
         if self._origin is not None:
             import_module(RESTORING).continue_in(self.segment, self._origin)
@@ -362,7 +365,9 @@ class Rack:
         are pending.
         """
         wanted = asked({"level": level, "what": what, "tick": tick, **goal})
-        return OperatorTable(self.segment).add(request(wanted, self.config, self._plan.layout))
+        plan = self._plan
+        found = request(wanted, self.config, plan.published.levels, plan.layout)
+        return OperatorTable(self.segment).add(found)
 
     def _listen(self, timeout_s: float) -> None:
         """Wait for the crate or an alarm, at most `timeout_s`."""
@@ -397,7 +402,8 @@ class Rack:
         """Record the event of an alarm, and kill a process that hangs."""
         self._journal.keep(rung.event)
         if rung.alarm == Alarm.HANG:
-            self._recovery.end_hanging(self._plan.layout.tasks[rung.subject].name)
+            task = pick(self._plan.layout.tasks, rung.subject, "task")
+            self._recovery.end_hanging(task.name)
         elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self._pids.get(CLOCK):
             # Only the clock that was reported: its successor may be running by now.
             self._recovery.end_hanging(CLOCK)

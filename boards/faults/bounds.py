@@ -126,10 +126,11 @@ class BoundCase:
 
 @dataclass(frozen=True)
 class Bound:
-    """A detection bound, as text and in ticks. `ticks` returns None if there is no bound."""
+    """A detection bound, as text and in ticks. `ticks` returns None if there is no bound, or if
+    this process knows only the text."""
 
     text: str
-    ticks: Callable[[BoundCase], int | None]
+    ticks: Callable[[BoundCase], int | None] = lambda case: None
 
     def __str__(self) -> str:
         return self.text
@@ -221,8 +222,8 @@ RELEASE = Bound("1 cycle", lambda case: case.period)
 LOCK_WAIT = Bound(
     "the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns)
 )
-BY_SIZE = Bound("depends on size", lambda case: None)
-NOT_ARMED = Bound("the launch fails", lambda case: None)
+BY_SIZE = Bound("depends on size")
+NOT_ARMED = Bound("the launch fails")
 
 
 def counting(number: float, noun: str) -> str:

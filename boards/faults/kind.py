@@ -6,13 +6,13 @@ level:
 
     KINDS.add(Kind(name="gauge-stuck", where="writer", ...))
 
-Every process of a rack imports the modules of its levels, so all of them know the kind.
+Every process of a rack imports the modules of its levels, so all of them know the kind. Programs
+that look at the rack know it as the rack publishes it: see `rack.boards.config.published`.
 """
 
 from __future__ import annotations
 
-import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -24,9 +24,7 @@ from rack.backplane.fault_table import PARAMETERS, Entry, FaultEntry, Injection
 from rack.backplane.layout import Layout
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks, struck_mailboxes
-
-if typing.TYPE_CHECKING:
-    from rack.boards.faults.drawing import Draw, DrawTicks
+from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
 """The place where a step acts. `process`, `clock`, `bus`: the clock's board, at the start of a
@@ -201,6 +199,7 @@ class Kinds:
     def __init__(self) -> None:
         self._by_name: dict[str, Kind] = {}
         self._by_number: dict[int, Kind] = {}
+        self._adopted: set[str] = set()
 
     def add(self, *kinds: Kind) -> None:
         """Add kinds. Raises `ValueError` for a name or number in use, or for too many
@@ -216,6 +215,14 @@ class Kinds:
                     f" {PARAMETERS}"
                 )
             self._by_name[kind.name] = self._by_number[kind.number] = kind
+
+    def adopt(self, kinds: Iterable[Kind]) -> None:
+        """Add kinds that a rack has published, in place of those that another one has. None
+        replaces a kind that this process has imported."""
+        for kind in kinds:
+            if kind.name in self._adopted or kind.number not in self._by_number:
+                self._adopted.add(kind.name)
+                self._by_name[kind.name] = self._by_number[kind.number] = kind
 
     def __iter__(self) -> Iterator[Kind]:
         return iter(self._by_name.values())

@@ -466,3 +466,5 @@ KINDS.add(
         once=True,
     ),
 )
+BUILT_IN = frozenset(KINDS.names)
+"""Names of these kinds, which every process knows."""

@@ -42,7 +42,8 @@ def describe(name: str) -> dict[str, str | int | float | None]:
     words = segment.words
     age_s = time.time() - words[Head.CREATED_NS] * 1e-9
     alive = segment.launcher_is_alive
-    state = state if alive else "dead"
+    if not alive:
+        state = "dead"
     gone = "its launcher is gone: 'rack clean' removes it"
     by = f"launched {age_s:.0f} s ago by {segment.launcher_text}" if alive else gone
     boards = len({task.board for task in segment.layout.tasks})

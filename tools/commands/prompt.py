@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import code
 import contextlib
+import os
 import runpy
 import signal
 import sys
@@ -41,10 +42,11 @@ def prompt(rack: RackName, board: HostName = None, script: Script = None) -> Non
     It takes the place of the program of a host board with `external = true`, one process at a time.
     `bus` sends and reads messages, `program` is the board's program, which may offer more names.
     Whatever happens here, the real-time side is not delayed. The prompt can be left and opened
-    again while the rack runs.
+    again while the rack runs. Its program is a class that the rack's config names: the rack must be
+    one's own.
 
-    Exit status: 0 prompt closed; 1 there is no such rack, the board is in use, or the script
-    failed; 2 usage.
+    Exit status: 0 prompt closed; 1 there is no such rack, it is another user's, the board is in
+    use, or the script failed; 2 usage.
 
     \b
     Examples:
@@ -54,6 +56,9 @@ def prompt(rack: RackName, board: HostName = None, script: Script = None) -> Non
     segment = Segment.attach(rack)
     if segment.run_is_over:
         raise Failure(f"rack '{rack}': the run is over")
+    if (owner := os.fstat(segment.fd).st_uid) != os.getuid():
+        why = "a prompt runs the program that its config names, which only that user may do"
+        raise Failure(f"rack '{rack}' belongs to user {owner}: {why}")
     wiring = _wiring(segment, board)
     program = find_class(wiring.target, HostProgram)(wiring.context)
     bus = HostBus(segment, wiring)

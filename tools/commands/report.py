@@ -26,10 +26,12 @@ Of = Annotated[
         help="with --against: from where this mailbox first differs, back to the cause",
     ),
 ]
-NoRepeat = Annotated[
+Repeat = Annotated[
     bool,
     typer.Option(
-        "--no-repeat", help="with --against: tell by the recordings alone, run neither rack again"
+        "--repeat",
+        help="with --against: if the recordings leave it open, run both racks again, with the"
+        " levels that their configs name",
     ),
 ]
 
@@ -38,7 +40,7 @@ def report(
     run: RunFolder,
     against: Against = None,
     of: Of = "",
-    no_repeat: NoRepeat = False,
+    repeat: Repeat = False,
     as_json: Json = False,
 ) -> None:
     """Report on a run, from its recording.
@@ -49,8 +51,9 @@ def report(
     With --against it names the first message that differs, its fields, and whether its writer had
     read the same in both runs. If not, it goes back along what differed, to the cycle whose inputs
     were equal. There it names what is different: a fault, a loss, a command, a miss, a setting. If
-    that leaves the level's state and code, runs in lockstep are repeated to that cycle: which
-    attributes of the level differed before it, and whether its code repeats what it wrote.
+    that leaves the level's state and code, --repeat runs both racks in lockstep again, to that
+    cycle: which attributes of the level differed before it, and whether its code repeats what it
+    wrote. No other report runs code of a run.
 
     Exit status: 0 the report was printed; 1 with --against: the runs diverge before any miss; 2 RUN
     is not a run, or the two cannot be compared: they are of different racks, or either lacks rows.
@@ -59,19 +62,19 @@ def report(
     Examples:
       rack report runs/nasrem-20250101-120000
       rack report runs/a --against runs/b
-      rack report runs/a --against runs/b --of task.status
+      rack report runs/a --against runs/b --of task.status --repeat
       rack report runs/slower --against origin
     """
     if against is None:
-        if of or no_repeat:
-            raise Failure("--of and --no-repeat: permitted with --against", 2)
+        if of or repeat:
+            raise Failure("--of and --repeat: permitted with --against", 2)
         show_report(run, as_json)
         return
     from rack.tools.recording.divergence import other_run
     from rack.tools.timing.analysis.report import OtherRun, write_report
 
     other = other_run(run, against)
-    data, text = write_report(run, OtherRun(other, of, not no_repeat))
+    data, text = write_report(run, OtherRun(other, of, repeat))
     print_report(data, text, as_json)
     if not data["against"]["explained"]:
         sys.exit(1)

@@ -8,15 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rack.backplane.checked import as_whole
 from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.layout import Layout
-from rack.backplane.message import State, reason_of
+from rack.backplane.message import State, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.boards.events import statuses
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
 from rack.boards.faults.kind import KINDS, Kind, kind_of
 from rack.levels.messages import Error
+from rack.tools.console.answer import Failure
 
 EXTERNAL = "external kill"
 """The kind, in reports, of a SIGKILL that a campaign itself sends, without the fault table."""
@@ -26,8 +28,12 @@ AT_REST = 0.02
 
 
 def record_of(kind: str) -> Kind:
-    """Return the record of a kind in reports; a kill from outside is like any other."""
+    """Return the record of a kind in reports; a kill from outside is like any other. Raises
+    `Failure` for an unknown kind."""
     name = "kill" if kind == EXTERNAL else kind
+    if name not in KINDS:
+        why = "no level that is imported here adds it, and the run has no published.json that does"
+        raise Failure(f"a fault is of the unknown kind '{kind}': {why}; run the rack again", 2)
     return KINDS[name]
 
 
@@ -120,7 +126,7 @@ def levels_of(segment: Segment) -> str:
     states = []
     for writer, status in statuses(segment, "state"):
         reason = f" ({why})" if (why := reason_of(status)) else ""
-        states.append(f"{writer} {State(status.state).name.lower()}{reason}")
+        states.append(f"{writer} {state_name(status.state)}{reason}")
     return ", ".join(states)
 
 
@@ -136,7 +142,7 @@ def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
     values = kind.values(entry)
     board = board_of(entry, layout)
     began = -1 if entry.stage == Stage.WAITING else entry[Entry.FROM]
-    joint = int(values.get("joint", -1))
+    joint = as_whole(values.get("joint", -1))
     joint_name = joints[joint] if 0 <= joint < len(joints) else ""
     return Strike(
         fault=entry.index,

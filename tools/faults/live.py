@@ -14,9 +14,10 @@ from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Sta
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config import loads
+from rack.boards.config import read_stored
 from rack.boards.config.faults import injection
 from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.published import Published
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig, condition_text
 from rack.boards.faults.describe import describe, document
@@ -38,7 +39,8 @@ class LiveRack:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        self._config = loads(self._segment.config)
+        self._config = read_stored(self._segment.config)
+        self._levels = Published.of_rack(self._segment).levels
         self._table = FaultTable(self._segment)
         self._joints = self._config.joints
 
@@ -54,7 +56,7 @@ class LiveRack:
         if self._segment.run_is_over:
             raise Failure(f"rack '{self._segment.rack}': its run is over")
         fault = self._fault({key: value for key, value in given.items() if value is not None})
-        checked = injection(fault, self._config, self._segment.layout)
+        checked = injection(fault, self._config, self._levels, self._segment.layout)
         self._check(fault)
         entry = self._table.add(checked)
         if KINDS[fault.kind].where == "core":

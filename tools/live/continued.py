@@ -25,6 +25,7 @@ from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.checkpoint.format import ATTRIBUTES, NAME, checkpoints
 from rack.boards.checkpoint.taking import outside
+from rack.boards.classes import extend_path
 from rack.boards.config.files import assembled
 from rack.boards.config.resolved import validated
 from rack.boards.config.schema import RackConfig
@@ -183,6 +184,8 @@ def begun_before(
 ) -> tuple[int, Beginning]:
     """Return the last checkpoint at `tick` or before, of the run or else `found`, or tick 0 without
     one, and what goes on from there, with what operators commanded later. Raises `Failure`."""
+    # The rack is about to run again, with the levels that its config names.
+    extend_path(recording.rack_config.python_path)
     kept = {at: path.resolve() for at, path in checkpoints(recording.folder).items()}
     if begins := max((at for at in (*kept, *found) if at <= tick), default=0):
         keeping = _kept_in(recording, kept.get(begins) or found[begins], begins)

@@ -20,10 +20,10 @@ from rack.backplane.operator_table import (
     RequestWord,
 )
 from rack.backplane.words import System
-from rack.boards.config import loads
-from rack.boards.config.commands import asked, live_params, request, takes
+from rack.boards.config import read_stored
+from rack.boards.config.commands import asked, request, takes
+from rack.boards.config.published import Published
 from rack.boards.config.schema import CommandConfig
-from rack.boards.config.wiring import commandable
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
 from rack.levels.operator import EFFECTS, Operation
@@ -47,18 +47,15 @@ class LiveDesk:
     def __init__(self, rack: WatchedRack) -> None:
         self._rack = rack
         self._segment = rack.segment
-        self._config = loads(self._segment.config)
+        self._config = read_stored(self._segment.config)
+        levels = Published.of_rack(self._segment).levels
+        self._levels = {name: one for name, one in levels.items() if one.has_operator}
 
     def levels(self) -> list[dict[str, str]]:
         """Return the commands that each level takes, and the one in force, as plain data."""
-        known = commandable(self._config)
         return [
-            {
-                "level": name,
-                "in_force": self._in_force(name),
-                "takes": takes(self._config, name, commands),
-            }
-            for name, commands in known.items()
+            {"level": name, "in_force": self._in_force(name), "takes": takes(level)}
+            for name, level in self._levels.items()
         ]
 
     def text(self) -> Iterator[str]:
@@ -70,8 +67,8 @@ class LiveDesk:
         without those below another one of them."""
         found = [
             name
-            for name, commands in commandable(self._config).items()
-            if Operation.HOLD in commands and self._in_force(name) in in_force
+            for name in self._levels
+            if self._takes_hold(name) and self._in_force(name) in in_force
         ]
         lower = set[str]().union(*map(self._config.all_below, found))
         return [name for name in found if name not in lower]
@@ -105,8 +102,7 @@ class LiveDesk:
         """
         command, wanted = self._request(given)
         segment = self._segment
-        takes_hold = Operation.HOLD in commandable(self._config)[command.level]
-        if command.said not in EFFECTS or not takes_hold:
+        if command.said not in EFFECTS or not self._takes_hold(command.level):
             kept = ", ".join(what.name.lower() for what in EFFECTS)
             why = f"permitted: {kept}, to levels that take a hold"
             raise Failure(f"--lease: '{command.level}', {command.what}: {why}", 2)
@@ -124,6 +120,9 @@ class LiveDesk:
                     raise Failure(f"rack '{segment.rack}' is out of reach: {why}")
         return reply
 
+    def _takes_hold(self, level: str) -> bool:
+        return Operation.HOLD in (self._levels[level].commands)
+
     def _claimed(
         self, level: str, wanted: Request, client: Client
     ) -> AbstractContextManager[RequestEntry]:
@@ -137,7 +136,7 @@ class LiveDesk:
         """Return a command and what asks the clock for it. Raises as `give` does."""
         tick = self._segment.words[System.TICK]
         command = asked({key: value for key, value in given.items() if value is not None})
-        wanted = request(command, self._config, self._segment.layout)
+        wanted = request(command, self._config, self._levels, self._segment.layout)
         if 0 <= wanted.tick <= tick:
             key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
             raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
@@ -148,7 +147,9 @@ class LiveDesk:
     def set_param(self, setting: str, tick: int | None = None, at: float | None = None) -> Reply:
         """Set a live parameter, as in `board.servo.params.bandwidth=80`; raises as `give` does."""
         place, _, _ = setting.partition("=")[0].rpartition(".")
-        live = live_params(self._config)
+        live = {
+            name: one.live for name, one in self._levels.items() if Operation.SET in one.commands
+        }
         level = next((level for level in live if place == f"board.{level}.params"), None)
         if level is None:
             known = [f"board.{board}.params.{key}" for board, keys in live.items() for key in keys]

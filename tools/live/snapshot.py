@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rack.backplane.checked import as_named
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State, reason_of
+from rack.backplane.message import Message, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Demand, Run, System, TaskState
@@ -33,7 +34,6 @@ GONE = "gone"
 """State of a run on another machine that does not answer any more."""
 HELD = "HELD: 'rack step {}' lets it go on"
 """Line of a rack in lockstep that is single-stepped."""
-LEVEL_STATES: Mapping[int | None, str] = {state: state.name.lower() for state in State}
 """Names of the states of levels."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports the progress of the whole task."""
@@ -150,7 +150,7 @@ class RackMonitor:
         layout = self._segment.layout
         run = GONE if self._segment.is_mirror else DEAD
         if self._segment.launcher_is_alive:
-            run = Run(words[System.STATE]).name.lower()
+            run = as_named(Run, words[System.STATE]).name.lower()
         tick = words[System.TICK]
         return Snapshot(
             rack=layout.rack,
@@ -159,7 +159,7 @@ class RackMonitor:
             time_s=tick * layout.clock_ns * 1e-9,
             clock_skipped=words[System.CLOCK_SKIPPED],
             lines=tuple(self._asserted()),
-            demand=Demand(words[System.DEMAND]).name.lower(),
+            demand=as_named(Demand, words[System.DEMAND]).name.lower(),
             faults=tuple(self._active_faults()),
             tasks=tuple(
                 self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
@@ -184,7 +184,13 @@ class RackMonitor:
         for fault in self._faults.staged((Stage.ACTIVE,)):
             # The kinds of faults take a while to import; most racks have none.
             from rack.boards.faults.describe import describe
+            from rack.boards.faults.kind import UNKNOWN, kind_of
 
+            if kind_of(fault) is UNKNOWN:
+                from rack.boards.config.published import Published
+
+                # A kind that the rack's levels add is known once this is read.
+                Published.of_rack(self._segment)
             yield describe(fault, self._segment.layout, self._joints)
 
     def _asserted(self) -> list[str]:
@@ -220,7 +226,7 @@ class RackMonitor:
     def _row(self, task: TaskSpec) -> TaskRow:
         block = self._segment.block(task.name)
         exec_ms, lateness_ms = self._times_ms(task.name)
-        state = TaskState(block[Block.STATE]).name.lower()
+        state = as_named(TaskState, block[Block.STATE]).name.lower()
         reason = ""
         row = ""
         mode = ""
@@ -228,7 +234,7 @@ class RackMonitor:
             state = LOST
         elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
             # Of a user's level without a state, or with others, it is that of its process.
-            state = LEVEL_STATES.get(getattr(status.value, "state", None), state)
+            state = state_name(getattr(status.value, "state", None), state)
             reason = reason_of(status.value)
             row = fired(status.value)
             mode = mode_of(status.value)
@@ -268,7 +274,7 @@ class RackMonitor:
             return None
         at = status.value
         return TaskProgress(
-            at.moves_done, at.moves, at.action, at.actions, State(at.state).name.lower(), at.reason
+            at.moves_done, at.moves, at.action, at.actions, state_name(at.state), at.reason
         )
 
 

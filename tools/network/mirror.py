@@ -32,7 +32,7 @@ from rack.backplane.address_map import (
 )
 from rack.backplane.errors import SegmentError
 from rack.backplane.operator_table import OperatorTable, RequestStage
-from rack.backplane.segment import MAGIC, VERSION, Segment
+from rack.backplane.segment import MAGIC, TEXTS, VERSION, Segment
 from rack.backplane.words import Block, Box, Head, System
 from rack.boards.lan.questions import MOST_CONTENT, DeskAnswer, Stretch
 
@@ -95,7 +95,7 @@ class Mirror(Segment):
     is_mirror = True
 
     def __init__(self, rack: str, fetch: Fetch) -> None:
-        """Fetch layout and config. Raises `SegmentError` when the other program has another
+        """Fetch the texts in its head. Raises `SegmentError` when the other program has another
         version."""
         self._fetch = fetch
         (head,), answer = fetch([WORDS])
@@ -108,9 +108,8 @@ class Mirror(Segment):
         super().__init__(rack, mmap.mmap(-1, words[Head.SIZE]))
         self.is_there = True
         self._note(answer)
-        layout = self._cut(words[Head.LAYOUT_AT], words[Head.LAYOUT_SIZE])
-        config = self._cut(words[Head.CONFIG_AT], words[Head.CONFIG_SIZE])
-        self._fill([WORDS, *layout, *config])
+        texts = [part for at in TEXTS for part in self._cut(words[at], words[at + 1])]
+        self._fill([WORDS, *texts])
         self.read_head()
         self._rings = {ring.head: ring for ring in self._all_rings()}
         # The heads of all rings: in control blocks, in the words of mailboxes, and before alarms.

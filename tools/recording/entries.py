@@ -11,6 +11,7 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import COMMAND_ID
 from rack.backplane.operator_table import Request
 from rack.boards.classes import find_class
+from rack.boards.config.commands import requests
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.host.adapter import Adapter
@@ -54,11 +55,11 @@ def recorded_commands(recording: Recording) -> tuple[Request, ...]:
 
     Raises `Failure` if the recording lacks some.
     """
-    plan = resolve(recording.rack_config)
-    commanded = _issued(recording, plan.layout)
+    layout = recording.layout
+    commanded = _issued(recording, layout)
     if commanded and recording.kept:
         raise Failure(f"--from {recording.folder}: {recording.kept_text}", 2)
-    for known in plan.commands:
+    for known in requests(recording.rack_config, layout):
         # Issued at its tick, or later in real time: the same may have been commanded before it.
         later = (r for r in commanded if r.tick >= known.tick)
         given = (r for r in later if replace(r, tick=known.tick) == known)

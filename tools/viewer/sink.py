@@ -15,7 +15,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config import RackConfig, loads, rack_timing
+from rack.boards.config import RackConfig, rack_timing, read_stored
 from rack.levels.messages import (
     ARM_STATE,
     MOVE_PLAN,
@@ -76,7 +76,7 @@ class Ran(NamedTuple):
     @classmethod
     def of(cls, layout: Layout, text: str, folder: Path) -> Self:
         """Return it for a run in `folder`; `text` is the resolved config."""
-        config = loads(text)
+        config = read_stored(text)
         robot = config.robot
         cell = None if robot is None else build_cell(robot, config.scene, config.clock_ns)
         return cls(layout, text, config, cell, folder / "events.jsonl")

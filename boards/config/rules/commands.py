@@ -10,25 +10,38 @@ from pydantic import ValidationError
 from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.boards.config.cell import built_cell
 from rack.boards.config.mistakes import at_key, mistakes_of
+from rack.boards.config.published import Levels, PublishedLevel
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.config.wiring import commandable, executor_of
 from rack.boards.errors import Mistake
 from rack.levels.errors import LevelError, RobotError
 from rack.levels.operator import NAMED, Commands, Goal, Operation, goal_names, listed
-from rack.levels.tables import live_keys, read_setting
+from rack.levels.tables import read_setting
 
 
 def command_mistakes(
-    commands: Iterable[tuple[str, CommandConfig]], config: RackConfig, broken: Collection[str] = ()
+    commands: Iterable[tuple[str, CommandConfig]],
+    config: RackConfig,
+    levels: Levels,
+    broken: Collection[str] = (),
 ) -> list[Mistake]:
-    """Return every mistake in commands, given with their places in a config; a live command has an
-    empty place.
+    """Check commands.
 
-    Commands for `broken` boards, which have mistakes of their own, are not checked.
+    Args:
+        commands: The commands, with their places in a config. A live command has an empty place.
+        config: The config of the rack.
+        levels: Its levels.
+        broken: Boards with mistakes of their own. Commands for them are not checked.
+
+    Returns:
+        Every mistake.
     """
     given = list(commands)
     checked = [(place, command) for place, command in given if command.level not in broken]
-    found = [mistake for place, command in checked for mistake in _mistakes(place, command, config)]
+    found = [
+        mistake
+        for place, command in checked
+        for mistake in _mistakes(place, command, config, levels)
+    ]
     if len(given) > OPERATOR_ENTRIES:
         found.append(
             Mistake(
@@ -38,25 +51,28 @@ def command_mistakes(
     return found
 
 
-def _mistakes(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+def _mistakes(
+    place: str, command: CommandConfig, config: RackConfig, published: Levels
+) -> Iterator[Mistake]:
     at = partial(at_key, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
-    levels = commandable(config)
+    levels = {name: level for name, level in published.items() if level.has_operator}
     if command.level not in levels:
         why = f"no level of this name takes commands; levels that do: {', '.join(levels) or 'none'}"
         yield Mistake(at("level"), command.level, why)
         return
-    known = levels[command.level]
+    level = levels[command.level]
+    known = level.commands
     if command.said not in known:
         why = f"'{command.level}' does not take {command.what}; it takes: {listed(known)}"
         yield Mistake(at("what"), command.what, why)
         return
     yield from _goal(at, command, known)
     if command.said is Operation.SET:
-        yield from _setting(place, command, config)
+        yield from _setting(place, command, level)
     else:
-        yield from _name(at("name"), command, config)
+        yield from _name(at("name"), command, level)
     if command.joints is not None and Goal.JOINTS in known[command.said]:
         yield from _joints(at("joints"), command.joints, config)
     for key in ("quaternion", "direction"):
@@ -93,18 +109,15 @@ def _key(goal: Goal) -> str:
     return keys.get(goal, goal.name.lower())
 
 
-def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Iterator[Mistake]:
     """Check that an operation that gives a name, and no other, gives one that its level knows."""
     if command.said not in NAMED:
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
-    params = config.board[command.level].params
-    try:
-        known = executor_of(config, command.level).wording(command.said, params, config.scene)
-    except LevelError:
-        return  # reported elsewhere
-    if command.name not in known:
+    known = level.wording.get(command.said)
+    # Mistakes that keep the names unknown are reported elsewhere.
+    if known is not None and command.name not in known:
         yield Mistake(
             place,
             command.name,
@@ -112,26 +125,25 @@ def _name(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mi
         )
 
 
-def _setting(place: str, command: CommandConfig, config: RackConfig) -> Iterator[Mistake]:
+def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Iterator[Mistake]:
     """Check that a command sets a live parameter of its level to a valid value."""
     name = at_key(place, "name")
-    kind = executor_of(config, command.level).params
     try:
         key, value = read_setting(command.name or "")
     except LevelError as error:
         yield Mistake(name, command.name, str(error))
         return
     params = name if place else f"board.{command.level}.params"
-    live = live_keys(kind)
-    if kind is None or (key not in live and key in kind.model_fields):
-        why = f"read at the launch alone; live: {', '.join(live) or 'none'}"
+    if not level.live or (key in level.params and key not in level.live):
+        why = f"read at the launch alone; live: {', '.join(level.live) or 'none'}"
         yield Mistake(f"{params}.{key}", value, why)
         return
-    given = {**config.board[command.level].params, key: value}
+    table = level.table
+    given = {key: value}
     try:
-        kind.model_validate(given)
+        table.model_validate(given)
     except ValidationError as error:
-        yield from mistakes_of(error, kind, given, params)
+        yield from mistakes_of(error, table, given, params)
 
 
 def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:

@@ -9,15 +9,13 @@ from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
 from rack.backplane.layout import Layout, Role
 from rack.backplane.mailbox.queue import is_position
 from rack.boards.config.mistakes import at_key
+from rack.boards.config.published import Levels
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.wiring import executors
 from rack.boards.errors import Mistake
 from rack.boards.faults.config import FaultConfig, condition
 from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.levels.tables import RobotConfig
 
-Steps = tuple[type, ...]
-"""Classes of steps, as in `Executor.faults`."""
 Place = str
 """The place of a fault in a config, as in "fault[0]"; empty for a fault injected live."""
 
@@ -25,15 +23,25 @@ Place = str
 def fault_mistakes(
     faults: Iterable[tuple[Place, FaultConfig]],
     config: RackConfig,
+    levels: Levels,
     layout: Layout | None = None,
     unspecified: Collection[str] = (),
 ) -> list[Mistake]:
-    """Return every mistake in faults, given with their places.
+    """Check faults.
 
-    Without a layout, rules that need one are skipped. Boards in `unspecified` have mistakes of
-    their own.
+    Args:
+        faults: The faults, with their places.
+        config: The config of the rack.
+        levels: Its levels.
+        layout: Its layout. Without it the rules that need one are skipped.
+        unspecified: Boards with mistakes of their own.
+
+    Returns:
+        Every mistake.
     """
-    rules = [FaultRules(place, fault, config, layout, unspecified) for place, fault in faults]
+    rules = [
+        FaultRules(place, fault, config, levels, layout, unspecified) for place, fault in faults
+    ]
     found = [mistake for rule in rules for mistake in rule.mistakes()]
     if len(rules) > FAULT_ENTRIES:
         found.append(
@@ -49,6 +57,7 @@ class FaultRules:
     place: Place
     fault: FaultConfig
     config: RackConfig
+    levels: Levels
     layout: Layout | None = None
     unspecified: Collection[str] = ()
 
@@ -58,8 +67,6 @@ class FaultRules:
         fault = self.fault
         places = (*self.config.tasks(), *self.config.hosts())
         tasks: dict[str, Role] = {place.name: place.role for place in places}
-        # The levels' modules may add kinds.
-        driving = self._driving()
         kind = KINDS.names.get(fault.kind)
         if kind is None:
             yield self._mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
@@ -69,7 +76,7 @@ class FaultRules:
             if fault.board.partition(".")[0] not in self.unspecified:
                 yield self._mistake("board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}")
         elif kind is not None:
-            yield from self._target(kind, tasks, driving)
+            yield from self._target(kind, tasks)
         if self.layout is not None and fault.when is not None:
             try:
                 condition(fault.when, self.layout)
@@ -124,9 +131,7 @@ class FaultRules:
             if parameter.default is None and parameter.name not in self.fault.parameters:
                 yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
 
-    def _target(
-        self, kind: Kind, tasks: Mapping[str, Role], driving: Mapping[str, Steps]
-    ) -> Iterator[Mistake]:
+    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Iterator[Mistake]:
         """Check that the task can be struck by such a fault."""
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
@@ -149,7 +154,12 @@ class FaultRules:
             fitting = _listed(name for name, other in tasks.items() if other == role)
             yield self._mistake("board", f"{kind.name} strikes only {role}s; {role}s: {fitting}")
         elif kind.where == "arm":
-            able = [name for name, steps in driving.items() if isinstance(kind.step, steps)]
+            able = [
+                name
+                for name in self.config.board
+                # What strikes a level whose class is missing is not known.
+                if name not in self.levels or kind.name in self.levels[name].struck_by
+            ]
             if board not in able:
                 yield self._mistake(
                     "board",
@@ -191,14 +201,6 @@ class FaultRules:
                     f" it: {_listed(locked)}"
                 )
                 yield self._mistake("mailbox", why)
-
-    def _driving(self) -> dict[str, Steps]:
-        """Return the classes of steps that can strike each board's hardware, by board; of a missing
-        class any."""
-        found = executors(self.config).items()
-        return {
-            name: (object,) if executor is None else executor.faults for name, executor in found
-        }
 
     def _without(self, keys: Iterable[str], why: str) -> Iterator[Mistake]:
         """Check that none of these keys is given."""

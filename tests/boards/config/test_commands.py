@@ -8,7 +8,8 @@ import pytest
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.boards.config import RackConfig, load, wire
-from rack.boards.config.commands import DOWN, asked, request, setting_name, takes
+from rack.boards.config.commands import DOWN, asked, request, takes
+from rack.boards.config.published import publish
 from rack.boards.errors import ConfigError
 from rack.levels.operator import Goal, Operation
 
@@ -23,7 +24,7 @@ def nasrem() -> RackConfig:
 def message_of(config: RackConfig, **given: object) -> tuple[Message, int]:
     """Return the message of a command, and the tick at which it is given."""
     layout = wire(config)
-    made = request(asked(given), config, layout)
+    made = request(asked(given), config, publish(config).levels, layout)
     box = layout.mailboxes[made.mailbox]
     assert box.name == f"{given['level']}.operator"
     message = Message(message_dtype(box.fields, box.size))
@@ -79,13 +80,15 @@ def test_a_hold_is_nothing_but_a_hold(nasrem: RackConfig) -> None:
 def test_every_mistake_of_a_command_is_said(nasrem: RackConfig) -> None:
     with pytest.raises(ConfigError, match="unknown key"):
         asked({"level": "task", "what": "hold", "speed": 2})
+    levels = publish(nasrem).levels
     with pytest.raises(ConfigError, match="primitive"):
-        request(asked({"level": "nobody", "what": "hold"}), nasrem, wire(nasrem))
+        request(asked({"level": "nobody", "what": "hold"}), nasrem, levels, wire(nasrem))
 
 
 def test_what_a_level_takes_has_the_names_that_it_knows(nasrem: RackConfig) -> None:
-    commands = {Operation.HOLD: (), Operation.SETPOINT: (Goal.JOINTS, Goal.POSE)}
-    assert takes(nasrem, "primitive", commands) == "hold, setpoint joints|pose"
+    assert takes(publish(nasrem).levels["primitive"]) == "hold, resume"
     config = load("configs/examples/own-modification/gentle.toml")
-    assert takes(config, "servo", {Operation.MODIFY: ()}) == "modify gentle"
-    assert setting_name(config, "servo", 0) == "gentle"
+    servo = publish(config).levels["servo"]
+    assert "modify gentle on|off" in takes(servo)
+    assert "set bandwidth|damping" in takes(servo)
+    assert servo.names == ("gentle",)

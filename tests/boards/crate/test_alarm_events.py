@@ -16,6 +16,7 @@ from rack.backplane.words import Demand
 from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
 from rack.boards.config.faults import injections
+from rack.boards.config.published import PublishedLevel
 from rack.boards.crate.alarm_events import AlarmEvents
 from rack.boards.events import Event
 from rack.levels.messages import Error
@@ -64,9 +65,9 @@ def segment(config: MakeConfig, rack_name: str) -> Iterator[Segment]:
 def alarm_events(
     segment: Segment,
     geom: Callable[[int], str] = str,
-    name: Callable[[str, int], str] = lambda board, number: str(number),
+    names: tuple[str, ...] = ("first", "second"),
 ) -> AlarmEvents:
-    return AlarmEvents(segment, JOINTS, geom, name, lambda board, key: None)
+    return AlarmEvents(segment, JOINTS, geom, {"wave": PublishedLevel(names=names)})
 
 
 def heard(
@@ -248,7 +249,7 @@ def test_the_end_of_a_fault_says_how_often_it_acted(segment: Segment) -> None:
 def test_a_modification_that_failed_is_named_by_its_board(segment: Segment) -> None:
     AlarmWriter(segment, "wave").ring(400, Alarm.MODIFICATION, 1)
     row = alarm_ring(segment, "wave").drain().rows[-1]
-    event = alarm_events(segment, name=lambda board, number: f"{board} {number}").of(row, "wave")
+    event = alarm_events(segment, names=("wave 0", "wave 1")).of(row, "wave")
     assert (event.kind, event.code, event.subject) == ("detection", "modification", "wave 1")
     assert event.text == "control modification 'wave 1' failed and was taken out"
 

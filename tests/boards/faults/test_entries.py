@@ -11,6 +11,7 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config import wire
 from rack.boards.config.faults import injection, injections
+from rack.boards.config.published import publish
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.describe import describe, document
@@ -139,7 +140,7 @@ def test_a_fault_injected_live_is_checked_in_the_same_way(config: MakeConfig) ->
     with pytest.raises(
         ConfigError, match=r"^size = 1: hang has no such parameter; parameters: none$"
     ):
-        injection(fault, found, wire(found))
+        injection(fault, found, publish(found).levels, wire(found))
 
 
 def test_the_fault_table_returns_the_faults_added(config: MakeConfig, rack_name: str) -> None:

@@ -80,9 +80,14 @@ class ByHand(Display):
 
 def requests(config: RackConfig, **ticks: int) -> tuple[Request, ...]:
     """Return commands to the upper level, each at a tick."""
-    layout = resolve(config).layout
+    plan = resolve(config)
     return tuple(
-        request(asked({"level": "upper", "what": what, "tick": tick}), config, layout)
+        request(
+            asked({"level": "upper", "what": what, "tick": tick}),
+            config,
+            plan.published.levels,
+            plan.layout,
+        )
         for what, tick in ticks.items()
     )
 

@@ -21,6 +21,7 @@ from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
 from rack.tools.recording.occasions import Retention
+from rack.tools.recording.parquet import PUBLISHED
 from rack.tools.recording.recorder.flight import FlightRecorder
 from rack.tools.recording.run_files import RunFiles, Tally
 from rack.tools.recording.spool import Frame, Spool, rings
@@ -180,6 +181,7 @@ class Recorder:
         # The spool first: it fails where another recorder is running, and leaves that one's files
         # alone.
         self._spool = Spool(folder, layout, segment.launch)
+        (folder / PUBLISHED).write_text(segment.published)
         retention = Retention.of(segment)
         self._rings = rings(segment)
         before = {name: ring.before for name, ring in self._rings.items()}

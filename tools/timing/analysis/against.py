@@ -62,8 +62,8 @@ def _repeated(
 ) -> tuple[Repetition | None, str]:
     """Return what repeating a cycle shows, or why it is not repeated."""
     if not is_wanted:
-        return None, "--no-repeat"
-    print(f"repeating tick {cycle.tick} in both runs; --no-repeat omits that", file=sys.stderr)
+        return None, "--repeat runs both racks again, to that cycle"
+    print(f"repeating tick {cycle.tick} in both runs", file=sys.stderr)
     try:
         return repeated(found, cycle), ""
     except Failure as failure:

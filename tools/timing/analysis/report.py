@@ -82,6 +82,7 @@ def report_of(recording: Recording) -> Report:
     config = recording.rack_config
     layout = recording.layout
     ended = recording.ended
+    recording.adopt_kinds()
     origin = Origin.of(recording)
     found = misses(recording)
     last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)

@@ -10,6 +10,7 @@ from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.boards.config import RackConfig, load
 from rack.boards.config.cell import built_cell
 from rack.boards.config.commands import asked
+from rack.boards.config.published import publish
 from rack.boards.config.rules.commands import command_mistakes
 
 HOME = [0.0, 0.7, -2.4, 0.0, -1.4, 0.0]
@@ -29,7 +30,8 @@ def gentle() -> RackConfig:
 
 def mistakes(config: RackConfig, broken: frozenset[str] = frozenset(), **given: Any) -> list[str]:
     """Return what is wrong with a command."""
-    return [str(found) for found in command_mistakes([("", asked(given))], config, broken)]
+    levels = publish(config).levels
+    return [str(found) for found in command_mistakes([("", asked(given))], config, levels, broken)]
 
 
 @pytest.mark.parametrize(
@@ -138,8 +140,9 @@ def test_the_ends_of_a_joints_range_are_permitted(nasrem: RackConfig) -> None:
 
 def test_no_more_commands_than_the_table_holds_can_wait(nasrem: RackConfig) -> None:
     hold = ("", asked({"level": "task", "what": "hold"}))
-    assert command_mistakes([hold] * OPERATOR_ENTRIES, nasrem) == []
-    (found,) = command_mistakes([hold] * (OPERATOR_ENTRIES + 1), nasrem)
+    levels = publish(nasrem).levels
+    assert command_mistakes([hold] * OPERATOR_ENTRIES, nasrem, levels) == []
+    (found,) = command_mistakes([hold] * (OPERATOR_ENTRIES + 1), nasrem, levels)
     many = OPERATOR_ENTRIES + 1
     assert str(found) == (
         f"command = {many}: too many pending commands; permitted: {OPERATOR_ENTRIES}"

@@ -12,6 +12,7 @@ from rack.backplane.address_map import FAULT_ENTRIES
 from rack.backplane.layout import Layout
 from rack.boards.config import load, loads, wire
 from rack.boards.config.faults import fault_mistakes, injection
+from rack.boards.config.published import Levels, publish
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -164,12 +165,12 @@ def fault_of(kind: Kind, **keys: Any) -> Fault:
 
 
 @cache
-def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Layout]:
+def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Levels, Layout]:
     """Return the rack that can have every kind, but for those that need locks, or real time."""
     mode = "lockstep" if lockstep else "realtime"
     text = DRIVEN.replace('mode = "lockstep"', f'mode = "{mode}"')
     found = loads(text + ('[protocol]\ndefault = "lock"\n' if locked else ""))
-    return found, wire(found)
+    return found, publish(found).levels, wire(found)
 
 
 def mistake_of(kind: Kind, lockstep: bool = False, **keys: Any) -> str:

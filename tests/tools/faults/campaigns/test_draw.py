@@ -15,6 +15,7 @@ import pytest
 
 from rack.boards.config import load, wire
 from rack.boards.config.faults import fault_mistakes, places
+from rack.boards.config.published import publish
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.config import FaultConfig
@@ -84,7 +85,10 @@ def test_every_plan_fits_its_rack(
 ) -> None:
     for plan in [*drawn(course, kinds, "3", True), *drawn(course, kinds, "3", False)]:
         planned = plan.config(config, "other")
-        assert fault_mistakes(places(planned), planned, course.targets.layout) == []
+        assert (
+            fault_mistakes(places(planned), planned, publish(planned).levels, course.targets.layout)
+            == []
+        )
     assert size_plans(course, kinds, 10, 3, 61)[0].number == 61
 
 

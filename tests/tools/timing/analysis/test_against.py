@@ -243,9 +243,9 @@ def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
 ) -> None:
     one = ran("one", REMEMBERING)
     two = ran("two", REMEMBERING, "board.wave.params.factor=2")
-    done = rack("report", two.folder, "--against", one.folder, "--no-repeat")
+    done = rack("report", two.folder, "--against", one.folder)
     assert done.returncode == 1
-    assert "  - not repeated: --no-repeat" in done.stdout.splitlines()
+    assert "  - not repeated: --repeat runs both racks again, to that cycle" in done.stdout
     assert f"  - board.wave.params.factor is 2, in {one.folder} not set" in done.stdout.splitlines()
     other = ran("other", COMMANDED)
     for arguments, said in (

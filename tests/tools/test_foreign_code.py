@@ -1,0 +1,289 @@
+"""Looking at a rack or a run, or commanding it, imports nothing that its config names."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+import rack as api
+from rack.backplane.segment import Segment, racks
+from rack.boards.faults import KINDS
+from rack.tools.cli import COMMANDS
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.processes import RACK, wait_until
+from tests.tools.command_line import BOUND_S, rack
+
+MODULE = "spy_levels"
+SPY = '''
+"""Levels of somebody else, which note each program that imports them."""
+
+import os
+from pathlib import Path
+
+with Path(__file__).with_suffix(".imported").open("a") as file:
+    file.write(Path("/proc/self/cmdline").read_text().replace("\\0", " ") + "\\n")
+
+from commanded_levels import Homing, Upper
+
+from rack.backplane.watch.alarms import Alarm
+from rack.boards.faults import KINDS, Kind, Parameter
+from rack.boards.faults.bounds import DELIVERY, writes
+from rack.boards.faults.messages import Drop
+
+KINDS.add(
+    Kind(
+        "spy-drop",
+        "writer",
+        "a message is lost",
+        detected_as=(Alarm.GAP,),
+        bound=writes(1) + DELIVERY,
+        step=Drop,
+        parameters=(Parameter("probability", "1", "part that is lost", 1.0, 0.5, 1.0),),
+    )
+)
+'''
+RUNS_THEM = {
+    "run": "it runs a config",
+    "check": "it checks a config",
+    "robot": "it checks a config",
+    "schema": "it shows the keys of a config's levels",
+    "prompt": "it runs a program of the caller's own rack",
+    "rewind": "it runs the rack of a run again",
+    "campaign": "it runs a config",
+    "bench": "it runs configs",
+    "reproduce": "it runs configs",
+    "claims": "it runs commands of the project",
+}
+"""The commands that may import what a config names. Any other one is tested below."""
+
+
+class Spied(NamedTuple):
+    """A rack that runs, and a recorded run, both with levels that note who imports them."""
+
+    rack: str
+    run: Path
+    marker: Path
+
+
+ARGUMENTS: dict[str, Callable[[Spied], Sequence[Sequence[object]]]] = {
+    "list": lambda spied: [()],
+    "status": lambda spied: [(spied.rack,), (spied.rack, "--json")],
+    "watch": lambda spied: [
+        (
+            *(spied.rack, "lower.status.count", "--when", "lower.status.count > 1"),
+            *("--before", "10ms", "--after", "10ms", "--out", spied.run / "watched.csv"),
+        )
+    ],
+    "mailbox": lambda spied: [(spied.rack,), (spied.rack, "lower.status")],
+    "command": lambda spied: [
+        (spied.rack, "--list"),
+        (spied.rack, "upper", "hold"),
+        (spied.rack, "upper", "resume"),
+        (spied.rack, "lower", "modify", "twice", "on"),
+    ],
+    "set": lambda spied: [(spied.rack, "board.lower.params.by=2")],
+    "inject": lambda spied: [
+        ("--list",),
+        (spied.rack, "lower", "spy-drop", "probability=0.5", "--cycles", "3"),
+        (spied.rack, "--list"),
+    ],
+    "pause": lambda spied: [(spied.rack,)],
+    "resume": lambda spied: [(spied.rack,)],
+    "step": lambda spied: [(spied.rack,), (spied.rack, "--run")],
+    "estop": lambda spied: [(spied.rack,), (spied.rack, "--reset")],
+    "clean": lambda spied: [()],
+    "replay": lambda spied: [(spied.run, "--out", spied.run / "again.rrd")],
+    "export": lambda spied: [(spied.run,)],
+    "report": lambda spied: [(spied.run,), (spied.run, "--against", spied.run)],
+    "analyze": lambda spied: [(spied.run,), (spied.run, "--response")],
+    "gantt": lambda spied: [(spied.run,)],
+    "lan": lambda spied: [("certificates", spied.run / "certs", "--for", "someone")],
+}
+"""Arguments with which each command is tried, on a rack that runs and on a run."""
+AS_PROCESSES = {
+    "top": lambda spied: (spied.rack,),
+    "record": lambda spied: (spied.rack, "--out", spied.run.parent / "recorded"),
+}
+"""Commands that last as long as the rack; `stop` ends it."""
+BOARDS = ("upper", "lower")
+HOLD = commands('level = "upper", what = "hold", tick = 300')
+
+
+@pytest.fixture(scope="module")
+def spied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spied]:
+    folder = tmp_path_factory.mktemp("somebody")
+    own = tmp_path_factory.mktemp("levels")
+    (own / f"{MODULE}.py").write_text(SPY)
+    path = folder / "spied.toml"
+    text = COMMANDED.replace("commanded_levels:Lower", f"{MODULE}:Homing")
+    text = text.replace("commanded_levels:Upper", f"{MODULE}:Upper")
+    path.write_text(text.replace("python_path = [", f'python_path = ["{own}", '))
+    marker = own / f"{MODULE}.imported"
+    run = folder / "run"
+    name = f"test-spied-{os.getpid()}"
+    command = [*RACK, "run", str(path), "--lockstep", "--set", f"name={name}"]
+    fault = 'fault=[{ kind = "spy-drop", board = "lower", tick = 200, cycles = 2 }]'
+    command = [*command, *(f"--set=board.{board}.budget.process_ms=0.1" for board in BOARDS)]
+    recorded = [
+        *command,
+        "--set",
+        fault,
+        f"--set={HOLD}",
+        "--seconds",
+        "1",
+        "--out",
+        str(run),
+        "--json",
+    ]
+    done = subprocess.run(recorded, capture_output=True, text=True, timeout=BOUND_S)
+    assert done.returncode == 0, done.stderr
+    assert "rack.tools.cli run" in marker.read_text()
+    process = subprocess.Popen([*command, "--no-record"], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(name.encode()) and b"tick 0 " not in line:
+            break
+    marker.unlink()
+    yield Spied(name, run, marker)
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture
+def guarded(spied: Spied, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spied]:
+    """The levels, where an import would find them even without the config's path."""
+    monkeypatch.syspath_prepend(str(spied.marker.parent))
+    monkeypatch.setattr(KINDS, "_by_name", dict(KINDS._by_name))
+    monkeypatch.setattr(KINDS, "_by_number", dict(KINDS._by_number))
+    monkeypatch.setattr(KINDS, "_adopted", set())
+    before = list(sys.path)
+    yield spied
+    assert not spied.marker.exists(), spied.marker.read_text()
+    assert MODULE not in sys.modules
+    assert sys.path == before
+
+
+def test_every_command_is_tried_or_said_to_run_what_a_config_names() -> None:
+    assert {name for name, _, _ in COMMANDS} == {
+        *RUNS_THEM,
+        *ARGUMENTS,
+        *AS_PROCESSES,
+        "stop",
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ARGUMENTS)
+def test_a_command_imports_nothing_that_a_config_names(command: str, guarded: Spied) -> None:
+    for arguments in ARGUMENTS[command](guarded):
+        done = rack(command, *arguments)
+        assert done.returncode == 0, (arguments, done.stdout, done.stderr)
+
+
+@pytest.mark.slow
+def test_a_program_that_attaches_imports_nothing_that_a_config_names(guarded: Spied) -> None:
+    with api.attach(guarded.rack) as live:
+        assert live.command("lower", "hold").worked
+        assert live.command("lower", "resume").worked
+        assert live.set("board.lower.params.by", 3).worked
+        live.inject("lower", "spy-drop", cycles=2)
+        assert live.wait_for("begins", BOUND_S).text.startswith("spy-drop (probability 1")
+        assert live.status().rack == guarded.rack
+    run = api.open_run(guarded.run)
+    assert run.report["faults"][0]["kind"] == "spy-drop"
+
+
+@pytest.mark.slow
+def test_what_is_published_refuses_as_a_config_does(guarded: Spied) -> None:
+    key = "board.lower.params"
+    for arguments, line in {
+        ("set", guarded.rack, f"{key}.by=10"): (
+            f"{key}.by = 10: should be less than or equal to 9; counts in a cycle"
+        ),
+        ("set", guarded.rack, f"{key}.by=2.5"): (
+            f"{key}.by = 2.5: should be a valid integer; counts in a cycle"
+        ),
+        ("set", guarded.rack, f"{key}.label='a'"): (
+            f'{key}.label = "a": read at the launch alone; live: by'
+        ),
+        ("set", guarded.rack, f"{key}.lable=2"): (
+            f"{key}.lable = 2: unknown key; did you mean 'label'?"
+        ),
+        ("command", guarded.rack, "lower", "modify", "thrice", "on"): (
+            "name = \"thrice\": modify of 'lower' knows: twice"
+        ),
+        ("inject", guarded.rack, "lower", "spy-drop", "probability=0.2"): (
+            "probability = 0.2: out of range; permitted: 0.5 to 1; part that is lost"
+        ),
+    }.items():
+        done = rack(*arguments)
+        assert (done.returncode, done.stderr) == (2, f"{line}\n")
+
+
+@pytest.mark.slow
+def test_a_report_made_again_knows_kinds_that_levels_add(guarded: Spied) -> None:
+    (guarded.run / "report.json").unlink()
+    done = rack("report", guarded.run, "--json")
+    (fault,) = json.loads(done.stdout)["faults"]
+    assert (fault["kind"], fault["seen"], fault["found_as"]) == ("spy-drop", "detected", "gap")
+    published = guarded.run / "published.json"
+    text = published.read_text()
+    try:
+        for damaged, said in {"": "published.json", "{}": "unknown kind 'spy-drop'"}.items():
+            KINDS._by_name.pop("spy-drop", None)
+            published.write_text(damaged)
+            (guarded.run / "report.json").unlink(missing_ok=True)
+            refused = rack("report", guarded.run)
+            assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+            assert said in refused.stderr
+    finally:
+        published.write_text(text)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.getuid() != 0, reason="only root attaches to racks of other users")
+def test_a_prompt_is_refused_on_a_rack_of_another_user(guarded: Spied) -> None:
+    segment = Segment.attach(guarded.rack)
+    try:
+        os.fchown(segment.fd, 4711, -1)
+        done = rack("prompt", guarded.rack)
+    finally:
+        os.fchown(segment.fd, os.getuid(), -1)
+        segment.close()
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "belongs to user 4711" in done.stderr
+
+
+@pytest.mark.slow
+def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(guarded.marker.parent)}
+    started = {
+        command: subprocess.Popen(
+            [*RACK, command, *map(str, arguments(guarded))],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for command, arguments in AS_PROCESSES.items()
+    }
+    try:
+        spool = guarded.run.parent / "recorded" / "published.json"
+        wait_until(spool.exists)
+        stopped = rack("stop", guarded.rack, "--wait", BOUND_S)
+        assert stopped.returncode == 0, stopped.stderr
+        for command, process in started.items():
+            printed, _ = process.communicate(timeout=BOUND_S)
+            assert process.returncode == 0, (command, printed)
+    finally:
+        for process in started.values():
+            process.kill()
+            process.communicate()
+    assert guarded.rack not in racks()
