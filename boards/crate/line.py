@@ -56,6 +56,7 @@ class CrateLine:
             [
                 sys.executable,
                 "-u",
+                "-P",
                 "-m",
                 "rack.boards.crate",
                 str(theirs.fileno()),

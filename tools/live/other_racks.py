@@ -59,7 +59,7 @@ class OtherRacks:
             report = os.memfd_create("report")
             # A group of its own: Ctrl-C would reach it twice, from the terminal and from here.
             process = subprocess.Popen(
-                [sys.executable, "-m", "rack.tools.cli", "run", other, *options],
+                [sys.executable, "-P", "-m", "rack.tools.cli", "run", other, *options],
                 stdin=subprocess.DEVNULL,
                 stdout=report,
                 process_group=0,

@@ -72,7 +72,7 @@ class RecorderProcess:
 
     def _start(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "rack.tools.recording.recorder", VIEW],
+            [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._complaints,

@@ -127,7 +127,13 @@ def load() -> Iterator[str]:
         words = f"stress-ng --cpu {len(cores)} --io 1"
         parts = [words.split()]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-m", "rack.tools.faults.campaigns.environment", str(os.getpid())]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "rack.tools.faults.campaigns.environment",
+        str(os.getpid()),
+    ]
     busy = [
         subprocess.Popen(
             [*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL

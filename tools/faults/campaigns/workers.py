@@ -111,6 +111,7 @@ class Workers:
             here, there = Pipe()
             command = [
                 sys.executable,
+                "-P",
                 "-m",
                 "rack.tools.faults.campaigns.workers",
                 str(there.fileno()),

@@ -31,6 +31,7 @@ def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
     ours, theirs = Pipe()
     command = [
         sys.executable,
+        "-P",
         "-m",
         "rack.tools.lab.benches.apart",
         str(theirs.fileno()),
