@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from importlib import import_module
-from io import StringIO
+from io import StringIO, TextIOBase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -156,6 +156,7 @@ def main() -> None:
         )
     # First of all: importing what a command needs takes longer than many a command.
     INTERRUPT.catch()
+    _open_closed_streams()
     try:
         try:
             run_commands()
@@ -172,6 +173,32 @@ def main() -> None:
         return
     finally:
         INTERRUPT.settle()
+
+
+class ClosedInput(TextIOBase):
+    """A stdin that was closed before the start."""
+
+    def fileno(self) -> int:
+        """Return the descriptor, which is always readable."""
+        return 0
+
+    def readline(self, size: int | None = -1, /) -> str:  # type: ignore[override]
+        """Raise `Failure`."""
+        from rack.tools.console.answer import Failure
+
+        raise Failure("stdin is closed, and this command reads from it", 2)
+
+
+def _open_closed_streams() -> None:
+    """Give closed standard streams their descriptors back: the next file that is opened would get
+    one, and what is printed."""
+    # The lowest free descriptor is that of the first closed stream.
+    if sys.stdin is None:
+        os.open(os.devnull, os.O_RDONLY)
+        sys.stdin = ClosedInput()  # type: ignore[assignment]
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
 
 
 def run_commands() -> None:

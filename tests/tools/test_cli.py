@@ -15,6 +15,7 @@ import pytest
 from rack.tools.cli import COMMANDS as ALL
 from rack.tools.cli import GROUPS
 from tests.processes import RACK
+from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
 LONG = "a" * 5000
@@ -146,6 +147,16 @@ def test_in_a_removed_working_folder_a_command_works_or_says_why_not(
     script = f'cd "{tmp_path}" && rmdir "{tmp_path}" && exec {command}'
     done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, timeout=BOUND_S)
     assert (done.stderr.strip(), done.returncode) == (answer, 2 if answer else 0)
+
+
+@pytest.mark.slow
+def test_with_stdin_closed_a_command_that_reads_it_says_so(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    line = ["sh", "-c", '"$@" <&-', "sh", *RACK, "rewind", str(small_run(tmp_path_factory))]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=BOUND_S)
+    said = "stdin is closed, and this command reads from it\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
 
 
 @pytest.mark.slow

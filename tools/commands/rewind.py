@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rack.boards.errors import one_line
+from rack.levels.tables import LAST_TICK
 from rack.tools.console.answer import MAX_LINE, Failure, as_failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RunFolder
@@ -213,8 +214,16 @@ def _seconds(text: str) -> float:
     raise argparse.ArgumentTypeError(f"{text}: permitted: 0 to {MOST_S:g} s")
 
 
+def _ticks(text: str) -> int:
+    """Return a number of ticks. Raises `ArgumentTypeError`."""
+    with suppress(ValueError):
+        if abs(found := int(text)) <= LAST_TICK:
+            return found
+    raise argparse.ArgumentTypeError(f"{text}: permitted: at most {LAST_TICK} ticks, either way")
+
+
 _WHEN = {"nargs": "+"}
-_TICKS = {"nargs": "?", "type": int, "default": 1}
+_TICKS = {"nargs": "?", "type": _ticks, "default": 1}
 ARGUMENTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "goto": {"time": {"nargs": "?"}, "--when": _WHEN},
     "step": {"ticks": _TICKS},

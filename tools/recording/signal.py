@@ -18,7 +18,7 @@ from rack.backplane.message import text_of
 from rack.tools.console.answer import Failure
 from rack.tools.recording.parquet import Column, columns_of
 
-NAME = re.compile(r"([\w.]+)((?:\[\d+\])*)")
+NAME = re.compile(r"([\w.]+)((?:\[\d{1,9}\])*)")
 CONDITION = re.compile(r"\s*(\S+?)\s*(==|!=|<=|>=|<|>)\s*(\S+)\s*")
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
     "==": operator.eq,

@@ -23,6 +23,7 @@ from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
 SECONDS = 2.0
+DIGITS = "9" * 400
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +162,16 @@ def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
         "goto": 'goto: permitted: goto TIME, as in 12.5; or goto --when "',
         "goto soon": "soon: permitted: 0 to 1.9975 s",
         "goto nan": "nan: permitted: 0 to 1.9975 s",
-        "step x": "step: argument ticks: invalid int value: 'x'; permitted: step [TICKS]",
+        "step x": "step: argument ticks: x: permitted: at most 1000000000000000 ticks, either way",
+        f"step {DIGITS}": f"{DIGITS[:40]}",
+        f"back -{DIGITS}": "permitted: at most 1000000000000000 ticks, either way",
+        f"goto {DIGITS}": "permitted: 0 to 1.9975 s",
+        f"goto -{DIGITS}": "permitted: 0 to 1.9975 s",
+        f"events {DIGITS}": "permitted: 0 to 1e+09 s",
+        f"branch --seconds {DIGITS}": "permitted: 0 to 1e+09 s",
+        f"branch --set seed={DIGITS}": "seed = ",
+        f"show wave.status.value[{DIGITS}]": "no such level, mailbox or signal",
+        f"show wave.status.value[{12 * DIGITS}]": "no such level, mailbox or signal",
         'goto --when "wave.status.valeu > 1"': "nearest: wave.status.value",
         "show wavf": "wavf: no such level, mailbox or signal; nearest: wave",
         "show wave.status.value[3]": "no such index",
