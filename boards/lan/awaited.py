@@ -7,6 +7,8 @@ import tomllib
 from collections.abc import Iterator
 from enum import IntEnum
 
+from rack.backplane.checked import as_named, pick
+from rack.backplane.errors import DamageError
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
@@ -45,7 +47,10 @@ def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
             from rack.boards.lan.config import LanTable
 
             why, place = divmod(word - 1, 1 << _PLACES)
-            table = tomllib.loads(segment.config)["adapter"][task.board]
+            table = tomllib.loads(segment.config).get("adapter", {}).get(task.board)
+            if table is None:
+                raise DamageError(f"'{task.board}' waits for another rack and is no adapter")
             keys = {field.alias or name for name, field in LanTable.model_fields.items()}
             racks = LanTable.model_validate({key: table[key] for key in keys & table.keys()}).racks
-            yield task.board, f"waits for rack '{racks[place]}': {_TEXTS[Why(why)]}"
+            rack = pick(racks, place, "rack")
+            yield task.board, f"waits for rack '{rack}': {_TEXTS[as_named(Why, why)]}"

@@ -12,6 +12,7 @@ import time
 from importlib import import_module
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.checked import as_named
 from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import ReleasedTask
@@ -66,7 +67,7 @@ class SystemController:
         self._faults = FaultStage(segment, driver)
         self._desk = OperatorDesk(segment, driver.alarms)
         self._settled: tuple[int, int, int, int] | None = None
-        self._demand = Demand(self._words[System.DEMAND])
+        self._demand = as_named(Demand, self._words[System.DEMAND])
 
     def begin(self, tick: int) -> None:
         """Do the work due before the tasks of `tick` are released."""

@@ -1,0 +1,240 @@
+"""Noise in a rack's shared memory: whoever looks at it says so in one line, and nothing is left."""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from rack.backplane.address_map import (
+    ALARM_DEPTH,
+    ALARM_RECORD_SIZE,
+    ALARM_SIZE,
+    BLOCK_SIZE,
+    FAULT_ENTRY_SIZE,
+    LINE,
+    MAILBOX_HEAD_SIZE,
+    operator_entry_size,
+)
+from rack.backplane.errors import BackplaneError
+from rack.backplane.mailbox.history import digest
+from rack.backplane.segment import Segment, racks, unlink
+from rack.backplane.trace import trace_ring
+from rack.boards import Rack
+from rack.boards.config import load, read_stored
+from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.crate.heartbeat import Heartbeat
+from rack.boards.crate.patience import RackAwaited
+from rack.boards.events import Ending, Journal
+from rack.tools.faults.ending import arm_of, levels_of, strikes
+from rack.tools.faults.live import LiveRack
+from rack.tools.live.desk import LiveDesk
+from rack.tools.live.snapshot import RackMonitor
+from rack.tools.live.watched import LocalRack
+from rack.tools.recording.spool import rings
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.processes import RACK, named, wait_until
+from tests.tools.command_line import BOUND_S
+
+SEEDS = 20
+NOISE = 8 * 32
+"""Address behind the head, whose words are checked when a program attaches."""
+
+
+class Ran(NamedTuple):
+    """A rack at the end of a run: its segment's memory, and what stands in the head's texts."""
+
+    memory: bytes
+    segment: Segment
+
+
+REGIONS = (
+    "words",
+    "fault table",
+    "operator table",
+    "alarms",
+    "newest alarms",
+    "clock's alarms",
+    "count of alarms",
+    "control block",
+    "trace",
+    "mailbox",
+    "messages",
+    "all",
+)
+REFUSED = {*REGIONS} - {"trace", "messages"}
+"""Regions in which some noise is refused. A record of a trace may hold any number, and a damaged
+message counts as lost."""
+
+
+def regions(segment: Segment) -> dict[str, tuple[int, int]]:
+    """Return the parts of a segment that hold numbers, from address to address."""
+    places = segment.map
+    task = segment.layout.tasks[0].name
+    box = segment.layout.mailboxes[0].name
+    alarms = places.alarms[task]
+    found = (
+        (NOISE, 8 * 96),
+        (places.faults, places.faults + 2 * FAULT_ENTRY_SIZE),
+        (places.operator, places.operator + 2 * operator_entry_size(segment.layout)),
+        (alarms, alarms + ALARM_SIZE),
+        (alarms + LINE, alarms + 4 * LINE),
+        (places.alarms["clock"] + LINE, places.alarms["clock"] + 4 * LINE),
+        (alarms, alarms + LINE),
+        (places.blocks[task], places.blocks[task] + BLOCK_SIZE),
+        (places.traces[task], alarms),
+        (places.mailboxes[box], places.mailboxes[box] + MAILBOX_HEAD_SIZE),
+        (places.mailboxes[box] + MAILBOX_HEAD_SIZE, places.mailboxes[box] + 4096),
+        (NOISE, places.size),
+    )
+    return dict(zip(REGIONS, found, strict=True))
+
+
+def spoil(segment: Segment, region: str, seed: int) -> None:
+    """Write noise over words of a region: any number, or a small one that may be an index."""
+    chance = random.Random(f"{region} {seed}")
+    begin, end = regions(segment)[region]
+    for _ in range(chance.choice((1, 8, 64))):
+        at = chance.randrange(begin // 8, end // 8)
+        is_small = chance.random() < 0.5
+        segment.words[at] = chance.randint(-9, 300) if is_small else chance.getrandbits(64) - 2**63
+
+
+def looks(segment: Segment) -> dict[str, Callable[[], object]]:
+    """Return the ways in which the launcher, commands and recorders look at a rack."""
+    config = read_stored(segment.config)
+    joints = config.joints
+    ending = Ending(segment, None, 1000)
+    one = LocalRack(segment.rack)
+    heartbeat = Heartbeat(segment)
+    return {
+        "monitor": lambda: RackMonitor(segment).look(),
+        "alarms": lambda: AlarmWatch(segment, config).drain(),
+        "heartbeat": heartbeat.hanging,
+        "awaited": lambda: RackAwaited(segment, Journal(None)).look(),
+        "digest": lambda: digest(segment, 100),
+        "latched": ending.latched,
+        "levels": lambda: levels_of(segment),
+        "arm": lambda: arm_of(segment),
+        "strikes": lambda: strikes(segment, joints),
+        "faults": lambda: LiveRack(segment).faults(),
+        "desk": lambda: list(LiveDesk(one).text()),
+        "rings": lambda: [ring.drain() for ring in rings(segment).values()],
+        "trace": lambda: trace_ring(segment, segment.layout.tasks[0].name).drain(),
+    }
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """A rack after a run with commands, faults and alarms."""
+    path = tmp_path_factory.mktemp("noise") / "rack.toml"
+    path.write_text(COMMANDED)
+    told = commands('level = "upper", what = "hold", tick = 50', 'level = "lower", what = "hold"')
+    fault = 'fault=[{ kind = "drop", board = "lower", tick = 60, cycles = 20 }]'
+    with Rack(load(path, [f"name=test-noise-{path.parent.name}", told, fault])) as one:
+        one.run(0.3)
+        memory = bytes(one.segment.bytes)
+        segment = one.segment
+    assert {event.kind for event in one.events} >= {"fault", "detection", "command"}
+    return Ran(memory, segment)
+
+
+@pytest.fixture
+def copy(ran: Ran, rack_name: str) -> Iterator[Segment]:
+    """A segment like that of the rack."""
+    found = ran.segment
+    made = Segment.create(replace(found.layout, rack=rack_name), found.config, found.published)
+    yield made
+    made.close()
+    unlink(rack_name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("region", REGIONS)
+def test_whoever_looks_at_a_damaged_rack_refuses_it_or_looks(
+    region: str, ran: Ran, copy: Segment
+) -> None:
+    refused = 0
+    end = copy.map.size
+    for seed in range(SEEDS):
+        for name in looks(copy):
+            copy.bytes[NOISE:end] = ran.memory[NOISE:end]
+            look = looks(copy)[name]
+            spoil(copy, region, seed)
+            try:
+                look()
+            except BackplaneError:
+                refused += 1
+            except Exception as error:
+                pytest.fail(f"{name}, seed {seed}: {error!r}")
+    assert refused or region not in REFUSED
+
+
+@contextmanager
+def launched(path: Path, name: str) -> Iterator[subprocess.Popen[str]]:
+    """A rack in lockstep without an end, past its first ticks."""
+    path.write_text(COMMANDED)
+    process = subprocess.Popen(
+        [*RACK, "run", str(path), "--no-record", "--set", f"name={name}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith(name) and "tick 0 " not in line:
+                break
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.slow
+def test_a_launcher_that_reads_no_valid_alarm_ends_in_one_line_and_leaves_nothing(
+    tmp_path: Path, rack_name: str
+) -> None:
+    with launched(tmp_path / "rack.toml", rack_name) as process:
+        segment = Segment.attach(rack_name)
+        address = segment.map.alarms["lower"]
+        count = segment.words[address // 8] + 1
+        record = address + LINE + count % ALARM_DEPTH * ALARM_RECORD_SIZE
+        segment.words[record // 8 + 2] = 4711
+        segment.words[address // 8] = count
+        segment.close()
+        _, err = process.communicate(timeout=BOUND_S)
+    said = "the rack's shared memory is damaged: 4711 is not a value of Alarm"
+    assert (process.returncode, err) == (1, f"{said}\n")
+    assert rack_name not in racks()
+    wait_until(lambda: not named(f"{rack_name}:"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("region", ["words", "control block", "count of alarms", "all"])
+def test_a_rack_with_noise_in_it_runs_on_or_ends_and_leaves_nothing(
+    region: str, tmp_path: Path, rack_name: str
+) -> None:
+    with launched(tmp_path / "rack.toml", rack_name) as process:
+        segment = Segment.attach(rack_name)
+        for seed in range(3):
+            spoil(segment, region, seed)
+        # Time for the launcher to look at it; a rack that runs on is stopped.
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(2.0)
+        segment.close()
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=BOUND_S)
+    assert process.returncode in (0, 1, 128 + signal.SIGTERM), err
+    # What a board prints before it is lost is an event.
+    own = [line for line in out.splitlines() if "printed: " not in line]
+    assert "Traceback" not in "\n".join([*own, err])
+    assert rack_name not in racks()
+    wait_until(lambda: not named(f"{rack_name}:"))
