@@ -206,8 +206,7 @@ def reason_of(status: Message) -> str:
 def state_name(state: int | None, otherwise: str = "") -> str:
     """Return the name of a level's state; of a user's level that has others, `otherwise` or the
     number."""
-    names = {known.value: known.name.lower() for known in State}
-    return names.get(state, otherwise or str(state))
+    return State(state).name.lower() if state in set(State) else otherwise or str(state)
 
 
 def copied(message: Message) -> Message:

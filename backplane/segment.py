@@ -240,10 +240,8 @@ class Segment:
             ) from None
 
     def _text(self, at: int) -> bytes:
-        start, size = self.words[at : at + 2]
-        if not 0 <= start <= start + size <= len(self.bytes):
-            raise ValueError(f"a text of {size} bytes at {start}")
-        return bytes(self.bytes[start : start + size])
+        start = self.words[at]
+        return bytes(self.bytes[start : start + self.words[at + 1]])
 
     def view(self, address: int, size: int) -> memoryview:
         """Return the bytes at a bus address."""

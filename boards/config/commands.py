@@ -19,7 +19,7 @@ from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.config.timing import first_tick
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import norm
-from rack.levels.operator import Goal, Operation, goal_names
+from rack.levels.operator import Goal, goal_names
 
 DOWN = (0.0, 0.0, -1.0)
 
@@ -29,8 +29,8 @@ def takes(level: PublishedLevel) -> str:
     table saw|slow"."""
     words = []
     for what, goals in level.commands.items():
-        names = level.live if what is Operation.SET else level.wording.get(what, ())
-        wording = (what.name.lower(), "|".join(names), goal_names(goals))
+        names = "|".join(level.wording.get(what, ()))
+        wording = (what.name.lower(), names, goal_names(goals))
         words.append(" ".join(word for word in wording if word))
     return ", ".join(words)
 

@@ -11,10 +11,9 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError, create_model
+from pydantic import Field, TypeAdapter, create_model
 from pydantic.fields import FieldInfo
 
 from rack.backplane.errors import SegmentError
@@ -28,8 +27,6 @@ from rack.levels.level import Executor
 from rack.levels.operator import NAMED, Commands, Goal, Operation
 from rack.levels.tables import Table, keys_of, live_keys, read_params
 
-MOST_BYTES = 1_000_000
-"""Largest text that is read."""
 TYPES: Mapping[str, type] = {kind.__name__: kind for kind in (bool, int, float, str)}
 """Types of parameters whose values can be checked without the level's class."""
 Constraint = Literal["gt", "ge", "lt", "le", "allow_inf_nan"]
@@ -38,21 +35,19 @@ CONSTRAINTS: tuple[Constraint, ...] = ("gt", "ge", "lt", "le", "allow_inf_nan")
 
 @dataclass(frozen=True)
 class PublishedParam:
-    """A parameter of a level. All but `is_live` is known of live ones only.
+    """A parameter that an operator may set while its level runs.
 
     Attributes:
-        is_live: An operator may set it while the level runs.
         kind: Name of its type in `TYPES`. Empty: the level alone can check its values.
         meaning: Its meaning, with its unit.
         constraints: Bounds of its values, by the names that pydantic has for them.
         launched: Its value at the launch, as text.
     """
 
-    is_live: bool = False
-    kind: str = ""
-    meaning: str = ""
-    constraints: Mapping[Constraint, float | bool] = field(default_factory=dict)
-    launched: str = ""
+    kind: str
+    meaning: str
+    constraints: Mapping[Constraint, float | bool]
+    launched: str
 
 
 @dataclass(frozen=True)
@@ -60,34 +55,29 @@ class PublishedLevel:
     """A level, as its operator and the injector of faults know it.
 
     Attributes:
-        has_operator: It reads an operator's commands.
         commands: The operator's commands that it takes, with the forms of their goals.
         wording: Names that each command with a name may give. A command is missing if its names are
             not known.
         names: See `Executor.names`.
-        params: Its parameters by key.
+        keys: Keys of all its parameters.
+        live: Its live parameters by key.
         struck_by: Kinds of faults that can strike the hardware that it drives.
     """
 
-    has_operator: bool = False
     commands: Mapping[Operation, tuple[Goal, ...]] = field(default_factory=dict)
     wording: Mapping[Operation, tuple[str, ...]] = field(default_factory=dict)
     names: tuple[str, ...] = ()
-    params: Mapping[str, PublishedParam] = field(default_factory=dict)
+    keys: tuple[str, ...] = ()
+    live: Mapping[str, PublishedParam] = field(default_factory=dict)
     struck_by: tuple[str, ...] = ()
 
     @property
-    def live(self) -> tuple[str, ...]:
-        """Keys of the parameters that an operator may set while the level runs."""
-        return tuple(key for key, param in self.params.items() if param.is_live)
-
-    @property
     def table(self) -> type[Table]:
-        """A table that checks the values of parameters, as far as they are published."""
-        fields: dict[str, Any] = {
-            key: (TYPES.get(p.kind, Any), Field(None, description=p.meaning, **p.constraints))
-            for key, p in self.params.items()
-        }
+        """A table that checks the values of live parameters."""
+        fields: dict[str, Any] = dict.fromkeys(self.keys, (Any, None))
+        for key, param in self.live.items():
+            declared = Field(None, description=param.meaning, **param.constraints)
+            fields[key] = (TYPES.get(param.kind, Any), declared)
         return create_model("Params", __base__=Table, **fields)
 
 
@@ -96,7 +86,7 @@ Levels = Mapping[str, PublishedLevel]
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedRack:
     """The levels of a rack, and the kinds of faults that their modules add."""
 
     levels: Levels = field(default_factory=dict)
@@ -104,34 +94,30 @@ class Published:
 
     def text(self) -> str:
         """Return it as text, without the parts of kinds that are code."""
-        return json.dumps(_adapter().dump_python(self, exclude=CODE))
+        return json.dumps(ADAPTER.dump_python(self, exclude=CODE))
 
     @classmethod
-    def read(cls, text: str) -> Published:
+    def read(cls, text: str) -> PublishedRack:
         """Return what a text contains. Its kinds of faults are known to this process from now on.
 
         Raises:
             ValueError: The text is no such record.
         """
-        if len(text) > MOST_BYTES:
-            raise ValueError(f"{len(text)} characters; permitted: {MOST_BYTES}")
-        try:
-            found = _adapter().validate_json(text)
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        found = ADAPTER.validate_json(text)
         KINDS.adopt(found.kinds)
         return found
 
     @classmethod
-    def of_rack(cls, segment: Segment) -> Published:
+    def of_rack(cls, segment: Segment) -> PublishedRack:
         """Return what a rack has published. Raises `SegmentError`."""
         try:
             return cls.read(segment.published)
         except ValueError as error:
-            raise SegmentError(f"rack '{segment.rack}': published levels: {error}") from None
+            why = " ".join(str(error).split())
+            raise SegmentError(f"rack '{segment.rack}': published levels: {why}") from None
 
 
+ADAPTER = TypeAdapter(PublishedRack)
 CODE: Any = {
     "kinds": {
         "__all__": {
@@ -145,68 +131,51 @@ CODE: Any = {
 """What is not published: functions and classes."""
 
 
-@cache
-def _adapter() -> TypeAdapter[Published]:
-    return TypeAdapter(Published)
-
-
-def publish(config: RackConfig) -> Published:
+def publish(config: RackConfig) -> PublishedRack:
     """Gather the facts about a rack's levels from their classes, which are imported."""
     taken = commandable(config)
     levels = {
-        name: _level(config, name, kind, taken.get(name))
+        name: _level(config, name, kind, taken.get(name, {}))
         for name, kind in executors(config).items()
-        if kind is not None
     }
-    return Published(levels, tuple(kind for kind in KINDS if kind.name not in BUILT_IN))
+    return PublishedRack(levels, tuple(kind for kind in KINDS if kind.name not in BUILT_IN))
 
 
 def _level(
-    config: RackConfig, board: str, kind: type[Executor], commands: Commands | None
+    config: RackConfig, board: str, kind: type[Executor], commands: Commands
 ) -> PublishedLevel:
     given = config.board[board].params
-    wording: dict[Operation, tuple[str, ...]] = {}
-    taken = {what: tuple(goals) for what, goals in (commands or {}).items()}
-    for what in taken.keys() & {*NAMED} - {Operation.SET}:
+    live: dict[str, PublishedParam] = {}
+    if kind.params is not None and (keys := live_keys(kind.params)):
+        declared = keys_of(kind.params)
+        launched = None
+        # Of parameters with mistakes, which are reported elsewhere, no value is known.
+        with suppress(LevelError):
+            launched = read_params(kind.params, given)
+        live = {key: _param(declared[key], getattr(launched, key, "")) for key in keys}
+    wording = {Operation.SET: tuple(live)}
+    for what in commands.keys() & {*NAMED} - {Operation.SET}:
         # A table may be in the middle of being edited.
         with suppress(LevelError):
             wording[what] = tuple(kind.wording(what, given, config.scene))
     return PublishedLevel(
-        has_operator=commands is not None,
-        commands=taken,
+        commands={what: tuple(goals) for what, goals in commands.items()},
         wording=wording,
         names=tuple(kind.names(given)),
-        params=_params(kind.params, given),
+        keys=() if kind.params is None else tuple(kind.params.model_fields),
+        live=live,
         struck_by=tuple(k.name for k in KINDS if isinstance(k.step, kind.faults)),
     )
 
 
-def _params(kind: type[Table] | None, given: Mapping[str, Any]) -> dict[str, PublishedParam]:
-    if kind is None:
-        return {}
-    live = live_keys(kind)
-    found = dict.fromkeys(kind.model_fields, PublishedParam())
-    if live:
-        declared = keys_of(kind)
-        launched = None
-        # Of parameters with mistakes, which are reported elsewhere, no value is known.
-        with suppress(LevelError):
-            launched = read_params(kind, given)
-        found |= {key: _live_param(declared[key], getattr(launched, key, "")) for key in live}
-    return found
-
-
-def _live_param(declared: FieldInfo, launched: object) -> PublishedParam:
+def _param(declared: FieldInfo, launched: object) -> PublishedParam:
     constraints: dict[Constraint, float | bool] = {}
     for bound in declared.metadata:
         for key in CONSTRAINTS:
             if (value := getattr(bound, key, None)) is not None:
                 constraints[key] = value if isinstance(value, bool) else float(value)
-    kind = next((name for name, found in TYPES.items() if found is declared.annotation), "")
+    kind = getattr(declared.annotation, "__name__", "")
+    is_known = kind in TYPES
     return PublishedParam(
-        is_live=True,
-        kind=kind,
-        meaning=declared.description or "",
-        constraints=constraints if kind else {},
-        launched=str(launched),
+        kind, declared.description or "", constraints if is_known else {}, str(launched)
     )

@@ -30,7 +30,7 @@ from rack.boards.config.faults import injections, places
 from rack.boards.config.files import CONFIGS, anchor, assembled
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
 from rack.boards.config.mistakes import mistakes_of
-from rack.boards.config.published import Published, publish
+from rack.boards.config.published import PublishedRack, publish
 from rack.boards.config.rules import broken_rules, network_rules
 from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.rules.faults import fault_mistakes
@@ -137,7 +137,7 @@ class Resolved:
     hosts: tuple[HostWiring, ...]
     faults: tuple[Injection, ...]
     commands: tuple[Request, ...]
-    published: Published
+    published: PublishedRack
     goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
     def for_run(

@@ -337,10 +337,9 @@ class Wiring:
         return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
 
 
-def executors(config: RackConfig) -> dict[str, type[Executor] | None]:
-    """Return the class of each board's executor; None where it is missing, which is reported
-    elsewhere."""
-    found: dict[str, type[Executor] | None] = dict.fromkeys(config.board)
+def executors(config: RackConfig) -> dict[str, type[Executor]]:
+    """Return the class of each board's executor; those that are missing are reported elsewhere."""
+    found: dict[str, type[Executor]] = {}
     for name, board in config.board.items():
         with suppress(LookupError):
             found[name] = find_class(board.executor, Executor)
@@ -353,8 +352,7 @@ def commandable(config: RackConfig) -> dict[str, Commands]:
     return {
         name: executor.commands
         for name, executor in executors(config).items()
-        if executor is not None
-        and any(port.source == OWN_OPERATOR for port in executor.inputs.values())
+        if any(port.source == OWN_OPERATOR for port in executor.inputs.values())
     }
 
 

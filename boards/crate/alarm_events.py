@@ -19,8 +19,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
-from rack.boards.config.published import Levels, Published, PublishedLevel, PublishedParam
-from rack.boards.config.schema import RackConfig
+from rack.boards.config.published import Levels, PublishedRack
+from rack.boards.config.resolved import read_stored
 from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
 from rack.boards.faults.bounds import counting
 from rack.boards.faults.describe import board_of, joint_name, subject_of
@@ -133,14 +133,15 @@ class RungAlarm(NamedTuple):
 class AlarmWatch:
     """Reads all alarm rings of a rack. `lost` counts alarms overwritten before they were read."""
 
-    def __init__(self, segment: Segment, config: RackConfig) -> None:
+    def __init__(self, segment: Segment) -> None:
+        config = read_stored(segment.config)
         self._rings = {
             name: alarm_ring(segment, name)
             for name in (CLOCK, *(t.name for t in segment.layout.tasks))
         }
         # The cell is built at the first collision.
         geom = str if config.robot is None else partial(geom_name, config)
-        levels = Published.of_rack(segment).levels
+        levels = PublishedRack.of_rack(segment).levels
         self._events = AlarmEvents(segment, config.joints, geom, levels)
         self.lost = 0
 
@@ -253,7 +254,8 @@ class AlarmEvents:
         elif about == "joint":
             subject = joint_name(number, self._joints)
         elif about == "name":
-            subject = pick(self._levels[owner].names, number, "name")
+            names = self._levels[owner].names if owner in self._levels else ()
+            subject = pick(names, number, "name")
         elif about == "brakes":
             subject = (
                 as_named(Error, number).name.lower()
@@ -279,9 +281,8 @@ class AlarmEvents:
             key, value = read_setting(command.name)
         except LevelError:  # given past the checks of a config: the level refuses it
             return ""
-        level = self._levels.get(board, PublishedLevel())
-        launched = level.params.get(key, PublishedParam()).launched
-        before = self._live.get((board, key), launched or None)
+        param = self._levels[board].live.get(key)
+        before = self._live.get((board, key), param and param.launched)
         self._live[board, key] = value
         return f", before {before}"
 

@@ -251,7 +251,7 @@ class Rack:
             self.segment, self._plan.hosts, supervision, self._line, self._journal
         )
         self._losses.begin(self._recovery, self._hosts)
-        self._alarms = AlarmWatch(self.segment, self.config)
+        self._alarms = AlarmWatch(self.segment)
         self._heartbeat = Heartbeat(self.segment)
         self._awaited = RackAwaited(self.segment, self._journal)
         if self._origin is None:

@@ -199,7 +199,6 @@ class Kinds:
     def __init__(self) -> None:
         self._by_name: dict[str, Kind] = {}
         self._by_number: dict[int, Kind] = {}
-        self._adopted: set[str] = set()
 
     def add(self, *kinds: Kind) -> None:
         """Add kinds. Raises `ValueError` for a name or number in use, or for too many
@@ -217,12 +216,8 @@ class Kinds:
             self._by_name[kind.name] = self._by_number[kind.number] = kind
 
     def adopt(self, kinds: Iterable[Kind]) -> None:
-        """Add kinds that a rack has published, in place of those that another one has. None
-        replaces a kind that this process has imported."""
-        for kind in kinds:
-            if kind.name in self._adopted or kind.number not in self._by_number:
-                self._adopted.add(kind.name)
-                self._by_name[kind.name] = self._by_number[kind.number] = kind
+        """Add kinds that a rack has published, besides those that are known here."""
+        self.add(*(kind for kind in kinds if kind.number not in self._by_number))
 
     def __iter__(self) -> Iterator[Kind]:
         return iter(self._by_name.values())

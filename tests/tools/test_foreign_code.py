@@ -162,7 +162,6 @@ def guarded(spied: Spied, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spied]:
     monkeypatch.syspath_prepend(str(spied.marker.parent))
     monkeypatch.setattr(KINDS, "_by_name", dict(KINDS._by_name))
     monkeypatch.setattr(KINDS, "_by_number", dict(KINDS._by_number))
-    monkeypatch.setattr(KINDS, "_adopted", set())
     before = list(sys.path)
     yield spied
     assert not spied.marker.exists(), spied.marker.read_text()
@@ -237,7 +236,8 @@ def test_a_report_made_again_knows_kinds_that_levels_add(guarded: Spied) -> None
     text = published.read_text()
     try:
         for damaged, said in {"": "published.json", "{}": "unknown kind 'spy-drop'"}.items():
-            KINDS._by_name.pop("spy-drop", None)
+            kind = KINDS._by_name.pop("spy-drop", None)
+            KINDS._by_number.pop(kind.number if kind else 0, None)
             published.write_text(damaged)
             (guarded.run / "report.json").unlink(missing_ok=True)
             refused = rack("report", guarded.run)
@@ -287,3 +287,21 @@ def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -
             process.kill()
             process.communicate()
     assert guarded.rack not in racks()
+
+
+@pytest.mark.slow
+def test_a_file_in_the_current_folder_is_no_module_of_a_crate_or_a_recorder(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    (tmp_path / "numpy.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')")
+    safe = [sys.executable, "-P", *RACK[1:]]
+    given = ["--set", f"name={rack_name}", "--seconds", "0.1", "--out", tmp_path / "run"]
+    done = subprocess.run(
+        [*safe, "run", small, *given],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+    )
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "imported").exists()

@@ -17,7 +17,7 @@ from rack.backplane.words import System
 from rack.boards.config import read_stored
 from rack.boards.config.faults import injection
 from rack.boards.config.mistakes import mistakes_of
-from rack.boards.config.published import Published
+from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig, condition_text
 from rack.boards.faults.describe import describe, document
@@ -40,7 +40,7 @@ class LiveRack:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._config = read_stored(self._segment.config)
-        self._levels = Published.of_rack(self._segment).levels
+        self._levels = PublishedRack.of_rack(self._segment).levels
         self._table = FaultTable(self._segment)
         self._joints = self._config.joints
 

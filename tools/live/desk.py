@@ -22,7 +22,7 @@ from rack.backplane.operator_table import (
 from rack.backplane.words import System
 from rack.boards.config import read_stored
 from rack.boards.config.commands import asked, request, takes
-from rack.boards.config.published import Published
+from rack.boards.config.published import PublishedRack
 from rack.boards.config.schema import CommandConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.operator import describe, message_of
@@ -48,8 +48,8 @@ class LiveDesk:
         self._rack = rack
         self._segment = rack.segment
         self._config = read_stored(self._segment.config)
-        levels = Published.of_rack(self._segment).levels
-        self._levels = {name: one for name, one in levels.items() if one.has_operator}
+        levels = PublishedRack.of_rack(self._segment).levels
+        self._levels = {name: one for name, one in levels.items() if one.commands}
 
     def levels(self) -> list[dict[str, str]]:
         """Return the commands that each level takes, and the one in force, as plain data."""

@@ -23,7 +23,6 @@ from textual.widgets.option_list import Option
 
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
-from rack.boards.config import read_stored
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.errors import BoardError
 from rack.boards.faults import KINDS
@@ -84,7 +83,7 @@ class RackScreen(App[None]):
         self._has_ended = has_ended
         self._looks = RackMonitor(segment)
         self._gauges = Gauges(segment)
-        self._alarms = AlarmWatch(segment, read_stored(segment.config))
+        self._alarms = AlarmWatch(segment)
         self._lines = UtilityLines(segment)
         self._events: deque[Text] = deque(maxlen=500)  # newest first
         self._levels = deque(self._gauges.levels)

@@ -187,10 +187,10 @@ class RackMonitor:
             from rack.boards.faults.kind import UNKNOWN, kind_of
 
             if kind_of(fault) is UNKNOWN:
-                from rack.boards.config.published import Published
+                from rack.boards.config.published import PublishedRack
 
                 # A kind that the rack's levels add is known once this is read.
-                Published.of_rack(self._segment)
+                PublishedRack.of_rack(self._segment)
             yield describe(fault, self._segment.layout, self._joints)
 
     def _asserted(self) -> list[str]:

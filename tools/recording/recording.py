@@ -22,10 +22,9 @@ from rack.backplane.message import printable
 from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, read_stored
-from rack.boards.config.published import Published
+from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
-from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import (
@@ -111,13 +110,12 @@ class Recording:
             raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
 
     def adopt_kinds(self) -> None:
-        """Let this process know the kinds of faults that the rack's own levels add, if one of them
-        struck. Raises `Failure`."""
-        faults = self.ended.get("faults", ())
+        """Let this process know the kinds of faults that the rack's own levels add. Raises
+        `Failure`."""
         path = self.folder / PUBLISHED
-        if path.exists() and any(fault["kind"] not in KINDS for fault in faults):
+        if path.exists():
             with _naming(path):
-                Published.read(self._text(PUBLISHED))
+                PublishedRack.read(self._text(PUBLISHED))
 
     def _parts(self, mailbox: str) -> list[pq.ParquetFile]:
         """Return the parts of a mailbox's table, oldest first."""

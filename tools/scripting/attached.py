@@ -16,7 +16,6 @@ import numpy as np
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
-from rack.boards.config import read_stored
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure, as_failure
@@ -53,7 +52,7 @@ class AttachedRack:
         self._boxes = segment.layout.mailboxes
         self._desk = LiveDesk(self._rack)
         self._monitor = RackMonitor(segment)
-        self._alarms = AlarmWatch(segment, read_stored(segment.config))
+        self._alarms = AlarmWatch(segment)
         self._alarms.drain()
         self._events: list[Event] = []  # since then, without those that were waited for
 

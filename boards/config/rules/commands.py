@@ -57,7 +57,7 @@ def _mistakes(
     at = partial(at_key, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
-    levels = {name: level for name, level in published.items() if level.has_operator}
+    levels = {name: level for name, level in published.items() if level.commands}
     if command.level not in levels:
         why = f"no level of this name takes commands; levels that do: {', '.join(levels) or 'none'}"
         yield Mistake(at("level"), command.level, why)
@@ -134,7 +134,7 @@ def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Itera
         yield Mistake(name, command.name, str(error))
         return
     params = name if place else f"board.{command.level}.params"
-    if not level.live or (key in level.params and key not in level.live):
+    if not level.live or (key in level.keys and key not in level.live):
         why = f"read at the launch alone; live: {', '.join(level.live) or 'none'}"
         yield Mistake(f"{params}.{key}", value, why)
         return

@@ -113,9 +113,7 @@ class Targets:
         self.layout = layout
         self.joints = len(config.robot.joints) if config.robot is not None else 0
         self._roles = {task.name: task.role for task in layout.tasks}
-        self._driving = {
-            name: kind.faults for name, kind in executors(config).items() if kind is not None
-        }
+        self._driving = {name: kind.faults for name, kind in executors(config).items()}
         self.by_kind = {kind.name: self._of(kind) for kind in KINDS}
         # The clock's process can be killed like any other.
         self.by_kind[EXTERNAL] = self._at(EXTERNAL, [*self._roles, CLOCK])
