@@ -44,7 +44,9 @@ class Trouble:
             print("a wave", tick)  # noqa: T201  output of boards is tested
         elif self._kind == "raise" and tick == self._at:
             raise ValueError(f"no wave at tick {tick}")
-        elif self._kind == "late" and tick == self._at:
+        elif self._kind == "late" and tick >= self._at:
+            # Once, in the first cycle from then on: in real time a loaded machine skips some.
+            self._kind = "none"
             end = time.monotonic_ns() + self._took_ns
             while time.monotonic_ns() < end:
                 pass
