@@ -83,7 +83,7 @@ def _jit(marked: compiled[..., Any]) -> Any:
     from numba import config, njit
 
     # NUMBA_DISABLE_JIT is for a user's own functions: these call the C library's by address.
-    config.DISABLE_JIT = 0
+    config.DISABLE_JIT = 0  # type: ignore[attr-defined]  # numba makes it
     function: Any = marked._function
     known = function.__globals__
     called = {
