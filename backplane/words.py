@@ -74,7 +74,6 @@ class System(IntEnum):
     # while another rack is lost, the arm is to stop: see `switch`. Written by the network adapter
     PEER_STOP = 55
     SKIPPED_FROM = 56  # first of the ticks that the clock skipped last
-    SKIPPED_TO = 58  # end of them
     # the recorder has taken everything up to here, whether or not it is in its files
     FOLLOWER_DRAINED = 57
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed

@@ -104,7 +104,6 @@ class ClockDriver(ABC):
         All at once, and the count last: a late task must see neither half a skip nor one that began
         after its release.
         """
-        self.words[System.SKIPPED_TO] = first + ticks
         self.words[System.SKIPPED_FROM] = first
         self.words[System.CLOCK_SKIPPED] += ticks
 

@@ -18,7 +18,7 @@ from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
-from rack.backplane.words import Block, Box, System, is_on
+from rack.backplane.words import Block, Box, is_on
 
 MUTE_CYCLES = 3
 """Age in cycles of the writer from which silence is investigated; two are normal."""
@@ -28,8 +28,6 @@ _LOST = int(Block.LOST)
 _CLAIMANT = int(Box.CLAIMANT)
 _VOID = int(Box.VOID)
 _KEPT = int(Box.KEPT)
-_SKIPPED_FROM = int(System.SKIPPED_FROM)
-_SKIPPED_TO = int(System.SKIPPED_TO)
 
 
 class ReadingTask:
@@ -93,7 +91,6 @@ class SilenceWatch:
         self._episodes = episodes
         self._task = task
         self._slots = reader.slots
-        self._words = segment.words
         self._cycles = CycleRecord(segment, spec.writer)
         self._block = segment.block(spec.writer)
         self._reported: dict[Alarm, int] = {}
@@ -144,7 +141,8 @@ class SilenceWatch:
         # A serial without a message was lost on the way, not suppressed.
         spec = self._reader.spec
         due = finished - (finished + spec.ahead - spec.phase) % spec.every
-        if self._words[_SKIPPED_FROM] <= due < self._words[_SKIPPED_TO]:
+        # The writer may have been away at that release: dead, late, or not released by the clock.
+        if self._cycles.ended_ns(due) is None:
             return False
         return slots.copy(head) and slots.serial == head and slots.tick < due
 

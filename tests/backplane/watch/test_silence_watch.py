@@ -13,7 +13,7 @@ from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.process import state_of
 from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import Alarm
-from rack.backplane.words import Block, System
+from rack.backplane.words import Block
 from tests.backplane.bus import NAME
 from tests.link import MakeLink, ReadingTask, WritingTask, links
 from tests.processes import FORKS, forked, kill, wait_until
@@ -155,8 +155,6 @@ def test_a_message_that_was_due_in_a_pause_of_the_clock_was_not_suppressed(
     rack = link(cycles=8)
     rack.run(0, 80)
     # Those of ticks 87, 95 and 103 are skipped; the next is of 111.
-    rack.segment.words[System.SKIPPED_FROM] = 80
-    rack.segment.words[System.SKIPPED_TO] = 105
     # A release that falls into the pause is made up for, with its tick.
     rack.writer.end(104)
     rack.reader.cycle(100)
@@ -167,6 +165,19 @@ def test_a_message_that_was_due_in_a_pause_of_the_clock_was_not_suppressed(
         rack.reader.cycle(tick)
     # The newest is of tick 127: three of its periods later.
     assert rack.alarms() == [(151, Alarm.MUTE)]
+
+
+def test_a_writer_that_was_away_when_its_message_was_due_did_not_suppress_it(
+    link: MakeLink,
+) -> None:
+    rack = link(cycles=8)
+    rack.run(0, 80)
+    for tick in range(80, 120):
+        rack.reader.cycle(tick)
+    # It comes back one tick after the message of 119 was due, and writes the next, of 127, in time.
+    rack.run(120, 140)
+    assert rack.alarms() == []
+    assert rack.reader.seen[-1].released == 135
 
 
 def test_a_pause_does_not_hide_a_writer_that_stays_away(link: MakeLink) -> None:
