@@ -194,6 +194,13 @@ def statuses(segment: Segment, field: str) -> Iterator[tuple[str, Message]]:
                 yield box.writer, status.value
 
 
+def arm_states(segment: Segment) -> Iterator[tuple[str, Message]]:
+    """Yield the last state of every arm or hand, which it counts by itself, with its board."""
+    for box in segment.layout.mailboxes:
+        if box.message == "arm_state":
+            yield box.writer, open_observer(segment, box.name).peek().value
+
+
 class Ending:
     """Judges the end of a run. `ends_run` and `silent` are as in `ClockWiring`."""
 
@@ -218,12 +225,19 @@ class Ending:
 
     def latched(self) -> list[str]:
         """Return a line for every level whose last status reports an error, except the level that
-        ends the run."""
-        return [
-            f"level '{board}': {reason_of(status) or f'error {status.error}'}"
+        ends the run; and for every arm that counts what its level does not report."""
+        told = {
+            board: f"level '{board}': {reason_of(status) or f'error {status.error}'}"
             for board, status in statuses(self._segment, "error")
             if status.error and f"{board}.status" != self._ends_run
-        ]
+        }
+        counted = {
+            board: f"arm of '{board}': limits exceeded in {state.violations} substeps,"
+            f" {state.touches} unintended contacts"
+            for board, state in arm_states(self._segment)
+            if state.violations or state.touches
+        }
+        return [*(counted | told).values()]
 
     def held(
         self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float
@@ -238,23 +252,31 @@ class Ending:
             event.kind in ("fault", "command") for event in events
         ):
             return
+        tick_ms = segment.layout.clock_ns * 1e-6
+        hands = dict(statuses(segment, "tension"))
+        braked = {
+            name: message
+            for name, message in (*arm_states(segment), *statuses(segment, "braked"))
+            if message.braked and name not in hands and not found
+        }
         never = []
+        for name, message in braked.items():
+            since = segment.block(name)[Block.LEVEL_SINCE]
+            why = reason_of(message) or NO_TORQUE
+            never.append(Braking(why, since, ran_ms - since * tick_ms))
         held = []
         for name, status in statuses(segment, "state"):
             block = segment.block(name)
-            since = block[Block.LEVEL_SINCE]
-            lasted_ms = ran_ms - since * segment.layout.clock_ns * 1e-6
-            if not found and getattr(status, "braked", False):
-                never.append(Braking(reason_of(status) or NO_TORQUE, since, lasted_ms))
+            lasted_ms = ran_ms - block[Block.LEVEL_SINCE] * tick_ms
             if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > HELD_MS:
                 held.append(
                     f"level '{name}' held for {lasted_ms:g} ms without a cause in sight:"
                     f" {reason_of(status) or 'no reason given'}"
                 )
-        braked = [one for one in found if one.why != DEMANDED] or never
-        times = [one.lasted_ms for one in braked]
+        counted = [one for one in found if one.why != DEMANDED] or never
+        times = [one.lasted_ms for one in counted]
         if max(times, default=0.0) > HELD_MS or sum(times) > HELD_PART * ran_ms:
-            yield f"held without a cause in sight, in {ran_ms:g} ms: {braked_text(braked)}"
+            yield f"held without a cause in sight, in {ran_ms:g} ms: {braked_text(counted)}"
         elif not any(box.name.startswith("lan.") for box in segment.layout.mailboxes):
             yield from held
 

@@ -64,6 +64,8 @@ A servo level of your own
   motion when statuses are missing, or when a joint is farther off than its `following`.
 - obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm
   only through it.
+- need not report what befalls the arm: refused torques, broken limits, contacts and brakes are
+  findings of the arm itself, and counted in its state.
 - advances the arm's time, saves its state, and publishes its scene, without which the world model
   is stale and motion holds: see `rack.levels.arm.arm`.
 
@@ -78,7 +80,7 @@ every`): the first brings them to the servo, which interpolates over the second.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any, ClassVar, NamedTuple, Self
@@ -227,6 +229,7 @@ class Finding(NamedTuple):
     alarm: Alarm
     subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular
     value: float = 0.0  # measured, in the unit of the alarm
+    since: int | None = None  # tick at which it happened, if that is not the cycle that found it
 
 
 @dataclass(frozen=True)
@@ -309,6 +312,8 @@ class Executor(LevelSection, ABC):
     commands: ClassVar[Commands] = {}
     """An operator's commands to the level, with the forms of their goals; for a level that reads
     "own.operator"."""
+    made_last: ClassVar[Executor | None] = None
+    """In this process. A board makes one executor, which then makes what it drives."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -322,6 +327,9 @@ class Executor(LevelSection, ABC):
         # The injected faults that changed anything in this cycle, by index; whether each showed:
         # then it must be found.
         self.acted: dict[int, bool] = {}
+        # Whatever it drives adds its own findings, and completes each cycle, given its `ARM_STATE`.
+        self.complete_cycle: list[Callable[[Message | None], None]] = []
+        Executor.made_last = self
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:

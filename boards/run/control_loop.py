@@ -21,6 +21,7 @@ from rack.boards.run.interrupts import interrupted
 from rack.boards.run.task import ClockGuard, Task, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
+from rack.levels.messages import ARM_STATE
 
 _DEMAND = int(System.DEMAND)
 _CLOCK_SKIPPED = int(System.CLOCK_SKIPPED)
@@ -48,6 +49,14 @@ class VirtualControlLoop(Task):
     ) -> None:
         super().__init__(segment, wiring, executor, attention)
         self.executor = executor
+        self._arm_state = next(
+            (
+                writer.message
+                for writer in self.outputs.writers.values()
+                if writer.spec.message == ARM_STATE.name
+            ),
+            None,
+        )
         self._guard = ClockGuard(segment, self.alarms, self.block) if wiring.guards_clock else None
         self._has_cycled = False
         self._due = segment.layout.due(self.spec)
@@ -115,13 +124,15 @@ class VirtualControlLoop(Task):
         executor = self.executor
         executor.demand = _DEMANDS[self.words[_DEMAND]]
         executor.process(self.inputs.values, self.outputs.messages, tick)
+        for complete_cycle in executor.complete_cycle:
+            complete_cycle(self._arm_state)
         if executor.findings or executor.acted or self.faults.loads:
             self._report(tick)
 
     def _report(self, tick: int) -> None:
         executor = self.executor
-        for alarm, subject, value in executor.findings:
-            self.alarms.ring(tick, alarm, subject, value)
+        for finding in executor.findings:
+            self.alarms.ring(tick, *finding)
         executor.findings.clear()
         self.faults.count(executor.acted, tick)
         executor.acted.clear()

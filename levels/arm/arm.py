@@ -17,7 +17,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.backplane.watch.alarms import Alarm
+from rack.backplane.watch.alarms import AT_START, NO_TORQUE, Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.plant import Plant
 from rack.levels.level import Finding
@@ -115,6 +115,8 @@ class Arm(Plant, ABC):
         self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
         self.grip_force = 0.0  # N: given to the gripper last
         self.state = DriveState.DISABLED  # of the drives, as of the last `step`
+        # Why the brakes are engaged, see `Alarm.BRAKES_CLOSED`, and since which tick; None: not.
+        self._brakes: tuple[int, int] | None = (AT_START, self.tick)
         self.dynamics = Dynamics(
             cell
         )  # for the level that drives the arm; one that senses exactly shares it with it
@@ -172,21 +174,49 @@ class Arm(Plant, ABC):
         """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
         were in it. Default: they cannot."""
 
+    def refused(self, torque: Array) -> Finding | None:
+        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;
+        None: it may. The caller then brakes; the refusal is counted and reported here."""
+        if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
+            return None
+        if np.isfinite(torque).all():
+            joint = int((np.abs(torque) / self._permitted).argmax())
+            return self.refuse(Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint])))
+        return self.refuse(Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax())))
+
+    def report_waiting(self) -> None:
+        """Add to the findings that the arm has engaged its brakes by itself, between two cycles."""
+        if self._brakes is None and self.braked:
+            if self.state is not DriveState.ENABLED:
+                self._report_brakes(Error.DRIVES, self.tick)
+            else:
+                since = self.tick - max(self.waited - self.patience, 1)
+                self._report_brakes(NO_TORQUE, since, self.waited - self.every)
+
+    def report_cycle(self) -> None:
+        """Add to the findings what a cycle did to the brakes, each time, however short; and why."""
+        super().report_cycle()
+        why = self.brake_cause
+        self.brake_cause = Error.NONE
+        if self.braked:
+            if self._brakes is None:
+                self._report_brakes(why, self.tick)
+        elif self._brakes is not None:
+            why, since = self._brakes
+            self._brakes = None
+            if self.tick > since:
+                self.findings.append(Finding(Alarm.BRAKES_OPENED, why, self.tick - since))
+
+    def _report_brakes(self, why: int, since: int, missed: int = 0) -> None:
+        self._brakes = why, since
+        self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
+
     def restore(self, state: Message) -> None:
         """Continue from an `ARM_STATE`. Default: drives that know no states are as they were."""
         super().restore(state)
         was_disabled = state.error == Error.DISABLED
         self.state = DriveState.DISABLED if was_disabled else DriveState.ENABLED
-
-    def refused(self, torque: Array) -> Finding | None:
-        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;
-        None: it may."""
-        if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
-            return None
-        if np.isfinite(torque).all():
-            joint = int((np.abs(torque) / self._permitted).argmax())
-            return Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint]))
-        return Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax()))
+        self._brakes = (NO_TORQUE, self.tick) if self.braked else None
 
     @property
     def holds(self) -> bool:

@@ -16,6 +16,7 @@ from rack.levels.arm.present import PresentLink
 from rack.levels.arm.set_points import SetPointGate
 from rack.levels.errors import RobotError
 from rack.levels.level import Finding
+from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import Bounds
@@ -116,7 +117,6 @@ class GuardedArm:
         """Pass on the torque, (joints,), N m, cut to what the limits permit; see `Link.drive`."""
         arm = self._arm
         if (refused := arm.refused(torque)) is not None:
-            arm.clipped += 1
             arm.brake()
             return refused
         state = self._state
@@ -157,7 +157,10 @@ class GuardedArm:
             what = f"velocity {value:.4g} rad/s"
         text = f"{what} of joint '{self._joints[joint]}' as sensed; permitted: {permitted}"
         arm = self._arm
+        finding = Finding(Alarm.LIMIT_EXCEEDED, joint, value)
         if arm.state is DriveState.ENABLED:  # before that it is moved by others
             arm.violations += 1
             arm.first_violation = arm.first_violation or f"{text}, at tick {sample.tick}"
-        self.exceeded = Exceeded(Finding(Alarm.LIMIT_EXCEEDED, joint, value), text)
+            arm.find(finding)
+            arm.brake_cause = Error.LIMIT
+        self.exceeded = Exceeded(finding, text)

@@ -7,7 +7,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm.substeps import Substeps
+from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell, unintended_contacts
 from rack.levels.robot.lookup import geom_name
 
@@ -31,6 +33,7 @@ class LimitMonitor:
         # steps in which a blow broke a limit of position or velocity: no drive can prevent it
         self.pushed = 0
         self.first = ""  # the first broken limit, readable
+        self.finding = Finding(Alarm.LIMIT_EXCEEDED)  # the newest one
 
     def judge(self, time_s: float, struck: bool) -> bool:
         """Judge the steps of the tick that began at simulated `time_s`; return whether one broke a
@@ -55,14 +58,16 @@ class LimitMonitor:
             if not steps.any():
                 return
         self.count += int(steps.sum())
-        if self.first:
-            return
         substep = int(steps.argmax())
         part, joint = (int(at[0]) for at in np.nonzero(wrong[substep]))
+        value = float(self._seen[substep, part, joint])
+        self.finding = Finding(Alarm.LIMIT_EXCEEDED, joint, value)
+        if self.first:
+            return
         what, unit = QUANTITIES[part]
         where = f"joint '{self._names[joint]}' at {time_s:.4f} s, step {substep}"
         permitted = f"{self._low[part, joint]:g} to {self._high[part, joint]:g} is permitted"
-        self.first = f"{what} {self._seen[substep, part, joint]:.6g} {unit} of {where}; {permitted}"
+        self.first = f"{what} {value:.6g} {unit} of {where}; {permitted}"
 
 
 class ContactMonitor:

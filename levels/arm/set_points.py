@@ -71,7 +71,6 @@ class SetPointGate:
             position[:] = q
         refused = arm.refused(target.torque) or self._misplaced(target, q, qd)
         if refused is not None:
-            arm.clipped += 1
             arm.brake()
             return refused
         wanted, is_cut = self._approached(target)
@@ -97,7 +96,7 @@ class SetPointGate:
         if not wrong.any():
             return None
         joint = int(wrong.argmax())
-        return Finding(Alarm.SET_POINT, joint, float(away[joint]))
+        return self._arm.refuse(Finding(Alarm.SET_POINT, joint, float(away[joint])))
 
     def _approached(self, target: JointTarget) -> tuple[Array, bool]:
         """Return the velocity at the end of the cycle, rad/s, and whether the set point stays

@@ -119,7 +119,6 @@ class SimulatedArm(Simulation, Arm):
             return None
         finding = self.refused(torque)
         if finding is not None:
-            self.clipped += 1
             self.brake()
             return finding
         self.waited = 0
@@ -175,6 +174,7 @@ class SimulatedArm(Simulation, Arm):
             self.tick += 1
             if self._latency:
                 self._samples.append(copied(self._sampled()))
+        self.report_waiting()
         if self.fault:
             self._data.time = self._now_s
 

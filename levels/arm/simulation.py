@@ -10,10 +10,12 @@ import mujoco
 import numpy as np
 
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, norm
 from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
 from rack.levels.arm.plant import Plant
 from rack.levels.arm.substeps import advance, copy_state, substeps
+from rack.levels.level import Finding
 from rack.levels.robot.state import restore_state, sleeping
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
@@ -133,8 +135,12 @@ class Simulation(Plant):
                 made = -made
                 self._contacts.look(self._data)
         if self._contacts.count > touches and self._contacts.struck is not None:
+            self.find(Finding(Alarm.COLLISION, *self._contacts.struck))
             self.struck = STRUCK_TICKS
+        violations = self._limits.count
         broken = self._limits.judge(self._now_s, self.struck > 0)
+        if self._limits.count > violations:
+            self.find(self._limits.finding)
         if self.struck:
             self.struck = STRUCK_TICKS if broken else self.struck - 1
         self.fault = self._broken()

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.backplane.watch.alarms import AT_START, BY_DEMAND, NO_TORQUE
+from rack.backplane.watch.alarms import BY_DEMAND
 from rack.levels.algebra import Array
 from rack.levels.arm import (
     Arm,
@@ -39,7 +39,7 @@ from rack.levels.servo.control import ArmParams, SetPointLaw
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.enabling import Enabling
 from rack.levels.servo.sensor_monitor import SensorMonitor
-from rack.levels.servo.stopping import BrakeLog, Reaction, Stopping
+from rack.levels.servo.stopping import Reaction, Stopping
 from rack.levels.tables import read_params
 
 SCENES = Output(SCENE, cycles=8)
@@ -117,7 +117,6 @@ class ArmDriver(Executor):
         self.stopping = Stopping(params, context.robot.joints, context.tick_s, every)
         self.enabling = Enabling(self.arm, context)
         self.sensors.findings = self.stopping.findings = self.findings  # one list, in order of time
-        self._brakes = BrakeLog(self.arm, every)
         self._wanted = np.zeros(
             (2, len(cell.home))
         )  # the motion wanted in the last cycle begins with: rad, rad/s
@@ -264,8 +263,7 @@ class ArmDriver(Executor):
             self._drive(sensed, reaction, missed, tick)
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
-        cause = BY_DEMAND if self.demand else self.stopping.cause
-        self._brakes.after_cycle(tick, self.findings, cause)
+        self.arm.brake_cause = BY_DEMAND if self.demand else self.stopping.cause
         self._report(write, sensed, reaction)
         self.orders.report(write.status, self.rests_on)
         self.arm.save(write.state)
@@ -282,7 +280,7 @@ class ArmDriver(Executor):
             return False
         ticks = tick - self.arm.tick
         self.arm.step(ticks)
-        self._brakes.after_waiting(tick, self.findings)
+        self.arm.report_waiting()
         if ticks == self.context.every:
             return False
         self.motors.drop()
@@ -315,11 +313,8 @@ class ArmDriver(Executor):
             self.stopping.recall(before)
             self.started()
             self._adopted = self.enabling.is_enabled
-        if self.arm.braked:
-            cause = AT_START if before is None else NO_TORQUE
-            self._brakes.start(self.arm.tick, cause)
         self.arm.step(tick - self.arm.tick)
-        self._brakes.after_waiting(tick, self.findings)
+        self.arm.report_waiting()
         self._started = self.abandoned = True
 
     def brake(self) -> None:
@@ -361,9 +356,6 @@ class ArmDriver(Executor):
 
     def _refuse(self, finding: Finding, tick: int) -> None:
         """React to a torque that the arm refused, engaging its brakes."""
-        refused = self.stopping.refused
-        if refused is None or finding.alarm is not refused.alarm:
-            self.findings.append(finding)
         self.stopping.refuse(finding, tick)
         self.brake()
 

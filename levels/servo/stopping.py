@@ -1,5 +1,4 @@
-"""Decides in every cycle whether the arm follows its set points or stops, and for how long; logs
-its brakes."""
+"""Decides in every cycle whether the arm follows its set points or stops, and for how long."""
 
 from __future__ import annotations
 
@@ -8,9 +7,8 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from rack.backplane.message import Message
-from rack.backplane.watch.alarms import NO_TORQUE, Alarm
+from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
-from rack.levels.arm import Arm, DriveState
 from rack.levels.level import Finding
 from rack.levels.messages import Error
 from rack.levels.servo.control import ArmParams
@@ -139,7 +137,9 @@ class Stopping:
         self._stop_for(cause, finding, Reaction.BRAKE, tick)
 
     def _stop_for(self, blow: Cause, finding: Finding, reaction: Reaction, tick: int) -> None:
-        if self._struck_until is None or blow.error is not self._blow.error:
+        is_new = self._struck_until is None or blow.error is not self._blow.error
+        # The arm may have reported it by itself, in this cycle.
+        if is_new and all(one.alarm is not finding.alarm for one in self.findings):
             self.findings.append(finding)
         self._on_blow = reaction if self._struck_until is None else max(self._on_blow, reaction)
         self._struck_until = tick + self._retry_ticks
@@ -240,43 +240,3 @@ class Stopping:
         self.reason = f"{cause.text}; not over within {self._params.patience:g} s"
         self.findings.append(Finding(Alarm.LATCHED, cause.joint, cause.value))
         return Reaction.BRAKE
-
-
-class BrakeLog:
-    """Reports when the brakes of an arm engage and release, each time, however short; and why."""
-
-    def __init__(self, arm: Arm, every: int) -> None:
-        self._arm = arm
-        self._every = every
-        self._engaged: tuple[int, int] | None = (
-            None  # why, see `Alarm.BRAKES_CLOSED`, and at which tick
-        )
-
-    def start(self, tick: int, why: int) -> None:
-        """Begin at `tick` with brakes engaged: no torque has been given yet, or none since a
-        restart."""
-        self._engaged = why, tick
-
-    def after_waiting(self, tick: int, findings: list[Finding]) -> None:
-        """Report brakes that engaged, up to `tick`, because no torques came."""
-        arm = self._arm
-        if arm.braked and self._engaged is None:
-            # The arm itself engaged them, between two cycles.
-            if arm.state is not DriveState.ENABLED:
-                self._engaged = Error.DRIVES, tick
-                findings.append(Finding(Alarm.BRAKES_CLOSED, Error.DRIVES))
-                return
-            self._engaged = NO_TORQUE, tick - max(arm.waited - arm.patience, 1)
-            findings.append(Finding(Alarm.BRAKES_CLOSED, NO_TORQUE, arm.waited - self._every))
-
-    def after_cycle(self, tick: int, findings: list[Finding], why: int) -> None:
-        """Report what the cycle at `tick` did to the brakes; `why`: it engages them for this."""
-        if self._arm.braked:
-            if self._engaged is None:
-                self._engaged = why, tick
-                findings.append(Finding(Alarm.BRAKES_CLOSED, why))
-        elif self._engaged is not None:
-            cause, since = self._engaged
-            self._engaged = None
-            if tick > since:
-                findings.append(Finding(Alarm.BRAKES_OPENED, cause, tick - since))

@@ -13,7 +13,7 @@ from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection,
 from rack.backplane.layout import Layout
 from rack.backplane.message import State, reason_of, state_name
 from rack.backplane.segment import Segment
-from rack.boards.events import statuses
+from rack.boards.events import arm_states, statuses
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
 from rack.boards.faults.kind import KINDS, Kind, kind_of
@@ -111,12 +111,13 @@ def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> St
 
 
 def arm_of(segment: Segment) -> ArmEnd:
-    """Return the arm of a rack as its levels last reported it; a rack without one violates no
-    limit."""
+    """Return the arm of a rack as its state and its levels last told; a rack without one violates
+    no limit."""
     seen = [status for _, status in statuses(segment, "violations")]
+    counted = [*seen, *(state for _, state in arm_states(segment))]
     return ArmEnd(
-        violations=max((int(arm.violations) for arm in seen), default=0),
-        touches=max((int(arm.touches) for arm in seen), default=0),
+        violations=max((int(arm.violations) for arm in counted), default=0),
+        touches=max((int(arm.touches) for arm in counted), default=0),
         is_at_rest=all(np.abs(arm.velocity).max() < AT_REST for arm in seen),
     )
 

@@ -66,7 +66,6 @@ class HandExecutor(Executor):
         self._closed_at: int | None = 0
         self._opened = False  # the valves have been open on this board, or before it was restarted
         self._waiting = ""  # why the boards above do not drive the hand; empty: they do
-        self._wrong: Alarm | None = None  # last cycle's finding about a tension
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
         self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
         self._shown: tuple[Any, ...] = ()  # what seldom changes, in the last status
@@ -112,10 +111,7 @@ class HandExecutor(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
         hand = self.hand
-        was_struck = hand.struck > 0
         self._catch_up(read.before, tick)
-        if hand.contact is not None and not was_struck:
-            self.findings.append(Finding(Alarm.COLLISION, *hand.contact))
         self.orders.take(read.operator)
         sample = hand.sense()
         self.findings += self._slack.look(sample.tension, hand.wanted)
@@ -146,7 +142,8 @@ class HandExecutor(Executor):
         if not self._waiting:
             self.tensions.join(read.tensions)
             found, self._waiting = self.tensions.check()
-            self._find(found)
+            if found is not None:
+                self.hand.refuse(found)
         held = self.orders.holds
         if held and not self._waiting:
             self._waiting = HELD
@@ -162,16 +159,6 @@ class HandExecutor(Executor):
             self._closed_at = None
             self._opened = True
             self.hand.pull(self.tensions.tension)
-
-    def _find(self, found: Finding | None) -> None:
-        """Report a tension that is not as it should be, once an episode."""
-        if found is None:
-            self._wrong = None
-            return
-        self.hand.clipped += 1
-        if found.alarm is not self._wrong:
-            self.findings.append(found)
-        self._wrong = found.alarm
 
     def _report(self, status: Message, sample: HandSample, tick: int) -> None:
         """Fill the status; the fields that seldom change only when they do."""

@@ -53,7 +53,7 @@ def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_br
     rig.run(300, motion)
     (found,) = (f for f in rig.found if f.finding.alarm not in BRAKES)
     assert found.finding.alarm is Alarm.COLLISION
-    names = {rig.servo.arm._model.geom(int(g)).name for g in found.finding[1:]}  # type: ignore[attr-defined]
+    names = {rig.servo.arm._model.geom(int(g)).name for g in found.finding[1:3]}  # type: ignore[attr-defined]
     assert "post" in names
     assert (rig.status.state, rig.status.braked) == (State.HOLDING, 1)
     assert "'post'" in rig.status.reason
@@ -194,8 +194,8 @@ def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_the
     rig.run(missed + 5, move.at)
     # The last torque was given a tick before, and the motors kept it for two.
     closed, opened = (
-        (Alarm.BRAKES_CLOSED, NO_TORQUE, missed),
-        (Alarm.BRAKES_OPENED, NO_TORQUE, missed - 1),
+        (Alarm.BRAKES_CLOSED, NO_TORQUE, missed, begun + 1),
+        (Alarm.BRAKES_OPENED, NO_TORQUE, missed - 1, None),
     )
     assert rig.found == [(begun + missed, closed), (begun + missed, opened)]
 

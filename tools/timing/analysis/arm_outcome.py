@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.backplane.message import state_name
 from rack.boards.config import RackConfig
-from rack.levels.messages import SCENE, TASK_STATUS
+from rack.levels.messages import ARM_STATE, SCENE, TASK_STATUS
 from rack.tools.recording.recording import Recording
 
 Report = dict[str, Any]
@@ -79,25 +79,35 @@ def _drops(recording: Recording, row: int) -> Iterator[Report]:
 
 
 def motion(recording: Recording) -> Report | None:
-    """Return tracking error, mrad, and the counts of touches, exceeded limits and clipped set
-    points, or None."""
+    """Return tracking error, mrad, where a status tells it, and the counts of touches, exceeded
+    limits and refused or cut commands, or None."""
     mailbox = _mailbox_of(recording, *DRIVING)
-    if mailbox is None:
+    counts = _counts(recording, mailbox)
+    if not counts or _mailbox_of(recording, HAND_STATUS) is not None:
         return None
+    if mailbox is None:
+        return {"tracking_rms_mrad": None, "tracking_peak_mrad": None, **counts}
     error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
     return {
         "tracking_rms_mrad": _rms(error),
         "tracking_peak_mrad": rounded(np.abs(error).max()),
-        **_counts(recording, mailbox),
+        **counts,
     }
 
 
-def _counts(recording: Recording, mailbox: str) -> Report:
-    """Return what a board that drives an arm or a hand has counted."""
+def _counts(recording: Recording, status: str | None) -> Report:
+    """Return what an arm or a hand has counted, by its state, and what the board that drives it has
+    cut besides, by the mailbox of its status; nothing without either."""
     names = {name: name for name in ("touches", "violations", "pushed")} | {
         "clipped_cycles": "clipped"
     }
-    return {key: int(recording.signal(mailbox, name)[-1]) for key, name in names.items()}
+    boxes = [box for box in (status, _mailbox_of(recording, ARM_STATE.name)) if box is not None]
+    if not boxes:
+        return {}
+    return {
+        key: max(int(recording.signal(box, name)[-1]) for box in boxes)
+        for key, name in names.items()
+    }
 
 
 def _rms(error: np.ndarray) -> float:
@@ -189,13 +199,23 @@ def objects_text(objects: Sequence[Report]) -> Iterator[str]:
 
 def motion_text(motion: Report | None) -> Iterator[str]:
     """Yield how the arm followed, what it touched, and whether it kept its limits."""
-    if motion is not None:
-        yield (
+    if motion is None:
+        return
+    tracking = ""
+    if motion["tracking_rms_mrad"] is not None:
+        tracking = (
             f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS,"
-            f" {motion['tracking_peak_mrad']:.3f} peak; {motion['touches']} touches,"
-            f" {motion['clipped_cycles']} cycles clipped; limits exceeded in {motion['violations']}"
-            f" substeps, by a push from outside in {motion['pushed']}."
+            f" {motion['tracking_peak_mrad']:.3f} peak; "
         )
+    yield f"{tracking}{_counts_text(motion)}"
+
+
+def _counts_text(report: Report) -> str:
+    return (
+        f"{report['touches']} touches; commands refused or cut in {report['clipped_cycles']}"
+        f" cycles; limits exceeded in {report['violations']} substeps, by a push from outside in"
+        f" {report['pushed']}."
+    )
 
 
 def hand_text(hand: Report | None) -> Iterator[str]:
@@ -206,8 +226,7 @@ def hand_text(hand: Report | None) -> Iterator[str]:
         f"Tensions {hand['tension_rms_n']:.2f} N RMS off their commands,"
         f" {hand['tension_peak_n']:.2f} peak; {hand['least_tension_n']:.2f} to"
         f" {hand['largest_tension_n']:.2f} N; valves closed in {hand['closed_cycles']} cycles;"
-        f" {hand['touches']} touches, {hand['clipped_cycles']} cycles clipped; limits exceeded in"
-        f" {hand['violations']} substeps, by a push from outside in {hand['pushed']}."
+        f" {_counts_text(hand)}"
     )
     forces = ", ".join(f"{finger} {force:.2f}" for finger, force in hand["largest_force_n"].items())
     yield f"Largest force on each tip, N: {forces}."
