@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State, reason_of, state_name
@@ -145,6 +145,15 @@ class Outcome:
     def worked(self) -> bool:
         """Whether the run succeeded: no fault, and no task was refused, failed or cut short."""
         return not self.faults and self.cause in ("task done", "time over")
+
+
+def in_order(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the entries of an event log by tick, and of a tick as they became known.
+
+    Some are known late: a board that drives an arm tells, once it is back, when the brakes engaged.
+    Entries without a tick, such as the outcome, come last.
+    """
+    return sorted(entries, key=lambda entry: float(entry.get("tick", math.inf)))
 
 
 class Journal:

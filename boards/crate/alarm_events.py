@@ -100,7 +100,7 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
         Alarm.COMMAND_INVALID: "rejected: torque of {subject} is NaN",
         Alarm.COMMAND_LIMIT: "torque of {subject} cut to its limit: {value:.3g} N m was commanded",
         Alarm.SET_POINT: "rejected: set point of {subject} is {value:.3g} rad from the joint",
-        Alarm.LIMIT_EXCEEDED: "{subject} is beyond its limit, as sensed: {value:.4g}",
+        Alarm.LIMIT_EXCEEDED: "{subject} is beyond its limit: {value:.4g}",
         Alarm.TENSION_INVALID: "rejected: a tension of {subject} is NaN",
         Alarm.TENSION_LIMIT: "tension of {subject} cut to its limit: {value:.3g} N was commanded",
         Alarm.TENDON: "tendon of {subject} is slack: {value:.3g} N",
@@ -146,7 +146,7 @@ class AlarmWatch:
         self.lost = 0
 
     def drain(self) -> list[RungAlarm]:
-        """Return the alarms since the last call, by time."""
+        """Return the alarms since the last call, by tick and time."""
         found: list[RungAlarm] = []
         for owner, ring in self._rings.items():
             if not ring.waiting:
@@ -156,7 +156,7 @@ class AlarmWatch:
             for row in rows:
                 alarm = as_named(Alarm, row["code"])
                 found.append(RungAlarm(alarm, int(row["subject"]), self._events.of(row, owner)))
-        return sorted(found, key=lambda one: one.event.time_ns)
+        return sorted(found, key=lambda one: (one.event.tick, one.event.time_ns))
 
 
 class AlarmEvents:
@@ -196,6 +196,8 @@ class AlarmEvents:
         board = owner
         fault = -1
         since = row["since"]
+        # Brakes that engaged while no board drove the arm are known when one does again.
+        tick = int(since if alarm == Alarm.BRAKES_CLOSED else row["tick"])
         if kind == "fault":
             entry = pick(self._faults.entries, number, "fault")
             fault = number
@@ -227,11 +229,13 @@ class AlarmEvents:
         else:
             subject, text = self._described(alarm, row, owner)
             text += f" for {self._span(value)}" if alarm == Alarm.BRAKES_CLOSED and value else ""
+            if tick < row["tick"]:
+                text += f", known at tick {row['tick']}"
             board = subject if alarm == Alarm.REJOINED else owner
         realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
         return Event(
             realtime_ns,
-            int(row["tick"]),
+            tick,
             kind,
             board,
             text,

@@ -85,3 +85,20 @@ def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats
     assert [KILLED_AT < tick <= KILLED_AT + DEATH_BOUND for tick in braked] == [True]
     assert [rejoined[0] < tick <= rejoined[0] + DEATH_BOUND for tick in released] == [True]
     assert (arm.stopped, arm.holding, arm.violations, arm.reason) == (0, 0, 0, "")
+
+
+@pytest.mark.slow
+def test_brakes_that_engaged_while_the_arms_board_was_away_have_the_tick_at_which_they_did(
+    config: MakeConfig,
+) -> None:
+    killed = FaultConfig(kind="kill", board="arm", tick=KILLED_AT)
+    given = config(text=arm_rack(TOGETHER)).model_copy(update={"fault": (killed,)})
+    with Rack(given) as rack:
+        outcome = rack.run(0.6)
+        events = rack.events
+    (braking,) = (event for event in events if event.code == "brakes_closed" and event.value)
+    (rejoined,) = (event for event in events if event.code == "rejoined")
+    assert KILLED_AT < braking.tick == braking.since <= KILLED_AT + 10 < rejoined.tick
+    assert braking.text.endswith(f"known at tick {rejoined.tick}")
+    assert braking.tick in [one.since for one in outcome.brakings]
+    assert [event.text for event in events if event.code == "mute"] == []

@@ -213,10 +213,6 @@ def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
 
 def _undone(reaction: Event, after: Sequence[Event]) -> int | None:
     """Return the tick at which a reaction was undone; None when it was not."""
-    if reaction.code == BRAKES and reaction.value > 0:
-        # They were engaged for the cycles without torque; the event comes when there is torque
-        # again.
-        return reaction.tick
     recoveries = (
         event.tick
         for event in after

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TextIO
 
-from rack.boards.events import Event
+from rack.boards.events import Event, in_order
 from rack.tools.console.answer import Document, Failure
 from rack.tools.live.display import Display
 
@@ -60,9 +60,12 @@ class EventLog:
         self._put("".join(waiting))
 
     def end(self, outcome: Document) -> None:
-        """Write the outcome and close the file."""
+        """Write the outcome, close the file, and put its events in order: until now they are as
+        they became known."""
         self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
+        if self._file is not None and not self._has_failed:
+            self._put_in_order(Path(self._file.name))
 
     def close(self) -> None:
         """Close the file, with or without an outcome."""
@@ -70,6 +73,18 @@ class EventLog:
             # Closing retries what could not be written.
             with suppress(OSError):
                 self._file.close()
+
+    def _put_in_order(self, path: Path) -> None:
+        """Sort the lines of the file; where there is no room for that, they stay as they are."""
+        entries = [json.loads(line) for line in path.read_text().splitlines()]
+        ordered = in_order(entries)
+        if ordered == entries:
+            return
+        draft = path.with_suffix(".part")
+        with suppress(OSError):
+            draft.write_text("".join(f"{json.dumps(entry)}\n" for entry in ordered))
+            draft.replace(path)
+        draft.unlink(missing_ok=True)
 
     def _write(self, entry: Document) -> None:
         line = json.dumps(entry) + "\n"

@@ -118,6 +118,6 @@ def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[C
 def _events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
     ticked = [event for event in recording.events if event.get("tick", -1) >= 0]
     clock_ns = recording.layout.clock_ns
-    for number, event in enumerate(sorted(ticked, key=lambda event: int(event["tick"]))):
+    for number, event in enumerate(ticked):
         data = json.dumps(event).encode()
         yield ChannelMessage(event["tick"] * clock_ns, channel, number, event["time_ns"], data)

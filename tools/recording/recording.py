@@ -24,7 +24,7 @@ from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, read_stored
 from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError
-from rack.boards.events import Event
+from rack.boards.events import Event, in_order
 from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import (
@@ -146,7 +146,8 @@ class Recording:
 
     @cached_property
     def events(self) -> list[Document]:
-        """The events of the run, oldest first. Raises `Failure` when a line is not an event."""
+        """The events of the run by tick, then its outcome. Raises `Failure` when a line is not an
+        event."""
         path = self.folder / "events.jsonl"
         if not path.is_file():
             return []
@@ -155,7 +156,7 @@ class Recording:
         if last:
             # A run that was killed leaves half a line.
             _note(f"{path}: line {len(lines) + 1} is cut off, and left out")
-        return found
+        return in_order(found)
 
     @cached_property
     def ended(self) -> Document:

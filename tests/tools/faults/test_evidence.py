@@ -186,10 +186,12 @@ def test_brakes_in_the_tick_of_a_collision_are_no_reaction_to_a_fault() -> None:
     assert aftermath(MUTE, [brakes, opened], 500, ()).reactions == ("brakes_closed",)
     hit = found(110, "collision", "lower")
     assert aftermath(MUTE, [hit, brakes, opened], 500, ()).reactions == ()
-    # For missed cycles they are a reaction to what takes cycles alone, and over at once.
+    # For missed cycles they are a reaction to what takes cycles alone, and over when released.
     missed = replace(brakes, value=2.0)
     assert aftermath(MUTE, [missed], 500, ()).reactions == ()
-    assert aftermath(LATE, [missed], 500, ()) == Aftermath(("brakes_closed",), True, 10, ())
+    both = [missed, opened]
+    assert aftermath(LATE, both, 500, ()) == Aftermath(("brakes_closed",), True, 40, ())
+    assert not aftermath(LATE, [missed], 500, ()).is_undone
 
 
 def test_a_reaction_that_must_follow_is_lacking_unless_the_brakes_were_engaged_before() -> None:

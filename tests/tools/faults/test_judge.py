@@ -174,11 +174,11 @@ def test_recovery_lasts_until_the_last_reaction_is_undone() -> None:
     )
 
 
-def test_brakes_that_closed_for_missed_cycles_are_open_again_when_that_is_told() -> None:
-    fault = judged(
-        strike("overrun", "lower", 100), event(104, "reaction", "brakes_closed", "lower", value=3.0)
-    )
-    assert (fault.reactions, fault.is_recovered, fault.recovery) == (("brakes_closed",), True, 4)
+def test_brakes_that_closed_for_missed_cycles_are_recovered_from_when_they_open() -> None:
+    closed = event(104, "reaction", "brakes_closed", "lower", value=3.0)
+    opened = event(107, "recovery", "brakes_opened", "lower")
+    fault = judged(strike("overrun", "lower", 100), closed, opened)
+    assert (fault.reactions, fault.is_recovered, fault.recovery) == (("brakes_closed",), True, 7)
     demanded = judged(
         strike("sensor-nan", "lower", 100), event(100, "reaction", "brakes_closed", "lower")
     )
@@ -441,10 +441,6 @@ def test_brakes_that_are_engaged_when_a_fault_strikes_need_not_be_engaged_for_it
     )
     assert judged(torque, refused, engaged, released).lacking == ()
     assert judged(torque, refused, engaged, replace(released, tick=99)).lacking == (
-        "brakes_closed",
-    )
-    # For missed cycles they were engaged until there was torque again.
-    assert judged(torque, refused, replace(engaged, value=3.0), released).lacking == (
         "brakes_closed",
     )
 

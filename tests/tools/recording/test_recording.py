@@ -176,6 +176,18 @@ def test_events_of_something_else_are_named_with_their_line(damaged: Path, text:
         write_report(damaged)
 
 
+def test_an_event_that_became_known_late_is_in_its_place(damaged: Path) -> None:
+    path = damaged / "events.jsonl"
+    *lines, outcome = path.read_text().splitlines()
+    late = json.loads(lines[-1]) | {"tick": 7, "code": "late"}
+    path.write_text("\n".join([*lines, json.dumps(late), outcome, ""]))
+    events = Recording(damaged).events
+    ticks = [event["tick"] for event in events[:-1]]
+    assert late in events
+    assert ticks == sorted(ticks)
+    assert events[-1] == json.loads(outcome)
+
+
 def test_a_last_line_that_is_cut_is_left_out_and_said(
     damaged: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -213,7 +213,7 @@ def run_trial(
         run=run,
         outcome=rack.outcome,
         refused=refused,
-        events=tuple(rack.events),
+        events=tuple(sorted(rack.events, key=lambda event: event.tick)),
         strikes=found,
         arm=arm,
         left=tuple(left_behind(rack_name, before)),

@@ -11,7 +11,6 @@ from typing import NamedTuple
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
-from rack.boards.config.cell import built_cell
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.kind import DIED
 from rack.tools.console.answer import Failure
@@ -100,8 +99,6 @@ class Killing:
             raise Failure(f"{name}: no arm whose brakes could engage", 2)
         self.boards = servo, above[0]
         self._config = config
-        cell = built_cell(config)
-        self._patience = cell.patience.ticks(config.every(servo), config.clock_ns * 1e-9)
         self._random = Random(kills)
 
     def samples(self, board: str) -> Iterator[Sample]:
@@ -148,10 +145,9 @@ class Killing:
     def _braked_ns(self, run: KilledRun, braked: Event) -> int:
         """Return when the brakes engaged, CLOCK_MONOTONIC, ns.
 
-        A servo level that was away reports them late: the arm itself engaged them once it had
+        A servo level that was away reports them late, with the tick at which the arm itself engaged
         waited long enough.
         """
         if not braked.value:
             return braked.time_ns - run.offset_ns
-        tick = braked.tick - int(braked.value) + self._patience
-        return run.epoch_ns + tick * self._config.clock_ns
+        return run.epoch_ns + braked.tick * self._config.clock_ns
