@@ -1,0 +1,83 @@
+"""Reading regular files of bounded size.
+
+Files that a user or another program names may be FIFOs, which block whoever opens them, devices,
+which act or never end, or too large for memory.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+PIECE_BYTES = 1 << 20
+_KINDS = {
+    stat.S_IFBLK: "block device",
+    stat.S_IFCHR: "character device",
+    stat.S_IFDIR: "directory",
+    stat.S_IFIFO: "FIFO",
+    stat.S_IFSOCK: "socket",
+}
+
+
+class RefusedFileError(OSError):
+    """A file that is not a regular file, or is too large; `strerror` is the reason as a
+    sentence."""
+
+    def __str__(self) -> str:
+        return f"{self.filename}: {self.strerror}"
+
+
+def read_regular_file(path: Path, limit_bytes: int) -> bytes:
+    """Return the content of a regular file, without ever waiting for a writer.
+
+    Args:
+        path: File to read; symbolic links are followed.
+        limit_bytes: Largest permitted size.
+
+    Raises:
+        RefusedFileError: The file is no regular file, or is larger than permitted.
+        OSError: The file cannot be opened or read, as by `open`.
+    """
+    # Opening a device may already act on it, so its kind is checked first. The kind is checked
+    # again once the file is open, because the path may name another file by then.
+    check_regular_file(path, limit_bytes)
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        _check(path, os.fstat(file.fileno()), limit_bytes)
+        pieces = []
+        size = 0
+        # Files of /proc and files that are being written hold more bytes than their size says.
+        while piece := file.read(PIECE_BYTES):
+            pieces.append(piece)
+            size += len(piece)
+            _check_size(path, size, limit_bytes)
+    return b"".join(pieces)
+
+
+def check_regular_file(path: Path, limit_bytes: int) -> None:
+    """Check a file that a library opens by its path.
+
+    Args:
+        path: File to check; symbolic links are followed.
+        limit_bytes: Largest permitted size.
+
+    Raises:
+        RefusedFileError: The file is no regular file, or is larger than permitted.
+        OSError: There is no such file, or its folder cannot be searched.
+    """
+    _check(path, path.stat(), limit_bytes)
+
+
+def _check(path: Path, status: os.stat_result, limit_bytes: int) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        kind = _KINDS[stat.S_IFMT(status.st_mode)]
+        raise RefusedFileError(errno.EINVAL, f"not a regular file, but a {kind}", str(path))
+    _check_size(path, status.st_size, limit_bytes)
+
+
+def _check_size(path: Path, size: int, limit_bytes: int) -> None:
+    if size > limit_bytes:
+        reason = f"too large, {size} bytes; permitted: {limit_bytes}"
+        raise RefusedFileError(errno.EFBIG, reason, str(path))
