@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import inspect
-import tomllib
 from collections import ChainMap
 from collections.abc import Mapping
 from contextlib import suppress
@@ -29,6 +28,7 @@ from pydantic import (
 from pydantic.config import JsonDict
 from pydantic.fields import FieldInfo
 
+from rack.backplane.bounded_toml import load_toml
 from rack.levels.errors import LevelError
 from rack.levels.references import module_and_name
 
@@ -136,7 +136,7 @@ def read_setting(setting: str) -> tuple[str, Any]:
     """Return key and value of "key=value", with the value in TOML. Raises `LevelError`."""
     key, _, text = setting.partition("=")
     try:
-        return key.strip(), tomllib.loads(f"value = {text}")["value"]
+        return key.strip(), load_toml(f"value = {text}")["value"]
     except ValueError:  # the parser's own errors are such
         raise LevelError("must be key=value, as in bandwidth=80") from None
 

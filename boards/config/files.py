@@ -8,7 +8,9 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from rack.boards.config.toml import MAX_DEPTH, Tables, merge, override, parse
+from rack.backplane.bounded_toml import MAX_DEPTH
+from rack.backplane.regular_file import read_regular_file
+from rack.boards.config.toml import Tables, merge, override, parse
 from rack.boards.errors import ConfigError, Mistake
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -98,11 +100,11 @@ def names(folder: Path = CONFIGS) -> list[str]:
 
 
 def file_at(path: Path) -> Path | None:
-    """Return the absolute path of a file; None if it does not exist or the path is invalid (unknown
-    ~user)."""
+    """Return the absolute path of a file, which need not be a regular one; None if it does not
+    exist or the path is invalid (unknown ~user)."""
     try:
         path = path.expanduser()
-        return path.resolve() if path.is_file() else None
+        return path.resolve() if path.exists() and not path.is_dir() else None
     except (OSError, RuntimeError, ValueError):
         return None
 
@@ -213,14 +215,10 @@ def _extended(base: Tables, top: Tables) -> Tables:
 
 def _tables(path: Path) -> Tables:
     try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise ConfigError(
-                [Mistake(str(path), None, f"too large, {size} bytes; permitted: {MAX_FILE_BYTES}")]
-            )
-        text = path.read_text(encoding="utf-8")
+        text = read_regular_file(path, MAX_FILE_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError([Mistake(str(path), None, f"cannot be read: {error}")]) from None
+        why = getattr(error, "strerror", error)
+        raise ConfigError([Mistake(str(path), None, f"cannot be read: {why}")]) from None
     return parse(text, path.name)
 
 

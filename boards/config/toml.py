@@ -9,18 +9,13 @@ from typing import Any
 
 import tomli_w
 
+from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_LONG, load_toml
 from rack.boards.errors import ConfigError, Mistake, shown
 
-MAX_DEPTH = 32
-"""Limit on the nesting of tables and lists, and on chains of `extends`."""
-INTEGER_BITS = 64
-"""TOML's own limit; Python's integers have none."""
 PART = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[^."'=\s]+)"""
 SETTING = re.compile(rf"\s*({PART}(?:\s*\.\s*{PART})*)\s*=(.*)", re.DOTALL)
 """"key.sub=value"; a key that contains a dot is quoted, as in TOML:
 protocol.mailbox."level.plan"=lock."""
-TOO_DEEP = f"nested too deeply; permitted: {MAX_DEPTH} levels"
-TOO_LONG = f"integer too long; permitted: {INTEGER_BITS} bits"
 FREE_FORM = ("params", "task")
 """Tables of the levels, where an empty list is an ordinary value."""
 
@@ -31,13 +26,11 @@ def parse(text: str, place: str = "config") -> Tables:
     """Return the tables of TOML text. Raises `ConfigError` with the invalid line, or every value
     out of bounds."""
     try:
-        tables = tomllib.loads(text)
+        tables = load_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
-    except RecursionError:
-        raise ConfigError([Mistake(place, None, TOO_DEEP)]) from None
-    except ValueError:  # Python refuses to convert integers of thousands of digits
-        raise ConfigError([Mistake(place, None, TOO_LONG)]) from None
+    except ValueError as error:
+        raise ConfigError([Mistake(place, None, str(error))]) from None
     if mistakes := list(_out_of_bounds(tables, place)):
         raise ConfigError(mistakes)
     return tables
@@ -116,10 +109,10 @@ def _parts(setting: str) -> tuple[list[str], Any]:
     found = SETTING.fullmatch(setting)
     if found is None or "\0" in setting:
         raise LookupError("must be key=value, as in clock.speed=2")
-    keys = [_key(part) for part in re.findall(PART, found[1])]
-    if len(keys) > MAX_DEPTH:
+    parts = re.findall(PART, found[1])
+    if len(parts) > MAX_DEPTH:
         raise LookupError(TOO_DEEP)
-    return keys, _value(found[2])
+    return [_key(part) for part in parts], _value(found[2])
 
 
 def _key(part: str) -> str:
@@ -133,10 +126,10 @@ def _key(part: str) -> str:
 
 def _value(text: str) -> Any:
     try:
-        tomllib.loads(f"value = {text}")
+        load_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return text.strip()
-    except (RecursionError, ValueError):
+    except ValueError:
         pass  # valid TOML, but out of bounds: `parse` gives the reason
     return parse(f"value = {text}")["value"]
 

@@ -10,13 +10,14 @@ RACK-key.pem     private key of that certificate, for its owner's eyes only: it 
 
 from __future__ import annotations
 
-import os
 import stat
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeGuard
+
+from rack.backplane.regular_file import read_regular_file
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import (
@@ -161,16 +162,11 @@ class Credentials:
 
 def _content(path: Path, is_private: bool = False) -> bytes:
     try:
-        with path.open("rb") as file:
-            about = os.fstat(file.fileno())
-            if is_private and about.st_mode & OTHERS:
-                mode = stat.S_IMODE(about.st_mode)
-                raise Credential(
-                    path, f"others may read it, mode {mode:04o}; permitted: {OWNER_ONLY:04o}"
-                )
-            if about.st_size > MAX_CREDENTIAL_BYTES:
-                raise Credential(path, f"{about.st_size} bytes; permitted: {MAX_CREDENTIAL_BYTES}")
-            return file.read(MAX_CREDENTIAL_BYTES)
+        if is_private and (mode := stat.S_IMODE(path.stat().st_mode)) & OTHERS:
+            raise Credential(
+                path, f"others may read it, mode {mode:04o}; permitted: {OWNER_ONLY:04o}"
+            )
+        return read_regular_file(path, MAX_CREDENTIAL_BYTES)
     except FileNotFoundError:
         raise Credential(path, "missing; see rack lan certificates --help") from None
     except OSError as error:

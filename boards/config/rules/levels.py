@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from rack.backplane.address_map import AddressMap
 from rack.backplane.errors import MailboxError
 from rack.backplane.layout import Layout
+from rack.backplane.regular_file import check_regular_file
 from rack.boards.config.cell import cell_sizes
-from rack.boards.config.files import file_at
 from rack.boards.config.mistakes import mistakes_of, repeated
 from rack.boards.config.wiring import Wiring
 from rack.boards.errors import Mistake
@@ -19,6 +19,7 @@ from rack.levels.level import Executor, LevelContext
 from rack.levels.tables import RobotConfig, SceneConfig
 
 MAX_SEGMENT_BYTES = 2**30
+MAX_MODEL_BYTES = 2**30
 
 
 def params(wiring: Wiring) -> Iterator[Mistake]:
@@ -103,8 +104,10 @@ def robot(wiring: Wiring) -> Iterator[Mistake]:
     if robot is None:
         return
     joints = len(robot.joints)
-    if file_at(robot.model) is None:
-        yield Mistake("robot.model", str(robot.model), "no such file")
+    try:
+        check_regular_file(robot.model, MAX_MODEL_BYTES)
+    except OSError as error:
+        yield Mistake("robot.model", str(robot.model), f"cannot be read: {error.strerror}")
     for key, values in robot.per_joint.items():
         if values is not None and len(values) != joints:
             yield Mistake(

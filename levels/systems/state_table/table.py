@@ -25,7 +25,6 @@ Rows of a state exclude each other, unless the later one says `else`; together t
 
 from __future__ import annotations
 
-import tomllib
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -35,7 +34,9 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, StringConstraints, ValidationError
 
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.message import REASON_BYTES, State
+from rack.backplane.regular_file import read_regular_file
 from rack.levels.errors import LevelError
 from rack.levels.systems.state_table.vocabulary import NAME_BYTES, Vocabulary
 from rack.levels.tables import Positive, Table, Vector
@@ -175,15 +176,13 @@ class StateTable:
 def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:
     """Return the table in a file, unchecked. Raises `TableError` when it cannot be read at all."""
     try:
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise TableError([f"{path.stat().st_size} bytes; permitted: {MAX_FILE_BYTES}"])
-        data = path.read_bytes()
-        config = TableConfig.model_validate(tomllib.loads(data.decode()))
+        data = read_regular_file(path, MAX_FILE_BYTES)
+        config = TableConfig.model_validate(load_toml(data.decode()))
     except OSError as error:
         raise TableError([f"cannot be read: {error.strerror}"]) from error
     except ValidationError as error:
         raise TableError(_flaws(error, "", TableConfig)) from error
-    except (ValueError, RecursionError) as error:  # ValueError: TOML, UTF-8
+    except ValueError as error:  # TOML, UTF-8
         raise TableError([f"not TOML: {error}"]) from error
     configs = {}
     flaws = list[str]()

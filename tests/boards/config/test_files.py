@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -206,9 +207,27 @@ def test_a_file_that_many_extend_is_read_once(small: Path, write: Write) -> None
 
 def test_a_file_too_large_to_be_a_config_is_not_read(write: Write) -> None:
     with pytest.raises(
-        ConfigError, match=r"large.toml: too large, 1000002 bytes; permitted: 1000000$"
+        ConfigError,
+        match=r"large.toml: cannot be read: too large, 1000002 bytes; permitted: 1000000$",
     ):
         load(write("large.toml", "#" * 1_000_002))
+
+
+def test_a_fifo_or_a_device_in_place_of_a_file_is_refused_at_once(
+    small: Path, write: Write, tmp_path: Path
+) -> None:
+    os.mkfifo(fifo := tmp_path / "fifo.toml")
+    (device := tmp_path / "device.toml").symlink_to("/dev/zero")
+    for path, kind in ((fifo, "FIFO"), (device.resolve(), "character device")):
+        why = f"{path}: cannot be read: not a regular file, but a {kind}"
+        for named in (
+            lambda path=path: load(path),
+            lambda path=path: load(small, faults=path),
+            lambda path=path: load(write("mine.toml", f'extends = ["{path}"]\n')),
+        ):
+            with pytest.raises(ConfigError) as error:
+                named()
+            assert lines(error) == [why]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -56,7 +57,12 @@ def test_every_missing_file_is_named(tmp_path: Path) -> None:
 def test_a_file_that_cannot_be_read_is_named(folder: Path) -> None:
     (folder / "cell.pem").unlink()
     (folder / "cell.pem").mkdir()
-    assert flaws(folder) == ["cell.pem: cannot be read: Is a directory"]
+    (folder / "cell-key.pem").unlink()
+    os.mkfifo(folder / "cell-key.pem", 0o600)
+    assert flaws(folder) == [
+        "cell.pem: cannot be read: not a regular file, but a directory",
+        "cell-key.pem: cannot be read: not a regular file, but a FIFO",
+    ]
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])

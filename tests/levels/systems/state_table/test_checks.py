@@ -3,6 +3,7 @@ rows."""
 
 from __future__ import annotations
 
+import os
 from itertools import product
 from pathlib import Path
 
@@ -170,6 +171,12 @@ def test_a_file_that_is_no_table_is_one_error(tmp_path: Path, text: str) -> None
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(TableError, match="cannot be read: No such file"):
         read_table(tmp_path / "none.toml", DOORS)
+
+
+def test_a_fifo_in_place_of_a_table_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo.toml")
+    with pytest.raises(TableError, match="cannot be read: not a regular file, but a FIFO"):
+        read_table(tmp_path / "fifo.toml", DOORS)
 
 
 def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
