@@ -50,12 +50,23 @@ class SystemClock:
 
 
 def ticks_of(
-    rate_hz: float, clock_ns: int, what: str, of: tuple[str, str] = ("clock", "tick")
+    rate_hz: float,
+    clock_ns: int,
+    what: str,
+    of: tuple[str, str] = ("clock", "tick"),
+    fastest_hz: float = inf,
 ) -> int:
-    """Return the period, in ticks, of a rate. Raises `ClockError` with the nearest rates when off
-    the grid.
+    """Return the period, in ticks, of a rate.
 
-    `of`: the text's words for the grid and for one step of it.
+    Args:
+        rate_hz: Rate; rounded to four digits or more, as in 57.14 Hz for 400 Hz / 7.
+        clock_ns: Length of a tick.
+        what: Name of what has the rate, for the error.
+        of: The error's words for the grid and for one step of it.
+        fastest_hz: Highest rate that the error may suggest.
+
+    Raises:
+        ClockError: The rate is off the grid; the error names the nearest rates.
     """
     clock_hz = 1e9 / clock_ns
     grid, step = of
@@ -66,14 +77,21 @@ def ticks_of(
             f"{what}: {rate_hz:g} Hz is not a rate; permitted: {clock_hz:g} Hz divided by a whole"
             " number"
         )
-    every = round(ticks)
-    if every >= 1 and abs(ticks - every) <= 1e-6 * ticks:
-        return every
     # Above the clock's own rate there is only one neighbour.
-    nearest = [n for n in (int(ticks) + 1, int(ticks)) if n >= 1]
+    nearest = {n: rate_text(clock_hz / n) for n in (int(ticks) + 1, int(ticks)) if n >= 1}
+    for every in sorted(nearest, key=lambda n: abs(n - ticks)):
+        if abs(ticks - every) <= 1e-6 * ticks or rate_hz == float(nearest[every]):
+            return every
     rates = ", ".join(
-        f"{clock_hz / n:.4g} Hz (every {n} {step}{'s' if n > 1 else ''})" for n in nearest
+        f"{rate} Hz (every {n} {step}{'s' if n > 1 else ''})"
+        for n, rate in nearest.items()
+        if float(rate) <= fastest_hz
     )
     raise ClockError(
         f"{what}: {rate_hz:g} Hz does not divide the {clock_hz:g} Hz {grid}; nearest: {rates}"
     )
+
+
+def rate_text(rate_hz: float) -> str:
+    """Return a rate, Hz, with the digits that `ticks_of` needs to find its period."""
+    return f"{rate_hz:.4g}"

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from graphlib import CycleError, TopologicalSorter
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.clock.system_clock import rate_text
 from rack.backplane.errors import ClockError
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeated
@@ -281,7 +282,7 @@ def _frames(table: ScheduleConfig, clock_ns: int) -> Iterator[Mistake]:
 def _nearest(value: float, step: float) -> str:
     """Return the multiples of `step` next to a value that is none."""
     below = int(value / step)
-    return " or ".join(f"{number * step:g}" for number in (below, below + 1) if number)
+    return " or ".join(f"{number * step:.12g}" for number in (below, below + 1) if number)
 
 
 def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
@@ -301,7 +302,8 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
         nearest = (*below[-1:], *above[:1])
         if key == "rate_hz":
             written = [
-                f"{cycle * tick_ms:g} ms, {1e3 / (cycle * tick_ms):g} Hz" for cycle in nearest
+                f"{cycle * tick_ms:g} ms, {rate_text(1e3 / (cycle * tick_ms))} Hz"
+                for cycle in nearest
             ]
         else:
             written = [f"{cycle * tick_ms:g} ms, every {cycle}" for cycle in nearest]

@@ -55,9 +55,11 @@ def lan(wiring: Wiring) -> Iterator[Mistake]:
         )
         return
     yield from _names(table, config.name)
-    for key, entries in (("export", table.exports), ("import", table.imports)):
-        for port, entry in entries.items():
-            yield from _rate(f"{PLACE}.{key}.{port}", entry, table)
+    if LAN in wiring.every:
+        cycle_ns = wiring.every[LAN] * config.clock_ns
+        for key, entries in (("export", table.exports), ("import", table.imports)):
+            for port, entry in entries.items():
+                yield from _rate(f"{PLACE}.{key}.{port}", entry, cycle_ns)
     if config.clock.mode == "realtime":
         yield from _priority(config, table)
         if config.protocol.strict:
@@ -106,10 +108,10 @@ def _names(table: LanTable, rack: str) -> Iterator[Mistake]:
         yield Mistake(f"{PLACE}.peers", alike, why)
 
 
-def _rate(place: str, entry: ExportConfig | ImportConfig, table: LanConfig) -> Iterator[Mistake]:
-    cycle_ns = round(1e9 / table.rate_hz)
+def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Iterator[Mistake]:
+    of = ("of the adapter", "cycle")
     try:
-        every = ticks_of(entry.rate_hz, cycle_ns, "exchange", ("of the adapter", "cycle"))
+        every = ticks_of(entry.rate_hz, cycle_ns, "exchange", of, FASTEST_HZ)
     except ClockError as error:
         yield Mistake(f"{place}.rate_hz", entry.rate_hz, str(error))
         return
@@ -118,7 +120,7 @@ def _rate(place: str, entry: ExportConfig | ImportConfig, table: LanConfig) -> I
         if entry.max_age_ms < least_ms:
             why = (
                 "between two exchanges it gets as old as one of them and a cycle of the adapter,"
-                f" {least_ms:g} ms"
+                f" {least_ms:.12g} ms"
             )
             yield Mistake(f"{place}.max_age_ms", entry.max_age_ms, f"{why}; permitted: no less")
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
-from rack.backplane.clock.system_clock import SystemClock, ticks_of
+from rack.backplane.clock.system_clock import SystemClock, rate_text, ticks_of
 from rack.backplane.errors import ClockError
 from rack.backplane.words import Run, System
 from tests.backplane.conftest import MakeBus
@@ -34,6 +37,39 @@ def test_a_rate_off_the_grid_is_refused_with_its_neighbours() -> None:
 def test_above_the_clocks_rate_there_is_one_neighbour(rate_hz: float) -> None:
     with pytest.raises(ClockError, match=r"nearest: 400 Hz \(every 1 tick\)$"):
         ticks_of(rate_hz, CLOCK_NS, "level")
+
+
+@given(clock_ns=st.integers(10_000, 10**9), rate_hz=st.floats(1e-6, 1e9))
+@example(clock_ns=1_000_000, rate_hz=333.0)
+@example(clock_ns=1_000_000, rate_hz=0.3)
+@example(clock_ns=2_500_000, rate_hz=60.0)
+@example(clock_ns=1_000_000, rate_hz=3.91)
+@example(clock_ns=333_333, rate_hz=0.19998)
+def test_every_rate_that_a_refusal_suggests_is_accepted_as_typed(
+    clock_ns: int, rate_hz: float
+) -> None:
+    try:
+        ticks_of(rate_hz, clock_ns, "level")
+    except ClockError as error:
+        hints = re.findall(r"(\S+) Hz \(every (\d+)", str(error))
+        assert hints
+        for rate, every in hints:
+            found = ticks_of(float(rate), clock_ns, "level")
+            assert found == int(every) or rate_text(1e9 / clock_ns / found) == rate
+
+
+@pytest.mark.parametrize("rate_hz", [333.3, 57.14, 3.906])
+def test_a_rate_may_be_rounded_to_four_digits(rate_hz: float) -> None:
+    clock_ns = {333.3: 1_000_000, 57.14: CLOCK_NS, 3.906: 1_000_000}[rate_hz]
+    assert ticks_of(rate_hz, clock_ns, "level") == round(1e9 / clock_ns / rate_hz)
+    for changed in (rate_hz + 0.02, rate_hz - 0.02):
+        with pytest.raises(ClockError, match="does not divide"):
+            ticks_of(changed, clock_ns, "level")
+
+
+def test_no_rate_above_the_highest_permitted_one_is_suggested() -> None:
+    with pytest.raises(ClockError, match=r"nearest: 30 Hz \(every 2 ticks\)$"):
+        ticks_of(45, 1_000_000_000 // 60, "exchange", fastest_hz=50.0)
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -50.0, float("nan"), 5e-324])

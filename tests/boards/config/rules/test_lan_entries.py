@@ -32,6 +32,17 @@ MISTAKES = {
             " the adapter; nearest: 20 Hz (every 1 cycle)"
         ),
     ),
+    "a rate of which one neighbour is beyond 50 Hz": (
+        [
+            "adapter.lan.rate_hz=66.67",
+            "adapter.lan.import.other.rate_hz=45",
+            "adapter.lan.export.pulse.rate_hz=33.33",
+        ],
+        (
+            "adapter.lan.import.other.rate_hz = 45.0: exchange: 45 Hz does not divide the"
+            " 66.6667 Hz of the adapter; nearest: 33.33 Hz (every 2 cycles)"
+        ),
+    ),
     "the adapter's rate": (
         [
             "adapter.lan.rate_hz=33",

@@ -58,3 +58,20 @@ def test_a_rate_is_refused_with_the_nearest_rates() -> None:
     assert found.place == "board.primitive.rate_hz"
     assert found.why.startswith("a cycle of 17.5 ms does not fit the schedule")
     assert found.why.endswith("nearest: 12.5 ms, 80 Hz or 20 ms, 50 Hz")
+
+
+@pytest.mark.parametrize("period_ms", [1.234567, 0.333333, 12.345678])
+@pytest.mark.parametrize("minor_ms", [20.1, 98.7654])
+def test_every_frame_and_rate_that_a_refusal_suggests_is_accepted_as_typed(
+    period_ms: float, minor_ms: float
+) -> None:
+    """From mistake to mistake a user types the first value that each of them suggests."""
+    settings = {"clock.period_ms": period_ms, "schedule.minor_ms": minor_ms}
+    settings |= {"schedule.major_ms": 900.1, "board.primitive.rate_hz": 0.81}
+    for key in ("schedule.minor_ms", "schedule.major_ms"):
+        config = load("nasrem", [f"{name}={value}" for name, value in settings.items()])
+        (found,) = schedule(Wiring(config))
+        assert found.place == key
+        settings[key] = float(found.why.partition("nearest: ")[2].split()[0])
+    config = load("nasrem", [f"{name}={value}" for name, value in settings.items()])
+    assert not any(found.place.startswith("schedule") for found in schedule(Wiring(config)))
