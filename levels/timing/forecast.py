@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,11 +13,14 @@ from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction, predict
 from rack.levels.timing.verdicts import EquationVerdict, verdicts
 
+NO_BUDGET = "no budget"
+
 
 @dataclass(frozen=True)
 class Forecast:
     """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the
-    prediction.
+    prediction; `uncounted` gives for every board, planner and host board that it leaves out the
+    reason.
 
     `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it. `schedule`
     is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
@@ -34,11 +37,17 @@ class Forecast:
     schedule: CyclicSchedule | None
     frames: tuple[CoreFrames, ...]
     notes: tuple[str, ...]
+    uncounted: dict[str, str]
 
     @classmethod
-    def of(cls, rack: RackTiming, has_cores: bool = True) -> Forecast:
-        """Return the forecast of a rack; `has_cores` is false if this machine lacks cores that the
-        config asks for."""
+    def of(cls, rack: RackTiming, has_cores: bool = True, hosts: Iterable[str] = ()) -> Forecast:
+        """Return the forecast of a rack.
+
+        Args:
+            rack: Timing of the boards.
+            has_cores: False if this machine lacks cores that the config asks for.
+            hosts: Host boards, which the timing model does not know.
+        """
         return cls(
             system=predict(rack),
             context_switch_ns=rack.context_switch_ns,
@@ -54,6 +63,7 @@ class Forecast:
             schedule=rack.schedule,
             frames=core_frames(rack),
             notes=tuple(_notes(rack, has_cores)),
+            uncounted=_uncounted(rack) | dict.fromkeys(hosts, "a host board, without a rate"),
         )
 
     @property
@@ -87,6 +97,17 @@ class Forecast:
         return {**sizes, "cores": [found.document() for found in self.frames]}
 
 
+def _uncounted(rack: RackTiming) -> dict[str, str]:
+    """Return the tasks without a cost, with the reason."""
+    counted = {task.name for task in rack.tasks if task.cost_ns}
+    # An update alone is no plan.
+    counted -= {f"{b.name}.planner" for b in rack.boards.values() if not b.is_plan_budgeted}
+    found = {name: NO_BUDGET for name in rack.cores if name not in counted}
+    if rack.clock.name in found:
+        found[rack.clock.name] = "timing.clock_ms is 0; --set timing.clock_ms=0.1 counts 0.1 ms"
+    return found
+
+
 def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
     if queues := [
         queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues
@@ -115,12 +136,6 @@ def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
             "no budget, so not judged and not counted (set one in the config, or use --from RUN):"
             f" {names}"
         )
-    if silent := [
-        board.name for board in known if board.has_planner and not board.is_plan_budgeted
-    ]:
-        yield f"planner not judged, no plan_ms in the budget: {', '.join(silent)}"
-    if not rack.clock.cost_ns:
-        yield "the clock is not counted on its core: timing.clock_ms is 0"
     sharing = [task for task in rack.tasks if task.cost_ns and not task.priority]
     crowded = [
         task.name for task in sharing if sum(other.core == task.core for other in sharing) > 1

@@ -42,7 +42,8 @@ class EquationVerdict:
 
     `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task,
     a core or "system". `left` and `right` are ns, or numbers if `unit` is "1". `meaning` names both
-    sides in the paper's terms, as in "t_plan / d < t_residual - 2 t_cs".
+    sides in the paper's terms, as in "t_plan / d < t_residual - 2 t_cs". `endless` says in a
+    sentence why the left side has no bound; empty if it has one.
     """
 
     equation: str
@@ -53,13 +54,20 @@ class EquationVerdict:
     holds: bool
     meaning: str
     unit: str = "ns"
+    endless: str = ""
 
     @classmethod
     def of(
-        cls, equation: str, subject: str, relation: Relation, meaning: str, unit: str = "ns"
+        cls,
+        equation: str,
+        subject: str,
+        relation: Relation,
+        meaning: str,
+        unit: str = "ns",
+        endless: str = "",
     ) -> EquationVerdict:
         """Return the verdict on a relation."""
-        return cls(equation, subject, *relation, relation.holds, meaning, unit)
+        return cls(equation, subject, *relation, relation.holds, meaning, unit, endless)
 
     @property
     def margin(self) -> float:
@@ -186,10 +194,19 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
 
 def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
     for task in rack.responses:
-        response_ns = inf if task.response_ns is None else task.response_ns
+        response_ns = task.response_ns
+        endless = ""
+        if response_ns is None:
+            response_ns = inf
+            load = rack.loads[task.core]
+            what = "is overloaded" if load > 1 else "leaves it too little time"
+            role = "planner" if task.task.endswith(".planner") else "board"
+            endless = (
+                f"{role} '{task.task}' never finishes: core {task.core} {what} (load {load:.3g})"
+            )
         relation = Relation(response_ns, "<=", task.deadline_ns)
         meaning = "worst-case response <= deadline"
-        yield EquationVerdict.of(RESPONSE_TIME, task.task, relation, meaning)
+        yield EquationVerdict.of(RESPONSE_TIME, task.task, relation, meaning, endless=endless)
 
 
 def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
@@ -212,9 +229,12 @@ def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
     for name, inbox in rack.inboxes.items():
-        waiting = inbox.burst.waiting
-        most = inf if waiting is None else waiting
+        burst = inbox.burst
+        most = inf
+        endless = f"interrupts of '{name}' come faster than it serves them (load {burst.load:.3g})"
+        if burst.waiting is not None:
+            most = burst.waiting
+            endless = ""
         relation = Relation(most, "<=", inbox.depth)
-        yield EquationVerdict.of(
-            INBOX, name, relation, "interrupts that wait after a burst of all senders <= depth", "1"
-        )
+        meaning = "interrupts that wait after a burst of all senders <= depth"
+        yield EquationVerdict.of(INBOX, name, relation, meaning, "1", endless)

@@ -3,6 +3,7 @@ cycles."""
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import asdict
 from importlib import import_module
@@ -21,6 +22,7 @@ from rack.levels.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
 from rack.tools.console.tables import print_wrapped
+from rack.tools.live.folder import folder_of
 from rack.tools.timing.inventory import arm_lines, inventory, inventory_lines
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import Repair, repair
@@ -90,7 +92,11 @@ def check(
     or of one that shares its core. Changes that need a core that this machine lacks come last.
     --fix prints the config with the first of them.
 
-    Exit status: 0 everything holds, or nothing can be judged; 1 an equation fails, or no change
+    The verdict names every board, planner and host board that was not counted: "fits" alone means
+    that all were. The recorder never is. In --json timing.fits is true, false, or null for a rack
+    that fits without what timing.uncounted lists.
+
+    Exit status: 0 every equation holds, of what was counted; 1 an equation fails, or no change
     helps; 2 a bad config.
 
     \b
@@ -114,22 +120,29 @@ def check(
         return
     lacking = shared_out(found)
     stock = inventory(found, judged.layout, lacking)
-    forecast = Forecast.of(judged.timing, not lacking)
+    forecast = Forecast.of(judged.timing, not lacking, found.host)
     arm = _abilities(found)
     unkept = _unkept(found)
     if as_json:
-        timing = forecast.document() | {"repair": fitting.document()}
+        fits = (None if forecast.uncounted else True) if forecast.holds else False
+        verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": fitting.document()}
+        timing = forecast.document() | verdict
         arm_document = None if arm is None else asdict(arm)
         further = {"changed": found.changed, "arm": arm_document, "unkept": unkept or None}
         print_json(stock | further | {"timing": timing})
     else:
+        again = shlex.join([config, *(f"--set={setting}" for setting in settings)])
+        measured = folder_of(None, found.name)
+        measuring = (
+            f"rack run {again} --seconds 10 --out {measured}; rack check {again} --from {measured}"
+        )
         head, *rest = inventory_lines(stock)
         lines = [
             head,
             *found.changed,
             *lacking,
             *([f"{UNKEPT}{unkept}"] if unkept else []),
-            *summary_lines(forecast, fitting, arm, found.joints),
+            *summary_lines(forecast, fitting, arm, found.joints, "" if run else measuring),
         ]
         if verbose:
             lines += [

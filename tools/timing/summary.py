@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.forecast import NO_BUDGET, Forecast
 from rack.levels.timing.verdicts import EQUATIONS, EquationVerdict
 from rack.tools.timing.repair import Repair
 from rack.tools.timing.tables import side_text, verdict_table
@@ -20,18 +20,23 @@ RESPONSES = "3.2", "3.3"
 
 
 def summary_lines(
-    forecast: Forecast, fitting: Repair, arm: Abilities | None, joints: Sequence[str]
+    forecast: Forecast,
+    fitting: Repair,
+    arm: Abilities | None,
+    joints: Sequence[str],
+    measuring: str,
 ) -> Iterator[str]:
-    """Yield it as text for people, with every verdict that fails; `arm` is None where there is
-    none."""
+    """Yield the summary as text for people, with every verdict that fails.
+
+    Args:
+        forecast: Timing of the rack.
+        fitting: Changes that make it fit.
+        arm: Abilities of the arm; None for a rack without one.
+        joints: Names of the arm's joints.
+        measuring: Command that measures budgets; empty if they were measured.
+    """
+    yield from _verdict(forecast, measuring)
     failing = [verdict for verdict in forecast.verdicts if not verdict.holds]
-    count = len(forecast.verdicts)
-    if failing:
-        yield f"does not fit: {len(failing)} of {count} equations and bounds fail"
-    elif count:
-        yield f"fits: all {count} equations and bounds hold"
-    else:
-        yield "fits, as far as is known: no board has a budget; --from RUN takes those measured"
     yield from tightest(forecast.verdicts)
     system = forecast.system
     if system.levels:
@@ -48,9 +53,34 @@ def summary_lines(
         yield from verdict_table(failing)
         yield ""
         yield from fitting.lines()
-    else:
+    elif not forecast.uncounted:
         yield "to do: nothing"
     yield from forecast.notes
+
+
+def _verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
+    """Yield whether the rack fits, and whatever was not counted for that."""
+    names: dict[str, list[str]] = {}
+    for name, why in forecast.uncounted.items():
+        names.setdefault(why, []).append(f"'{name}'")
+    left_out = ", ".join(f"{', '.join(those)} ({why})" for why, those in names.items())
+    silent = names.get(NO_BUDGET)
+    command = ""
+    if silent and measuring:
+        command = f": measure {'it' if len(silent) == 1 else 'them'} by: {measuring}"
+    count = len(forecast.verdicts)
+    if failing := sum(not verdict.holds for verdict in forecast.verdicts):
+        rest = f"; not counted: {left_out}{command}" if left_out else ""
+        yield f"does not fit: {failing} of {count} equations and bounds fail{rest}"
+        return
+    held = f"all {count} equations and bounds hold; not counted: the recorder"
+    if not forecast.levels:
+        yield f"fits, as far as is known: no board has a budget{command}"
+    elif left_out:
+        yield f"fits, without {left_out}{command}"
+        yield held
+    else:
+        yield f"fits: {held}"
 
 
 def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
@@ -66,6 +96,8 @@ def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
 
 
 def _margin(verdict: EquationVerdict) -> str:
+    if verdict.endless:
+        return verdict.endless
     what = verdict.equation
     if what in EQUATIONS:
         what = f"eq. {what}".replace("eq. fig.", "fig.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
+from math import isinf
 from typing import Any
 
 from rack.levels.timing.chains import spanned
@@ -217,6 +218,8 @@ def _verdict_row(verdict: EquationVerdict) -> list[str]:
 
 def side_text(value: float, unit: str) -> str:
     """Return a side of an equation: a time in ms, anything else with three digits."""
+    if isinf(value):
+        return "endless" if value > 0 else "-"
     return ms(value) if unit == "ns" else f"{value:.3g}"
 
 

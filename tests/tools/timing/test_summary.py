@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import re
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rack.backplane.mailbox.inbox import InterruptSource
+from rack.boards.config import load
+from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.interrupts import InboxTiming
+from rack.levels.timing.verdicts import INBOX, verdicts
+from rack.tools.timing.judged_config import JudgedConfig
+from rack.tools.timing.summary import tightest
 from tests.tools.command_line import rack
 
 BUDGET = "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }"
+UPPER = "board.upper.budget={ process_ms = 0.1 }"
 FAILS = "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }"
 ALONE = ("--set", "board.lower.core=1", "--set", "board.lower.priority=80")
 MORE = "--verbose shows every task, mailbox and equation"
@@ -52,8 +64,76 @@ def test_a_rack_that_does_not_fit_shows_what_fails_and_what_helps(small: Path) -
 
 def test_a_rack_without_budgets_is_not_said_to_fit(small: Path) -> None:
     found = lines(small)
-    assert found[1].startswith(("fits, as far as is known", "fits: all "))
-    assert any("not counted" in line for line in found)
+    assert found[1].startswith(
+        "fits, as far as is known: no board has a budget: measure them by: rack run "
+    )
+    assert "to do: nothing" not in found
+
+
+def test_whatever_was_not_counted_is_named_in_the_verdict(small: Path) -> None:
+    found = lines(small, "--set", BUDGET, *ALONE)
+    clock = "'clock' (timing.clock_ms is 0; --set timing.clock_ms=0.1 counts 0.1 ms)"
+    assert found[1].startswith(f"fits, without {clock}, 'upper' (no budget): measure it by: ")
+    assert found[2].startswith("all ")
+    assert "to do: nothing" not in found
+    counted = ("--set", UPPER, "--set", "timing.clock_ms=0.01")
+    assert lines(small, "--set", BUDGET, *ALONE, *counted)[1].startswith("fits: all ")
+    left_out = lines(small, "--set", FAILS, *ALONE, status=1)[1]
+    assert f"equations and bounds fail; not counted: {clock}, 'upper' (no budget)" in left_out
+
+
+def test_the_document_tells_what_was_not_counted(small: Path) -> None:
+    for settings, fits, names in (
+        ((BUDGET,), None, ["clock", "upper"]),
+        ((BUDGET, UPPER, "timing.clock_ms=0.01"), True, []),
+        ((FAILS, UPPER), False, ["clock"]),
+        (
+            (BUDGET.replace("plan_ms = 2.0", "plan_ms = 0.0"), UPPER),
+            None,
+            ["clock", "lower.planner"],
+        ),
+    ):
+        words = [word for setting in settings for word in ("--set", setting)]
+        status = 1 if fits is False else 0
+        timing = json.loads("\n".join(lines(small, *words, *ALONE, "--json", status=status)))[
+            "timing"
+        ]
+        assert (timing["fits"], list(timing["uncounted"])) == (fits, names)
+
+
+def test_host_boards_are_named_as_not_counted() -> None:
+    judged = JudgedConfig.of(load("ibm"))
+    found = Forecast.of(judged.timing, hosts=judged.config.host).uncounted
+    assert judged.config.host
+    assert judged.config.host.keys() <= found.keys()
+
+
+@pytest.mark.slow
+def test_the_command_in_the_verdict_measures_what_was_missing(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = ("--set", "clock.mode=lockstep", "--set", "timing.clock_ms=0.01")
+    command = lines(small, *settings)[1].partition("by: ")[2]
+    first, second = (shlex.split(part) for part in command.split("; "))
+    assert rack(*first[1:]).returncode == 0
+    assert "no budget" not in "\n".join(lines(*second[2:]))
+
+
+def test_what_never_ends_is_told_in_a_sentence(small: Path) -> None:
+    overload = "board.lower.budget={ process_ms = 2.0, plan_ms = 1e6 }"
+    found = lines(small, "--set", overload, *ALONE, "--verbose", status=1)
+    assert found[2].startswith("tightest: planner 'lower.planner' never finishes: core 1 is over")
+    assert not [line for line in found if re.search(r"\binf\b|inf%", line)]
+
+
+def test_interrupts_that_never_end_are_told_in_a_sentence() -> None:
+    inbox = InboxTiming("low", ("up.status",), (InterruptSource(1_000, 2_000),), 4)
+    timing = replace(JudgedConfig.of(load("fig2")).timing, inboxes={"low": inbox})
+    (found,) = [verdict for verdict in verdicts(timing) if verdict.equation == INBOX]
+    assert list(tightest([found])) == [
+        "tightest: interrupts of 'low' come faster than it serves them (load 2)"
+    ]
 
 
 def test_the_rest_comes_on_demand(small: Path) -> None:
