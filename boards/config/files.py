@@ -3,14 +3,15 @@ paths."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from rack.backplane.bounded_toml import MAX_DEPTH
 from rack.backplane.regular_file import read_regular_file
-from rack.boards.config.toml import Tables, merge, override, parse
+from rack.boards.config.toml import Tables, merge, override, parse, table_of
 from rack.boards.errors import ConfigError, Mistake
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -32,11 +33,50 @@ def assembled(
 
     Paths in an override are relative to the current folder. Raises `ConfigError`.
     """
-    path = _path(name_or_path, "config", CONFIGS)
-    tables = _read(path, (), {})
+    mistakes: list[Mistake] = []
+    tables: Tables = {}
+    folder = CONFIGS
+    with gathering(mistakes):
+        path = _path(name_or_path, "config", CONFIGS)
+        folder = path.parent
+        tables = _read(path, (), {}, mistakes)
+    is_whole = not mistakes
     if faults is not None:
-        tables = with_faults(tables, faults, path.parent)
-    return anchor(override(tables, overrides), Path.cwd())
+        with gathering(mistakes):
+            tables = with_faults(tables, faults, folder)
+    wrong: list[Mistake] = []
+    overridden = override(tables, overrides, wrong)
+    # Settings may refer to what only the files hold.
+    found = anchor(overridden if is_whole else tables, Path.cwd())
+    if mistakes or wrong:
+        broken = frozenset(table_of(setting.value) for setting in wrong)
+        raise PartialConfigError([*mistakes, *wrong], found, broken, is_whole)
+    return found
+
+
+class PartialConfigError(ConfigError):
+    """Mistakes in files, fault script and settings, with the tables that were read all the same.
+
+    `broken` names the tables that settings with mistakes were to change. `is_whole` is false if
+    files are missing, with tables that nobody knows.
+    """
+
+    def __init__(
+        self, mistakes: list[Mistake], tables: Tables, broken: frozenset[str], is_whole: bool
+    ) -> None:
+        super().__init__(mistakes)
+        self.tables = tables
+        self.broken = broken
+        self.is_whole = is_whole
+
+
+@contextmanager
+def gathering(mistakes: list[Mistake]) -> Iterator[None]:
+    """Add the mistakes of a `ConfigError` to a list."""
+    try:
+        yield
+    except ConfigError as error:
+        mistakes += error.mistakes
 
 
 def named_classes(tables: Tables) -> tuple[str, ...]:
@@ -55,7 +95,11 @@ def read(name_or_path: str | Path) -> Tables:
     in '.toml' is a path, if it is no name as `names` lists them, or such a file exists. Raises
     `ConfigError`.
     """
-    return _read(_path(name_or_path, "config", CONFIGS), (), {})
+    mistakes: list[Mistake] = []
+    tables = _read(_path(name_or_path, "config", CONFIGS), (), {}, mistakes)
+    if mistakes:
+        raise ConfigError(mistakes)
+    return tables
 
 
 def with_faults(tables: Tables, name_or_path: str | Path, own: Path) -> Tables:
@@ -185,11 +229,26 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     return found
 
 
-def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tables:
-    """Return the tables of a file, merged with those that it extends; `known` caches files extended
-    more than once."""
-    if path in known:
-        return known[path]
+def _read(
+    path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
+) -> Tables:
+    """Return the tables of a file, merged with those that it extends.
+
+    Args:
+        path: The file.
+        chain: The files that extend it, directly or not.
+        known: Files read before, which may be extended more than once.
+        mistakes: Gets every mistake.
+    """
+    if path not in known:
+        with gathering(mistakes):
+            known[path] = _merged(path, chain, known, mistakes)
+    return known.setdefault(path, {})
+
+
+def _merged(
+    path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
+) -> Tables:
     if path in chain:
         loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
         raise ConfigError([Mistake(f"{path.name}: extends", None, f"extends itself: {loop}")])
@@ -199,10 +258,9 @@ def _read(path: Path, chain: tuple[Path, ...], known: dict[Path, Tables]) -> Tab
     # Its own: a file may extend newer ones.
     own = {"format": 1, **anchor(_tables(path), path.parent)}
     merged: Tables = {}
-    for base in _bases(own.pop("extends", []), path):
-        merged = _extended(merged, _read(base, (*chain, path), known))
-    known[path] = _extended(merged, own)
-    return known[path]
+    for base in _bases(own.pop("extends", []), path, mistakes):
+        merged = _extended(merged, _read(base, (*chain, path), known, mistakes))
+    return _extended(merged, own)
 
 
 def _extended(base: Tables, top: Tables) -> Tables:
@@ -222,7 +280,7 @@ def _tables(path: Path) -> Tables:
     return parse(text, path.name)
 
 
-def _bases(extends: Any, path: Path) -> list[Path]:
+def _bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
     place = f"{path.name}: extends"
     if not isinstance(extends, list) or not all(isinstance(item, str) for item in extends):
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
@@ -230,7 +288,7 @@ def _bases(extends: Any, path: Path) -> list[Path]:
         item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item)
         for item in extends
     }
-    lost = [
+    mistakes += [
         Mistake(
             place,
             item,
@@ -239,8 +297,6 @@ def _bases(extends: Any, path: Path) -> list[Path]:
         for item, base in found.items()
         if base is None
     ]
-    if lost:
-        raise ConfigError(lost)
     return [base for base in found.values() if base is not None]
 
 

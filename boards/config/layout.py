@@ -143,7 +143,8 @@ class LayoutMaker:
         )
         if box.protocol == "interrupt":
             yield self._with_interrupts(box, writer, readers)
-        elif box.protocol == "queue":
+        # A board with mistakes of its own may be its reader.
+        elif box.protocol == "queue" and readers:
             yield from self._queue(box, readers[0], writer)
         else:
             yield box

@@ -27,7 +27,7 @@ from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes, with_derived
 from rack.boards.config.commands import requests
 from rack.boards.config.faults import injections, places
-from rack.boards.config.files import CONFIGS, anchor, assembled
+from rack.boards.config.files import CONFIGS, PartialConfigError, anchor, assembled
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.published import PublishedRack, publish
@@ -35,9 +35,9 @@ from rack.boards.config.rules import broken_rules, network_rules
 from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.rules.levels import memory, neighbours, sizes
-from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
+from rack.boards.config.schema import LAN, LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
-from rack.boards.config.toml import Tables, parse
+from rack.boards.config.toml import Tables, parse, table_of
 from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -73,6 +73,9 @@ FILES = 32
 """Files that a process of a rack may have open, beside one for each other process and each mailbox
 that it writes."""
 
+LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
+"""Tables without which there is no layout, and no level can judge its neighbours."""
+
 T = TypeVar("T", bound=Table)
 
 
@@ -83,10 +86,14 @@ def load(
     import path.
 
     Faults of the script `faults`, by name or path, are appended to its own. Paths in an override
-    are relative to the current folder. Raises `ConfigError` with every mistake if a single table is
-    wrong; `resolve` checks the rest.
+    are relative to the current folder. Raises `ConfigError` with every mistake if a file, a setting
+    or a single table is wrong; `resolve` checks the rest.
     """
-    return validated(assembled(name_or_path, overrides, faults))
+    try:
+        tables = assembled(name_or_path, overrides, faults)
+    except PartialConfigError as error:
+        return validated(error.tables, error)
+    return validated(tables)
 
 
 def loads(text: str) -> RackConfig:
@@ -333,21 +340,23 @@ class _Examined:
     ) -> None:
         self._config = config
         self._wiring = Wiring(config, broken)
+        self._sizes: dict[str, int] = {}
         self._layout: Layout | None = None
         self.mistakes = broken_rules(self._wiring)
-        is_whole = not self.mistakes and not broken
-        self._sizes = cell_sizes(config) if is_whole else {}
-        if is_whole:
-            self.mistakes += sizes(self._wiring, self._sizes)
-        if is_whole and not self.mistakes:
-            layout = LayoutMaker(self._wiring, self._sizes).layout()
-            self._contexts = self._contexts_of_boards()
-            self.mistakes += [*memory(layout), *neighbours(self._wiring, self._contexts)]
-            self._layout = None if self.mistakes else layout
+        unsound = broken.union(table_of(mistake.place) for mistake in self.mistakes)
+        wiring = self._wiring if not unsound else Wiring(_reduced(config, unsound), unsound)
+        if wiring.tasks and not unsound & LAYOUT_NEEDS:
+            self._sizes = cell_sizes(config)
+            self.mistakes += (wrong := [*sizes(wiring, self._sizes)])
+            if not wrong:
+                self._layout = LayoutMaker(wiring, self._sizes).layout()
+                self._contexts = self._contexts_of_boards(wiring)
+                self.mistakes += memory(self._layout)
+                self.mistakes += neighbours(wiring, self._contexts)
         self._published = publish(config)
         levels = self._published.levels
+        self.mistakes += fault_mistakes(faults, config, levels, self._layout, wiring.unknown)
         broken_boards = self._wiring.broken_boards
-        self.mistakes += fault_mistakes(faults, config, levels, self._layout, broken_boards)
         self.mistakes += command_mistakes(commands, config, levels, broken_boards)
         if (network := network_rules(config)) is not None:
             self.mistakes = [network.at_adapter(mistake, config) for mistake in self.mistakes]
@@ -422,9 +431,9 @@ class _Examined:
             ),
         )
 
-    def _contexts_of_boards(self) -> dict[str, LevelContext]:
-        every = self._wiring.every
-        boards = self._config.board
+    def _contexts_of_boards(self, wiring: Wiring) -> dict[str, LevelContext]:
+        every = wiring.every
+        boards = wiring.config.board
         paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
         return {
             name: self._context(
@@ -437,6 +446,8 @@ class _Examined:
                 below={other: paces[other] for other in board.below},
             )
             for name, board in boards.items()
+            # The neighbours of any other board have mistakes of their own.
+            if boards.keys() >= {*board.above, *board.below}
         }
 
     def _context(self, name: str, params: Mapping[str, Any], **times: Any) -> LevelContext:
@@ -456,21 +467,51 @@ class _Examined:
         )
 
 
-def validated(tables: Tables) -> RackConfig:
-    """Return the config in tables, and add its levels to the import path. Raises `ConfigError` as
-    `load` does."""
+def validated(tables: Tables, partial: PartialConfigError | None = None) -> RackConfig:
+    """Return the config in tables, and add its levels to the import path.
+
+    Args:
+        tables: Tables of a config, assembled.
+        partial: Earlier mistakes, which are raised together with those that are found here.
+
+    Raises:
+        ConfigError: The config has mistakes. All stages run on the tables that are valid.
+    """
+    mistakes: list[Mistake] = []
+    broken: frozenset[str] = frozenset()
+    is_whole = True
+    if partial is not None:
+        mistakes += partial.mistakes
+        broken = partial.broken
+        is_whole = partial.is_whole
+    unset = broken
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
-        broken = _broken(error)
+        broken |= _broken(error)
+        mistakes += [
+            mistake
+            for mistake in mistakes_of(error, RackConfig, tables)
+            # A setting or a file with mistakes may hold what is missing.
+            if not mistake.why.startswith("missing")
+            or (is_whole and table_of(mistake.place) not in unset)
+        ]
+    if not is_whole:
+        raise ConfigError(mistakes)
+    if broken:
         config = _intact(tables, broken)
-        extend_path(config.python_path)
-        faults = _readable(tables, "fault", FaultConfig)
-        commands = _readable(tables, "command", CommandConfig)
-        found = mistakes_of(error, RackConfig, tables)
-        raise ConfigError([*found, *_Examined(config, faults, commands, broken).mistakes]) from None
     extend_path(config.python_path)
-    return with_derived(config)
+    try:
+        config = with_derived(config)
+    except ConfigError as error:
+        broken |= {"robot"}
+        mistakes += error.mistakes
+        config = _intact(tables, broken)
+    if not mistakes:
+        return config
+    faults = _readable(tables, "fault", FaultConfig)
+    commands = _readable(tables, "command", CommandConfig)
+    raise ConfigError([*mistakes, *_Examined(config, faults, commands, broken).mistakes])
 
 
 def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
@@ -490,6 +531,17 @@ def _broken(error: ValidationError) -> frozenset[str]:
     return frozenset(
         ".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places
     )
+
+
+def _reduced(config: RackConfig, unsound: frozenset[str]) -> RackConfig:
+    """Return a config without the boards and host boards that have mistakes."""
+    kept = {
+        key: {name: t for name, t in getattr(config, key).items() if f"{key}.{name}" not in unsound}
+        for key in ("board", "host")
+    }
+    if "adapter" in unsound:
+        kept["board"].pop(LAN, None)
+    return config.model_copy(update=kept)
 
 
 def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:

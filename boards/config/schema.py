@@ -199,8 +199,7 @@ class BoardConfig(Table):
     core: Core = 0
     """core of the board; if the machine lacks it, another core is used"""
     rate_hz: Positive | None = Field(None, ge=1e-6)
-    """rate of the executor, Hz; must divide the clock rate, four digits are enough; give either
-    rate_hz or every"""
+    """rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"""
     every: int | None = Field(None, ge=1, le=LONGEST_EVERY)
     """instead of rate_hz: period of the executor, ticks"""
     phase: int = Field(0, ge=0)
@@ -263,7 +262,7 @@ class LanConfig(LanTable):
     core: Core = 0
     """core of the board; if the machine lacks it, another core is used"""
     rate_hz: Positive = Field(50.0, ge=1e-6)
-    """rate of the board, Hz; must divide the clock rate, four digits are enough"""
+    """rate of the board, Hz; must divide the clock rate"""
     priority: Priority = 0
     """SCHED_FIFO priority, above the other boards' of its core; 0: ordinary"""
     budget: BudgetConfig | None = None

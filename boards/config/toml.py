@@ -84,13 +84,24 @@ def merge(base: Tables, top: Tables) -> Tables:
     return merged
 
 
-def override(tables: Tables, settings: Sequence[str]) -> Tables:
+def override(
+    tables: Tables, settings: Sequence[str], mistakes: list[Mistake] | None = None
+) -> Tables:
     """Return the tables with each setting `key.sub=value` applied, in order.
 
     Values are TOML; any other text is taken as a string. A number in a key is an index into a list,
-    as in `task.action.0.by=30`. Raises `ConfigError` with every mistake.
+    as in `task.action.0.by=30`.
+
+    Args:
+        tables: Tables of a config, which are not changed.
+        settings: The settings.
+        mistakes: Gets every mistake; the settings without one are applied.
+
+    Raises:
+        ConfigError: There are mistakes, and no list for them.
     """
-    mistakes: list[Mistake] = []
+    raises = mistakes is None
+    mistakes = [] if mistakes is None else mistakes
     for setting in settings:
         try:
             keys, value = _parts(setting)
@@ -99,7 +110,7 @@ def override(tables: Tables, settings: Sequence[str]) -> Tables:
             mistakes.append(Mistake("--set", setting, str(error.args[0])))
         except ConfigError as error:
             mistakes += [Mistake("--set", setting, mistake.why) for mistake in error.mistakes]
-    if mistakes:
+    if mistakes and raises:
         raise ConfigError(mistakes)
     return tables
 
@@ -149,3 +160,9 @@ def _put(node: Any, keys: list[str], value: Any) -> Any:
         raise LookupError(f"{shown(key)} cannot be set in {shown(node)}, which is not a table")
     empty: Tables | None = {} if rest else None
     return {**node, key: _put(node.get(key, empty), rest, value)}
+
+
+def table_of(place: str) -> str:
+    """Return the table of a place, as "board.servo" of "board.servo.rate_hz = 3"."""
+    kind, *name = re.split(r"[.\[=]", place.replace("mailbox ", "board."))[:2]
+    return f"{kind}.{name[0]}" if name and kind in ("board", "host") else kind

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.boards.config.files import assembled, named_classes
+from rack.boards.config.files import PartialConfigError, assembled, named_classes
 from rack.boards.crate.requests import Preload
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
@@ -153,7 +153,7 @@ def run(
 
         config = str(run_of(origin))
     assert config is not None
-    tables = assembled(config, overrides, faults)
+    tables = _tables(config, overrides, faults)
     crate = _informed(context.obj, tables)
     from rack.boards.config.resolved import validated
     from rack.tools.live.display import display_for
@@ -194,6 +194,17 @@ def run(
         # On stderr and last, where it is seen in any case.
         print(result.failure(), file=sys.stderr)
     sys.exit(0 if result.worked else 1)
+
+
+def _tables(config: str, overrides: list[str], faults: str | None) -> Tables:
+    """Return the assembled tables. Raises `ConfigError` with the mistakes of all stages."""
+    try:
+        return assembled(config, overrides, faults)
+    except PartialConfigError:
+        from rack.boards.config.resolved import load
+
+        load(config, overrides, faults)
+        raise
 
 
 def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:

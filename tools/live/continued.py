@@ -26,8 +26,7 @@ from rack.boards import Rack
 from rack.boards.checkpoint.format import ATTRIBUTES, NAME, checkpoints
 from rack.boards.checkpoint.taking import outside
 from rack.boards.classes import extend_path
-from rack.boards.config.files import assembled
-from rack.boards.config.resolved import validated
+from rack.boards.config.resolved import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.wiring import Entries, Keeping
@@ -176,7 +175,7 @@ def tick_in(recording: Recording, text: str, asked: str = "") -> int:
 def branched(recording: Recording, settings: Sequence[str], faults: str | None) -> RackConfig:
     """Return the config of a branch of a run in lockstep. Raises `ConfigError`."""
     overrides = ["clock.mode=lockstep", "clock.speed=1.0", *settings]
-    return validated(assembled(str(recording.folder / CONFIG), overrides, faults))
+    return load(str(recording.folder / CONFIG), overrides, faults)
 
 
 def begun_before(

@@ -77,9 +77,9 @@ class FaultRules:
                 yield self._mistake("board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}")
         elif kind is not None:
             yield from self._target(kind, tasks)
-        if self.layout is not None and fault.when is not None:
+        if fault.when is not None and (layout := self._layout_of(fault.when)) is not None:
             try:
-                condition(fault.when, self.layout)
+                condition(fault.when, layout)
             except LookupError as error:
                 yield self._mistake("when", str(error.args[0]))
 
@@ -165,8 +165,13 @@ class FaultRules:
                     "board",
                     f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}",
                 )
-        elif kind.takes_mailbox and self.layout is not None:
-            yield from self._mailboxes(kind, self.layout)
+        elif kind.takes_mailbox and (layout := self._layout_of(board)) is not None:
+            yield from self._mailboxes(kind, layout)
+
+    def _layout_of(self, place: str) -> Layout | None:
+        """Return the layout; None without one, or if it lacks the board of a task or a mailbox."""
+        is_known = place.partition(".")[0].strip() not in self.unspecified
+        return self.layout if is_known else None
 
     def _mailboxes(self, kind: Kind, layout: Layout) -> Iterator[Mistake]:
         every = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
@@ -187,7 +192,11 @@ class FaultRules:
             )
             yield self._mistake("mailbox", why)
         elif (
-            kind.where == "bus" and wanted is None and not any(m.readers for m in written.values())
+            kind.where == "bus"
+            and wanted is None
+            and not any(m.readers for m in written.values())
+            # Readers may be among the boards that the layout lacks.
+            and not self.unspecified
         ):
             yield self._mistake(
                 "mailbox", f"missing; no mailbox of '{self.fault.board}' has a reader"

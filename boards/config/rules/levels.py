@@ -70,10 +70,12 @@ def memory(layout: Layout) -> Iterator[Mistake]:
 
 
 def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Iterator[Mistake]:
-    """Ask each level whether its neighbours suit it; `contexts` by board."""
+    """Ask each level whether its neighbours suit it; `contexts` by board, without boards that have
+    mistakes."""
     for ports in wiring.tasks:
-        if issubclass(ports.kind, Executor):
-            board = wiring.config.board[ports.task]
+        board = wiring.config.board[ports.place.board]
+        asked = {ports.task, *board.above, *board.below}
+        if issubclass(ports.kind, Executor) and asked <= contexts.keys():
             above, below = (
                 [contexts[other] for other in others] for others in (board.above, board.below)
             )
