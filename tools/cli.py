@@ -208,6 +208,8 @@ def run_commands() -> None:
     from rack.tools.console.answer import Failure, exit_status, fail
 
     arguments = sys.argv[1:]
+    if sys.flags.optimize > 1 and "--help" in arguments:
+        print("help lacks its texts: PYTHONOPTIMIZE=2 (python -OO) removes them", file=sys.stderr)
     try:
         _check_arguments(arguments)
         if answer := _short_answer(arguments):

@@ -7,6 +7,7 @@ import json
 import os
 import shlex
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -234,3 +235,22 @@ def test_the_shell_completes_commands_and_configs(words: str, found: str) -> Non
         check=False,
     )
     assert (done.returncode, done.stdout.strip()) == (0, found)
+
+
+def as_module(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line as `python WORDS`."""
+    return subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
+
+
+def test_the_command_line_runs_as_a_module() -> None:
+    done = as_module("-m", "rack", "--version")
+    assert (done.returncode, done.stderr, done.stdout[:5]) == (0, "", "rack ")
+
+
+def test_help_without_its_texts_gives_the_reason() -> None:
+    assert as_module("-m", "rack", "list", "--help").stderr == ""
+    assert as_module("-OO", "-m", "rack", "list", "--help").stderr == (
+        "help lacks its texts: PYTHONOPTIMIZE=2 (python -OO) removes them\n"
+    )

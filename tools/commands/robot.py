@@ -35,7 +35,6 @@ ModelOrConfig = Annotated[
 Picture = Annotated[
     Path | None, typer.Option(metavar="PNG", help="file of the picture; default: NAME.png")
 ]
-MODELS = (".xml", ".urdf", ".mjcf")
 Tip = Annotated[
     str, typer.Option(metavar="NAME", help="body or site at the end of the arm, if there are two")
 ]
@@ -152,7 +151,7 @@ def _examined(given: str, folder: Path) -> tuple[Examined, str]:
     from rack.tools.robot.findings import examine
     from rack.tools.robot.source import read_source
 
-    if Path(given).suffix.lower() in MODELS:
+    if Path(given).suffix not in ("", ".toml"):
         made = draft(read_source(Path(given)), Wishes(), folder, "arm")
         return examine(made.robot, NOTHING, CLOCK_NS), _plain(Path(given).stem)
     config = load(given)

@@ -22,7 +22,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 # In a checkout this file and the floors are links in .venv: their files are where these lead.
-__path__ = [str(Path(__file__).with_name("backplane").resolve().parent)]
+__path__ = [
+    str(Path(__file__).with_name("backplane").resolve().parent),
+    str(Path(__file__).resolve().parent),
+]
 
 from rack.backplane.exports import on_first_use
 

@@ -185,6 +185,36 @@ def test_a_stall_that_is_rare_fails_the_worst_cycle_and_not_most(
     assert [breach.tick for breach in Analysis.of(recording, 99.0).breaches] == [SETTLED + 7]
 
 
+@pytest.mark.parametrize(
+    ("outcome", "to_do"),
+    [
+        ({"cause": "task done"}, "nothing\n"),
+        ({"cause": "time over", "faults": []}, "nothing\n"),
+        ({"cause": "task failed"}, "rack report "),
+        ({"cause": "time over", "faults": ["emergency stop"]}, "rack report "),
+    ],
+)
+def test_a_run_that_failed_has_something_to_do(
+    small: Path, tmp_path: Path, outcome: dict[str, Any], to_do: str
+) -> None:
+    config = load(small, ["clock.mode=realtime", *BUDGET])
+    traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(40)] for name in ("lower", "upper")}
+    ended = {"kind": "outcome", "outcome": outcome, "tasks": {}}
+    analysis = Analysis.of(recorded(tmp_path / "run", config, traces, [ended]))
+    assert analysis.holds
+    assert f"to do: {to_do}" in brief(analysis)
+
+
+def test_a_level_that_is_late_though_its_times_fit_is_not_referred_to_the_check(
+    small: Path, tmp_path: Path
+) -> None:
+    config = load(small, ["clock.mode=realtime", *BUDGET])
+    late = [Cycle(SETTLED + k, PLAIN, late=3.0) for k in range(40)]
+    analysis = Analysis.of(recorded(tmp_path / "run", config, {"lower": late}))
+    assert not analysis.holds
+    assert "to do: nothing about the config: its levels' own times fit" in brief(analysis)
+
+
 def test_alpha_and_deviation_are_those_of_equation_3_6(small: Path, tmp_path: Path) -> None:
     trace = [Cycle(SETTLED, (0.0, 0.1, 2.0, 0.1)), Cycle(SETTLED + 1, (0.0, 0.4, 1.0, 0.1))]
     recording = recorded(tmp_path / "run", load(small, ["clock.mode=realtime"]), {"lower": trace})

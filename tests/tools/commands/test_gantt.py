@@ -187,6 +187,18 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
     assert ElementTree.parse(tmp_path / "figure5.svg").getroot().tag.endswith("svg")
 
 
+def test_a_level_that_the_chart_lacks_is_refused_with_the_reason(small: Path) -> None:
+    budget = ("--set", "board.lower.budget.process_ms=1", "--level")
+    lacking = rack("gantt", small, *budget, "upper")
+    assert (lacking.returncode, lacking.stderr) == (
+        2,
+        "--level upper: it has no budget, from which its schedule follows, as in rack gantt CONFIG"
+        " --set board.upper.budget.process_ms=1; levels: lower\n",
+    )
+    unknown = rack("gantt", small, *budget, "uper")
+    assert unknown.stderr == "--level uper: no such level in the chart; levels: lower\n"
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

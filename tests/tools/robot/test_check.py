@@ -64,7 +64,10 @@ def test_a_single_finger_and_its_jaw_are_named(tmp_path: Path) -> None:
     assert texts["fingers"].startswith("one finger, which closes on a fixed jaw; ")
 
 
-def test_what_is_no_model_has_exit_status_2(tmp_path: Path) -> None:
-    done = rack("robot", "check", written(tmp_path, "<sdf/>", "a.xml"), folder=tmp_path)
+@pytest.mark.parametrize("name", ["a.xml", "a.sdf"])
+def test_what_is_no_model_has_exit_status_2_and_a_line_that_names_what_is_read(
+    name: str, tmp_path: Path
+) -> None:
+    done = rack("robot", "check", written(tmp_path, "<sdf/>", name), folder=tmp_path)
     assert done.returncode == 2
-    assert "<sdf>" in done.stderr
+    assert "<sdf>; valid: <mujoco> (MJCF), <robot> (URDF)\n" in done.stderr

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.verdicts import EquationVerdict
+from rack.levels.timing.verdicts import EquationVerdict, verdicts
 from rack.tools.console.tables import decimal, figure, fitted, ms
 from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
@@ -141,13 +141,19 @@ def _ended(analysis: Analysis) -> str:
 
 
 def _advice(analysis: Analysis, failing: list[Pair]) -> str:
-    """Return what to do about equations that failed."""
+    """Return what to do about equations that failed, or about a run that failed without them."""
+    folder = analysis.recording.folder
     if not failing:
+        outcome = analysis.recording.ended.get("outcome", {"cause": "time over"})
+        if outcome.get("faults") or outcome["cause"] not in ("task done", "time over"):
+            return f"to do: rack report {folder} says why the run failed; its timing held"
         return "to do: nothing"
     if any(pair.fails for pair in analysis.mostly):
+        if all(verdict.holds for verdict in verdicts(analysis.measured)):
+            return "to do: nothing about the config: its levels' own times fit; see --verbose"
         return (
-            f"to do: rack check CONFIG --from {analysis.recording.folder} lists changes that make"
-            " it fit"
+            f"to do: rack check CONFIG --from {folder} lists changes that make it fit, if there are"
+            " any"
         )
     return (
         "to do: nothing about the config: it failed in single cycles; --percentile 99 leaves them"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 from rack.levels.timing.tasks import TimedTask
@@ -70,20 +70,23 @@ class WindowOptions:
             raise Failure(f"{_window(start, end)}: {most}", 2)
         return start, end
 
-    def task(self, tasks: Sequence[TimedTask]) -> TimedTask:
+    def task(self, tasks: Sequence[TimedTask], known: Container[str] = ()) -> TimedTask:
         """Return the task whose cycles count: of the level asked for, else the slowest that fits
         into a chart.
 
-        Raises `Failure` for a level that is not in the chart.
+        Raises `Failure` for a level that is not in the chart, with the reason if it is one of the
+        rack's, `known`.
         """
         tasks = [task for task in tasks if task.role != "clock"]
         if self.level is not None:
             named = [task for task in tasks if task.board == self.level]
             if not named:
+                why = "no such level in the chart"
+                if self.level in known:
+                    give = f"rack gantt CONFIG --set board.{self.level}.budget.process_ms=1"
+                    why = f"it has no budget, from which its schedule follows, as in {give}"
                 boards = ", ".join(dict.fromkeys(task.board for task in tasks))
-                raise Failure(
-                    f"--level {self.level}: no such level in the chart; levels: {boards}", 2
-                )
+                raise Failure(f"--level {self.level}: {why}; levels: {boards}", 2)
             return max(named, key=lambda task: task.period_ns)
         fastest = min(task.every_ns for task in tasks)
         cores = {(task.board, task.core) for task in tasks if task.role == "executor"}
