@@ -17,7 +17,7 @@ from functools import partial
 from importlib import import_module
 from io import StringIO, TextIOBase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from rack.tools.console.interrupt import INTERRUPT, Interrupted
 
@@ -203,8 +203,6 @@ def _open_closed_streams() -> None:
 
 def run_commands() -> None:
     """Run the command line in this process, without handling signals."""
-    from rack.backplane.process import refusal
-    from rack.boards.errors import shown
     from rack.tools.console.answer import Failure, exit_status, fail
 
     arguments = sys.argv[1:]
@@ -220,14 +218,7 @@ def run_commands() -> None:
     except Failure as failure:
         fail(str(failure), failure.status)
     except OSError as error:
-        if error.filename is None:
-            if Path("/proc/self/cwd").readlink().name.endswith(" (deleted)"):
-                fail("the working folder has been removed; change to another one", 2)
-            if error.errno not in (errno.EAGAIN, errno.EMFILE):
-                raise
-            fail(refusal(error), 1)
-        status = 2 if error.errno in USAGE else 1
-        fail(f"{shown(str(error.filename))}: {error.strerror}", status)
+        _fail_on_system_error(error)
     except Exception as error:
         # The parser's own, of a wrong usage; it is not imported for this.
         if hasattr(error, "show"):
@@ -237,6 +228,22 @@ def run_commands() -> None:
         if known is None:
             raise
         fail(str(error), known)
+
+
+def _fail_on_system_error(error: OSError) -> NoReturn:
+    """End with the system's reason in one line. Raises `error` again if it is nobody's input."""
+    from rack.backplane.process import refusal
+    from rack.boards.errors import shown
+    from rack.tools.console.answer import fail
+
+    if error.filename is not None:
+        status = 2 if error.errno in USAGE else 1
+        fail(f"{shown(str(error.filename))}: {error.strerror}", status)
+    if Path("/proc/self/cwd").readlink().name.endswith(" (deleted)"):
+        fail("the working folder has been removed; change to another one", 2)
+    if error.errno not in (errno.EAGAIN, errno.EMFILE):
+        raise error
+    fail(refusal(error), 1)
 
 
 def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:

@@ -103,7 +103,8 @@ def test_files_that_cannot_be_read_do_not_hide_other_mistakes(write: Write) -> N
 def test_a_model_that_cannot_be_read_does_not_hide_other_mistakes(write: Write) -> None:
     text = 'extends = ["nasrem"]\n[robot]\nmodel = "gone.xml"\nvelocity = [1.0]\n'
     text += "acceleration = [1.0]\njerk = [1.0]\n[board.servo]\nrate_hz = 333\n"
+    text += STAGES["fault.kind"].replace("lower", "servo")
     with pytest.raises(ConfigError) as error:
-        resolve(load(write("mine.toml", text + STAGES["fault.kind"].replace("lower", "servo")), ["seed"]))
+        resolve(load(write("mine.toml", text), ["seed"]))
     places = [mistake.place for mistake in error.value.mistakes]
     assert places == ["--set", "robot", "board.servo.rate_hz", "fault[0].kind"]
