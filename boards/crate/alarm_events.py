@@ -94,9 +94,7 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
             "sensor {subject} stuck: unchanged for {value:.0f} cycles while the arm is driven"
         ),
         Alarm.SENSOR_MODEL: "sensor {subject} disagrees with the model: off by {value:.3g}",
-        Alarm.ACTUATOR: (
-            "actuator {subject} does not produce its commanded torque: off by {value:.3g}"
-        ),
+        Alarm.ACTUATOR: "{subject} does not move as its torque commands: off by {value:.3g}",
         Alarm.COMMAND_INVALID: "rejected: torque of {subject} is NaN",
         Alarm.COMMAND_LIMIT: "torque of {subject} cut to its limit: {value:.3g} N m was commanded",
         Alarm.SET_POINT: "rejected: set point of {subject} is {value:.3g} rad from the joint",

@@ -157,7 +157,7 @@ def test_events_have_the_time_of_their_alarms(segment: Segment) -> None:
             Alarm.ACTUATOR,
             7,
             0.5,
-            "actuator joint 7 does not produce its commanded torque: off by 0.5",
+            "joint 7 does not move as its torque commands: off by 0.5",
         ),
         (
             "driven",
