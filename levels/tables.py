@@ -34,7 +34,10 @@ from rack.levels.references import module_and_name
 
 # No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them
 # stay finite. pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
-Positive = Annotated[float, Field(gt=0, lt=1e9, allow_inf_nan=False)]
+MOST = 1e9
+MOST_JOINTS = 16
+"""Of an arm."""
+Positive = Annotated[float, Field(gt=0, lt=MOST, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
@@ -319,7 +322,7 @@ class RobotConfig(Table):
 
     model: Path = Field(strict=False)
     """MJCF file of the arm and its cell; relative to the config"""
-    joints: tuple[str, ...] = Field((), min_length=1, max_length=16)
+    joints: tuple[str, ...] = Field((), min_length=1, max_length=MOST_JOINTS)
     """MJCF joints of the arm, base to tool; default: those with an actuator, without the
     gripper's"""
     tool: str = Field("", min_length=1)

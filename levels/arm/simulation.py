@@ -70,9 +70,6 @@ class Simulation(Plant):
         ]
         self._advance = advance.load()
         self._copy_state = copy_state.load()
-        # A warning is a fault, reported in `fault`; MuJoCo itself would write it to a file in the
-        # working directory.
-        mujoco.set_mju_user_warning(lambda _: None)
 
     def _refresh(self) -> None:
         """Take positions and velocities of the joints from MuJoCo's state, after it was set other

@@ -24,7 +24,7 @@ from rack.levels.robot.limits import (
     patience_of,
     planned_limits,
 )
-from rack.levels.robot.linkage import Linkage, solve_linkage
+from rack.levels.robot.linkage import Linkage, check_couplings, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
 from rack.levels.robot.state import state_size
 from rack.levels.robot.wrist import Wrist, find_wrist
@@ -125,7 +125,9 @@ def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cel
     else:
         motors, torque = fit_tendons(spec, robot, robot.hand, clock_ns * 1e-9 / robot.substeps)
     prepare(spec, robot, clock_ns)
-    cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
+    model = compile_spec(spec, robot.model)
+    check_couplings(model, robot.joints)
+    cell = index(model, robot, scene, motors, torque)
     if robot.gripper is not None and ease_gripper(cell, spec, robot.gripper, clock_ns * 1e-9):
         cell = index(compile_spec(spec, robot.model), robot, scene, motors, torque)
     cell.model.key_qpos[0] = start_qpos(cell, cell.begin)

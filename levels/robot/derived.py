@@ -7,7 +7,7 @@ import numpy as np
 
 from rack.levels.errors import RobotError
 from rack.levels.robot.lookup import below, find
-from rack.levels.robot.model import JOINT_DRIVES, compile_spec, load_spec
+from rack.levels.robot.model import JOINT_DRIVES, check_number, compile_spec, load_spec
 from rack.levels.tables import RobotConfig
 
 
@@ -17,6 +17,7 @@ def derived(robot: RobotConfig) -> RobotConfig:
     joints = robot.joints or _driven(model, robot)
     if not joints:
         raise RobotError("robot.joints: none named, and none in the model has an actuator")
+    check_number(joints)
     kind = mujoco.mjtObj.mjOBJ_JOINT
     ids = [find(model, kind, name, "robot.joints") for name in joints]
     start = model.key_qpos[0] if model.nkey else model.qpos0

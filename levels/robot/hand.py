@@ -237,7 +237,7 @@ def _arms(
         *np.where(limited, model.jnt_range[joints], np.array(robot.home)[:, None]).T,
     )
     at = [
-        _moments(model, joints, place)[actuators] for place in places
+        actuator_moments(model, joints, place)[actuators] for place in places
     ]  # each (2, joints, joints), m
     arms = np.zeros(len(joints))
     for number, joint in enumerate(robot.joints):
@@ -281,7 +281,7 @@ def _no_arm(robot: RobotConfig, joint: str, own: list[NDArray[np.float64]], sign
     return ""
 
 
-def _moments(
+def actuator_moments(
     model: mujoco.MjModel, joints: NDArray[np.int_], position: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the moments of all actuators on `joints` at a position of these, (actuators, joints),

@@ -8,11 +8,14 @@ contradict each other or a stop, as soft couplings of tendons do, it settles bet
 stiffness in the simulation. It is solved once for a number of openings; a pose in between is
 interpolated, which costs a cycle some microseconds. MuJoCo's own kernels add up in a fixed order:
 equal models give equal poses.
+
+An equality may not tie a joint of the arm: `check_couplings` refuses that.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -21,7 +24,8 @@ from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
-from rack.levels.robot.model import JOINT_DRIVES, SCALAR_JOINTS
+from rack.levels.robot.lookup import below
+from rack.levels.robot.model import JOINT_DRIVES, SCALAR_JOINTS, listed
 from rack.levels.tables import GripperConfig
 
 OPENINGS = 33
@@ -40,6 +44,8 @@ FREE_PART = 0.01
 RESIDUAL = 1e-3
 """An equality that stays open by more than this, in m or rad, yields: stiffness decides."""
 NOT_POSED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+ROUNDING = 1e-9
+"""In the Jacobian of a tendon."""
 LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 STIFFNESS = 0
 IMPEDANCE = 2
@@ -200,7 +206,7 @@ class _Solver:
         self.yields |= away > RESIDUAL
         if away > self._config.residual and self._model.eq_type[equality] in map(int, LOOPS):
             raise RobotError(
-                f"robot.gripper: equality {_equality_name(self._model, equality)} is {away:.4f} m"
+                f"robot.gripper: equality {equality_name(self._model, equality)} is {away:.4f} m"
                 f" or rad off with the gripper at {opening:g}; robot.gripper.residual permits"
                 f" {self._config.residual:g}"
             )
@@ -265,7 +271,7 @@ def check_commanded(
             )
 
 
-def _equality_name(model: mujoco.MjModel, equality: int) -> str:
+def equality_name(model: mujoco.MjModel, equality: int) -> str:
     """Return an equality's name or, when it has none, its kind and what it couples."""
     if name := model.equality(equality).name:
         return f"'{name}'"
@@ -278,3 +284,52 @@ def _equality_name(model: mujoco.MjModel, equality: int) -> str:
     ids = [int(k[equality]) for k in (model.eq_obj1id, model.eq_obj2id)]
     ends = [f"'{mujoco.mj_id2name(model, of, k) or k}'" for k in ids if k >= 0]
     return f"<{kind.name.removeprefix('mjEQ_').lower()}> of {' and '.join(ends)}"
+
+
+def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: bool = True) -> None:
+    """Refuse a model in which an equality ties a joint of the arm to anything.
+
+    Planning, inverse kinematics, dynamics and the servo loop treat these joints as independent.
+
+    Args:
+        model: The compiled model.
+        joints: The arm's joints.
+        of_bodies: Whether equalities of bodies count, beside those of joints and tendons.
+
+    Raises:
+        RobotError: A joint of the arm is tied.
+    """
+    for equality in range(model.neq):
+        tied = [model.joint(joint).name for joint in sorted(tied_joints(model, equality))]
+        counts = of_bodies or model.eq_type[equality] not in map(int, LOOPS)
+        if counts and model.eq_active0[equality] and {*tied} & {*joints}:
+            raise RobotError(
+                f"equality {equality_name(model, equality)} couples {listed(tied)}, but the joints"
+                " of an arm are driven independently; remove it from the model (in a URDF:"
+                " <mimic>), or fix the joint that has no motor"
+            )
+
+
+def tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
+    """Return the joints that an equality ties: of bodies, those that move only one of the two."""
+    ends = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
+    ends = ends[ends >= 0]
+    kind = model.eq_type[equality]
+    if kind == mujoco.mjtEq.mjEQ_JOINT:
+        return set(ends.tolist())
+    if kind == mujoco.mjtEq.mjEQ_TENDON:
+        return set[int]().union(*(tendon_joints(model, tendon) for tendon in ends))
+    if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+        ends = model.site_bodyid[ends]
+    moving = [below(model, model.jnt_bodyid[[joint]])[ends] for joint in range(model.njnt)]
+    return {joint for joint, moved in enumerate(moving) if 0 < moved.sum() < len(ends)}
+
+
+def tendon_joints(model: mujoco.MjModel, tendon: int) -> set[int]:
+    """Return the joints that change a tendon's length."""
+    data = mujoco.MjData(model)
+    mujoco.mj_fwdPosition(model, data)
+    first = model.ten_J_rowadr[tendon]
+    span = slice(first, first + model.ten_J_rownnz[tendon])
+    moving = model.ten_J_colind[span][np.abs(data.ten_J[span]) > ROUNDING]
+    return set(model.dof_jntid[moving].tolist())

@@ -4,6 +4,7 @@ the valid names."""
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 
 import mujoco
 import numpy as np
@@ -52,28 +53,30 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     broken model."""
     model = compile_spec(load_spec(robot.model), robot.model)
     kind = mujoco.mjtObj
-    wanted = [(kind.mjOBJ_JOINT, name, "robot.joints") for name in robot.joints]
+    wanted = [(kind.mjOBJ_JOINT, robot.joints, "robot.joints")]
     if mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) < 0:
-        wanted.append((kind.mjOBJ_SITE, robot.tool, "robot.tool"))
-    wanted += [(kind.mjOBJ_BODY, name, "robot.exclude") for pair in robot.exclude for name in pair]
+        wanted.append((kind.mjOBJ_SITE, (robot.tool,), "robot.tool"))
+    wanted.append((kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"))
     if robot.gripper is not None:
-        wanted.append((kind.mjOBJ_JOINT, robot.gripper.joint, "robot.gripper.joint"))
+        wanted.append((kind.mjOBJ_JOINT, (robot.gripper.joint,), "robot.gripper.joint"))
     if robot.hand is not None:
+        tips = tuple(finger.tip for finger in robot.hand.finger)
         wanted += [
-            (kind.mjOBJ_SITE, finger.tip, "robot.hand.finger.tip") for finger in robot.hand.finger
+            (kind.mjOBJ_SITE, tips, "robot.hand.finger.tip"),
+            (kind.mjOBJ_ACTUATOR, robot.hand.flexors, "robot.hand.flexors"),
+            (kind.mjOBJ_ACTUATOR, robot.hand.extensors, "robot.hand.extensors"),
         ]
-        wanted += [(kind.mjOBJ_ACTUATOR, name, "robot.hand.flexors") for name in robot.hand.flexors]
-        wanted += [
-            (kind.mjOBJ_ACTUATOR, name, "robot.hand.extensors") for name in robot.hand.extensors
-        ]
-    wanted += [(kind.mjOBJ_BODY, name, "scene.objects") for name in scene.objects]
-    wanted += [(kind.mjOBJ_BODY, name, "scene.obstacles") for name in scene.obstacles]
-    wanted += [(kind.mjOBJ_GEOM, name, "scene.supports") for name in scene.supports]
-    for what, name, place in wanted:
-        try:
-            find(model, what, name, place)
-        except RobotError as error:
-            yield str(error)
+    wanted += [
+        (kind.mjOBJ_BODY, scene.objects, "scene.objects"),
+        (kind.mjOBJ_BODY, scene.obstacles, "scene.obstacles"),
+        (kind.mjOBJ_GEOM, scene.supports, "scene.supports"),
+    ]
+    for what, names, place in wanted:
+        for name in names:
+            try:
+                find(model, what, name, place)
+            except RobotError as error:
+                yield str(error)
 
 
 def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None) -> int:

@@ -7,7 +7,7 @@ The file is not trusted: every mistake is one `RobotError`, in bounded time and 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
 from rack.levels.robot.state import SLEEP
-from rack.levels.tables import FollowConfig, GripperConfig, RobotConfig, ToolConfig
+from rack.levels.tables import (
+    MOST,
+    MOST_JOINTS,
+    FollowConfig,
+    GripperConfig,
+    RobotConfig,
+    ToolConfig,
+)
 
 GRID_CELLS = 4_000_000
 """Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x
@@ -32,6 +39,9 @@ SET_POINT_ROWS = 3
 """Numbers a joint that MuJoCo's state keeps of simulated drives that follow set points: position,
 velocity, and the torque of the integral."""
 SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+# MuJoCo would print its warnings, and write them to a file in the working directory. Whoever needs
+# one looks for its cause: steps of the simulation, for example, count them.
+mujoco.set_mju_user_warning(lambda _: None)
 
 
 def load_spec(path: Path) -> mujoco.MjSpec:
@@ -56,11 +66,39 @@ def load_spec(path: Path) -> mujoco.MjSpec:
 
 
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
-    """Compile. Raises `RobotError` with MuJoCo's reason in one line."""
+    """Compile. Inertias of bodies that never move are given up if they are what MuJoCo refuses.
+    Raises `RobotError` with MuJoCo's reason in one line."""
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as problem:
+        if drop_fixed_inertias(spec.worldbody):
+            return compile_spec(spec, path)
         raise RobotError(f"model '{path}': {one_line(problem)}") from None
+
+
+def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
+    """Give all below `body` that no joint moves the inertia of its geoms; return whether any stated
+    another."""
+    found = False
+    # Lists of children repeat the error of a compilation that failed.
+    child = body.first_body()
+    while child is not None:
+        if child.first_joint() is None:
+            found |= drop_fixed_inertias(child) or bool(child.explicitinertial)
+            child.explicitinertial = False
+            child.fullinertia = np.full(6, np.nan)
+            child.inertia = np.zeros(3)
+        child = body.next_body(child)
+    return found
+
+
+def check_number(joints: Sequence[str]) -> None:
+    """Raise `RobotError` for more joints than an arm may have."""
+    if len(joints) > MOST_JOINTS:
+        raise RobotError(
+            f"an arm has at most {MOST_JOINTS} joints, and not {len(joints)}: {listed([*joints])};"
+            " name fewer, in robot.joints, or by --tip or --joints of 'rack robot new'"
+        )
 
 
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
@@ -127,9 +165,15 @@ def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], NDAr
     the ranges of its actuators. Raises `RobotError` when neither has one.
     """
     drives = [a for a in spec.actuators if drives_arm(spec, a, robot)]
-    limits = np.array(
-        [torque_limit(spec, name, k, robot, drives) for k, name in enumerate(robot.joints)]
-    )
+    tendons = [a for a in drives if a.trntype not in JOINT_DRIVES]
+    shared = {*robot.joints} - {a.target for a in drives}
+    shared &= {joint for a in tendons for joint in driven_by(spec, a)}
+    if len(shared) > len(tendons):
+        raise RobotError(
+            f"joints {listed(sorted(shared))} share one actuator, but those of an arm are driven"
+            " independently; give each its own"
+        )
+    limits = np.array(robot.torque or [torque_limit(spec, name, drives) for name in robot.joints])
     remove(spec, drives)
     names = [f"torque of {joint}" for joint in robot.joints]
     for name, joint, limit in zip(names, robot.joints, limits, strict=True):
@@ -195,30 +239,23 @@ def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) 
 
 def drives_arm(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotConfig) -> bool:
     """Say whether an actuator drives a joint of the arm, by itself or through a fixed tendon."""
+    return not {*robot.joints}.isdisjoint(driven_by(spec, actuator))
+
+
+def driven_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
+    """Return the joints that an actuator drives, by itself or through a fixed tendon."""
     if actuator.trntype in JOINT_DRIVES:
-        return actuator.target in robot.joints
-    tendon = (
-        spec.tendon(actuator.target) if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON else None
-    )
-    if tendon is None:
-        return False
-    return any(
-        w.type == mujoco.mjtWrap.mjWRAP_JOINT and w.target.name in robot.joints for w in tendon.path
-    )
+        return [actuator.target]
+    is_tendon = actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON
+    tendon = spec.tendon(actuator.target) if is_tendon else None
+    path = () if tendon is None else tendon.path
+    return [wrap.target.name for wrap in path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
 
 
-def torque_limit(
-    spec: mujoco.MjSpec,
-    joint: str,
-    index: int,
-    robot: RobotConfig,
-    drives: list[mujoco.MjsActuator],
-) -> float:
+def torque_limit(spec: mujoco.MjSpec, joint: str, drives: list[mujoco.MjsActuator]) -> float:
     """Return the torque limit of one joint, N m. Raises `RobotError` when there is none."""
-    if robot.torque is not None:
-        return robot.torque[index]
     limit = stated_torque(spec, joint, drives)
-    if not (limit > 0 and np.isfinite(limit)):
+    if not limit:
         raise RobotError(
             f"joint '{joint}': the model gives no torque limit; give robot.torque, N m, one value a"
             " joint"
@@ -227,11 +264,12 @@ def torque_limit(
 
 
 def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]) -> float:
-    """Return the tightest torque limit that a model states for a joint, N m; 0: none."""
+    """Return the tightest torque limit that a model states for a joint, N m. 0 where it states none
+    that a `[robot]` table may have, such as infinity."""
     own = spec.joint(joint)
     found = [reach(own.actfrclimited, own.actfrcrange)]
     found += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
-    return min((x for x in found if x > 0), default=0.0)
+    return min((x for x in found if 0 < x < MOST), default=0.0)
 
 
 def drive_limit(actuator: mujoco.MjsActuator) -> float:
