@@ -10,10 +10,13 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
-from rack.levels.robot.lookup import below
-from rack.levels.robot.model import SCALAR_JOINTS, listed
+from rack.levels.robot.hand import actuator_moments
+from rack.levels.robot.linkage import tied_joints
+from rack.levels.robot.lookup import below, find
+from rack.levels.robot.model import SCALAR_JOINTS, check_number, listed
 
 OF_GRIPPER = re.compile("finger|grip|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """In the name of a joint: it belongs to a gripper."""
@@ -42,44 +45,66 @@ class ArmParts:
     joints: tuple[str, ...]  # base to tool
     tip: str  # the body at its end, which carries the gripper
     fingers: tuple[str, ...]  # joints beyond
+    passive: tuple[str, ...]  # joints beyond that nothing drives
     others: tuple[str, ...]  # tips of other arms
 
 
 def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts:
     """Return the arm that ends at the body or site `tip`, or has these `joints`; of neither is
     told, the longest. Raises `RobotError`."""
-    tree = _Tree(model)
+    driven = driven_joints(model)
+    scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
     others: list[int] = []
     if joints:
-        ids = [_id(model, mujoco.mjtObj.mjOBJ_JOINT, name, "--joints") for name in joints]
+        ids = [find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "--joints") for name in joints]
         end = int(model.jnt_bodyid[ids[-1]])
     elif tip:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
         body = mujoco.mjtObj.mjOBJ_BODY
-        end = int(model.site_bodyid[site]) if site >= 0 else _id(model, body, tip, "--tip")
+        end = int(model.site_bodyid[site]) if site >= 0 else find(model, body, tip, "--tip")
     else:
-        end, others = tree.walk()
-    chain = [joint for body in tree.to(end) for joint in tree.joints[body]]
-    cut = next((k for k, j in enumerate(chain) if k and OF_GRIPPER.search(_name(model, j))), None)
-    if cut is not None and not joints:
-        end = int(model.body_parentid[model.jnt_bodyid[chain[cut]]])
-        chain = chain[:cut]
-    # A mobile base stands: what leads to the arm and has no end.
-    while chain and not joints and model.jnt_type[chain[0]] == SCALAR_JOINTS[1]:
-        if model.jnt_limited[chain[0]]:
-            break
-        chain = chain[1:]
-    named = tuple(joints) or tuple(_name(model, joint) for joint in chain)
-    if not named:
+        end, others = _longest(model, scalar, driven)
+    if not joints:
+        moving = np.flatnonzero(scalar).tolist()
+        chain = [k for k in moving if below(model, model.jnt_bodyid[[k]])[end]]
+        cut = next((k for k in chain[1:] if OF_GRIPPER.search(_name(model, k))), None)
+        if cut is not None:
+            end = int(model.body_parentid[model.jnt_bodyid[cut]])
+            chain = chain[: chain.index(cut)]
+        # Where no joint of the chain is driven, --torque states the limits of all.
+        drives = driven & {*chain} or {*chain}
+        # A mobile base stands: passive joints, and slides without an end.
+        while chain and (chain[0] not in drives or _is_endless(model, chain[0])):
+            chain = chain[1:]
+        joints = [_name(model, joint) for joint in chain]
+        if passive := [_name(model, joint) for joint in chain if joint not in drives]:
+            raise RobotError(
+                f"nothing drives {listed(passive)}, though other joints of the arm have an actuator"
+                " or an effort; --tip names a body before them, --joints what to drive"
+            )
+    if not joints:
         raise RobotError("no arm: no hinge or slide joints in a row; --tip names a body at its end")
-    beyond = np.flatnonzero(below(model, np.array([end]))[model.jnt_bodyid])
-    fingers = [_name(model, int(joint)) for joint in beyond if _is_scalar(model, int(joint))]
+    check_number(joints)
+    beyond = np.flatnonzero(scalar & below(model, np.array([end]))[model.jnt_bodyid]).tolist()
+    beyond = [joint for joint in beyond if _name(model, joint) not in joints]
+    names = tuple(_name(model, joint) for joint in beyond)
+    has_gripper = not driven or driven & {*beyond} or any(map(OF_GRIPPER.search, names))
     return ArmParts(
-        named,
+        tuple(joints),
         model.body(end).name,
-        tuple(name for name in fingers if name not in named),
+        names if has_gripper else (),
+        () if has_gripper else names,
         tuple(model.body(other).name for other in others),
     )
+
+
+def driven_joints(model: mujoco.MjModel) -> set[int]:
+    """Return the joints for which a model states a drive: an actuator, by itself or through a
+    tendon, the effort of a URDF, or a coupling to other joints."""
+    every = np.arange(model.njnt)
+    drives = actuator_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
+    own = every[drives | model.jnt_actfrclimited]
+    return set(own.tolist()).union(*(tied_joints(model, k) for k in range(model.neq)))
 
 
 def hold(path: Path, kept: Iterable[str]) -> list[str]:
@@ -119,60 +144,48 @@ def hold(path: Path, kept: Iterable[str]) -> list[str]:
     return flying
 
 
-class _Tree:
-    """The bodies of a model, with the scalar joints of each and in the longest way beyond."""
+def _longest(
+    model: mujoco.MjModel, scalar: NDArray[np.bool_], driven: set[int]
+) -> tuple[int, list[int]]:
+    """Find the longest arm: the way with the most joints that ends at a driven one, if any is.
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
-        self.joints: list[list[int]] = [[] for _ in range(model.nbody)]
-        for joint in range(model.njnt):
-            if _is_scalar(model, joint):
-                self.joints[model.jnt_bodyid[joint]].append(joint)
-        self.depth = np.array([len(own) for own in self.joints])
-        for body in range(model.nbody - 1, 0, -1):
-            parent = model.body_parentid[body]
-            longer = len(self.joints[parent]) + self.depth[body]
-            self.depth[parent] = max(self.depth[parent], longer)
+    Args:
+        model: The compiled model.
+        scalar: (joints,), True for hinges and slides.
+        driven: Joints with a drive.
 
-    def walk(self) -> tuple[int, list[int]]:
-        """Return the body at the end of the longest arm, and those where others begin."""
-        body = 0
-        passed = 0
-        others: list[int] = []
-        while True:
-            passed += len(self.joints[body])
-            children = np.flatnonzero(self._model.body_parentid == body)
-            ways = [int(k) for k in children if k and self.depth[k]]
-            ways.sort(key=lambda k: -self.depth[k])
-            if not ways:
-                return body, others
-            longest = self.depth[ways[0]]
-            is_even = len(ways) > 1 and self.depth[ways[1]] >= longest - 1
-            if is_even and passed >= BASE_JOINTS and longest <= MOST_IN_FINGER:
-                return body, others
-            others += [k for k in ways[1:] if self.depth[k] >= LEAST_JOINTS]
-            body = ways[0]
-
-    def to(self, body: int) -> list[int]:
-        """Return the bodies from the base to this one."""
-        found = []
-        while body:
-            found.append(body)
-            body = int(self._model.body_parentid[body])
-        return found[::-1]
+    Returns:
+        The body at its end, and the bodies where other arms begin.
+    """
+    own = np.bincount(model.jnt_bodyid[scalar], minlength=model.nbody)
+    depth = own.copy()
+    leads = np.full(model.nbody, not driven)
+    leads[model.jnt_bodyid[[*driven]]] = True
+    for body in range(model.nbody - 1, 0, -1):
+        parent = model.body_parentid[body]
+        leads[parent] |= leads[body]
+        depth[body] *= leads[body]
+        depth[parent] = max(depth[parent], own[parent] + depth[body])
+    body = 0
+    passed = 0
+    others: list[int] = []
+    while True:
+        passed += own[body]
+        children = np.flatnonzero(model.body_parentid == body)
+        ways = [int(k) for k in children if k and depth[k]]
+        ways.sort(key=lambda k: -depth[k])
+        if not ways:
+            return body, others
+        longest = depth[ways[0]]
+        is_even = len(ways) > 1 and depth[ways[1]] >= longest - 1
+        if is_even and passed >= BASE_JOINTS and longest <= MOST_IN_FINGER:
+            return body, others
+        others += [k for k in ways[1:] if depth[k] >= LEAST_JOINTS]
+        body = ways[0]
 
 
-def _id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, option: str) -> int:
-    found = int(mujoco.mj_name2id(model, kind, name))
-    if found < 0:
-        counts = {mujoco.mjtObj.mjOBJ_JOINT: model.njnt, mujoco.mjtObj.mjOBJ_BODY: model.nbody}
-        have = listed([mujoco.mj_id2name(model, kind, k) for k in range(counts[kind])])
-        raise RobotError(f"{option}: '{name}' is not in the model; it has: {have}")
-    return found
-
-
-def _is_scalar(model: mujoco.MjModel, joint: int) -> bool:
-    return mujoco.mjtJoint(int(model.jnt_type[joint])) in SCALAR_JOINTS
+def _is_endless(model: mujoco.MjModel, joint: int) -> bool:
+    return bool(model.jnt_type[joint] == SCALAR_JOINTS[1] and not model.jnt_limited[joint])
 
 
 def _name(model: mujoco.MjModel, joint: int) -> str:

@@ -18,13 +18,20 @@ from rack.levels.errors import RobotError
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import sampling_range
 from rack.levels.robot.abilities import Statics
-from rack.levels.robot.cell import Cell, build_cell, check_fingers, unchecked_cell
+from rack.levels.robot.cell import (
+    Cell,
+    build_cell,
+    check_fingers,
+    unchecked_cell,
+    unintended_contacts,
+)
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.engine import set_margins
+from rack.levels.robot.linkage import check_couplings
 from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
 from rack.levels.servo.control import LoopGains
 from rack.levels.tables import RobotConfig, SceneConfig
-from rack.tools.robot.arm import ArmParts, find_arm, hold
+from rack.tools.robot.arm import ArmParts, driven_joints, find_arm, hold
 from rack.tools.robot.fingertips import Fingertips, find_fingertips, tool_outward
 from rack.tools.robot.gripper import fit_fingers
 from rack.tools.robot.pieces import cut_meshes
@@ -143,6 +150,8 @@ def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
 def _draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     model = source.compiled()
     arm = find_arm(model, wanted.tip, wanted.joints)
+    # Equalities with joints that are held are gone afterwards.
+    check_couplings(model, arm.joints, of_bodies=False)
     addresses = [model.joint(joint).qposadr[0] for joint in arm.joints]
     starts = {
         model.key(k).name or f"key {k}": model.key_qpos[k][addresses] for k in range(model.nkey)
@@ -151,8 +160,14 @@ def _draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     path = folder / f"{name}.xml"
     made = Draft(path, source.spec, wanted, arm, starts, notes=list(source.notes))
     copy_model(source, path)
-    if left := made.hold((*arm.joints, *fingers)):
+    springs = [joint for joint in arm.passive if model.joint(joint).stiffness > 0.0]
+    if left := made.hold((*arm.joints, *fingers, *springs)):
         made.notes.append(f"left out, as nothing holds it: {listed(left)}")
+    if endless := [joint for joint in arm.joints if not model.joint(joint).limited]:
+        made.notes.append(f"without limits: {listed(endless)}; [robot] position can state them")
+    if arm.passive:
+        why = "nothing drives them: --joints would; those without a spring are held"
+        made.notes.append(f"passive, beyond the arm: {listed([*arm.passive])}; {why}")
     if arm.others:
         others = listed(list(arm.others))
         made.notes.append(f"held: what begins at {others}; --tip chooses another arm")
@@ -164,7 +179,8 @@ def _draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     if missing:
         made.guessed["velocity"] = f"the model states none for {listed(missing)}"
     stated = [stated_torque(spec, joint, spec.actuators) for joint in arm.joints]
-    if not (any(stated) or wanted.torque or _driven(spec, arm.joints)):
+    ids = {model.joint(joint).id for joint in arm.joints}
+    if not (wanted.torque or driven_joints(model) & ids):
         why = "no actuator and no effort"
         raise RobotError(f"{why} at {listed(list(arm.joints))}; --torque T,... states the limits")
     made.table = {
@@ -188,10 +204,6 @@ def _draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     _dimension(made, unknown, [joint in missing for joint in arm.joints])
     made.search_home()
     return made
-
-
-def _driven(spec: mujoco.MjSpec, joints: Sequence[str]) -> bool:
-    return any(actuator.target in joints for actuator in spec.actuators)
 
 
 def _mount(model: mujoco.MjModel, tip: str, wanted: str) -> str:
@@ -280,8 +292,7 @@ def touching(
     model = cell.model
     data.qpos[cell.qpos] = q
     mujoco.mj_fwdPosition(model, data)
-    pairs = data.contact.geom[data.contact.dist < skin_m]
-    bodies = model.geom_bodyid[pairs[cell.touch[pairs[:, 0], pairs[:, 1]]]]
+    bodies = model.geom_bodyid[unintended_contacts(data, cell.touch, skin_m)]
     names = [sorted(str(model.body(body).name) for body in pair) for pair in bodies]
     return {(first, second) for first, second in names}
 

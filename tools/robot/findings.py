@@ -83,7 +83,7 @@ def _findings(
     yield Observation("weight", held, weak)
     pairs = sorted(" and ".join(pair) for pair in touching(cell, data, cell.home))
     yield Observation("contacts at home", ", ".join(pairs) or "none", bool(pairs))
-    known = {*cell.qpos, *cell.object_qpos}
+    known = {*cell.qpos, *cell.object_qpos, *model.jnt_qposadr[model.jnt_stiffness > 0.0]}
     if cell.gripper is not None:
         known |= {cell.gripper.linkage.driven, *cell.gripper.linkage.joints}
     loose = {

@@ -9,8 +9,9 @@ import numpy as np
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import RobotError
+from rack.levels.robot.linkage import tied_joints
 from rack.levels.robot.lookup import below, geoms_of
-from rack.levels.robot.model import JOINT_DRIVES, add_motor, listed, remove, stated_torque
+from rack.levels.robot.model import add_motor, driven_by, listed, remove, stated_torque
 from rack.levels.tables import FollowConfig, GripperConfig
 from rack.tools.robot.arm import ArmParts
 
@@ -24,8 +25,6 @@ made."""
 LEAST_LEVER_M = 0.02
 SIDEWAYS = 0.5
 """Cosine between a finger's motion and the way to the others below which it does not close."""
-ROUNDING = 1e-9
-"""In the Jacobian of an equality."""
 
 
 class _Finger(NamedTuple):
@@ -41,18 +40,10 @@ def fit_fingers(
     """Give the gripper one drive, at the joint `wanted` if that is named, which all that nothing
     couples to it follows; return its table, and what of it is guessed. Raises `RobotError`."""
     fingers = {name: _finger(spec, model, arm, name) for name in arm.fingers}
-    tendons = {
-        tendon.name: [wrap.target.name for wrap in tendon.path if wrap.target.name in fingers]
-        for tendon in spec.tendons
-    }
     drives = [
         (actuator, found[0])
         for actuator in spec.actuators
-        if (
-            found := [actuator.target]
-            if actuator.trntype in JOINT_DRIVES and actuator.target in fingers
-            else tendons.get(actuator.target, [])
-        )
+        if (found := [joint for joint in driven_by(spec, actuator) if joint in fingers])
     ]
     drives.sort(key=lambda drive: (drive[1] != wanted, fingers[drive[1]].sideways))
     driven = drives[0][1] if drives else wanted or arm.fingers[0]
@@ -113,7 +104,8 @@ def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str
     mujoco.mj_comPos(model, data)
     hand = model.body(arm.tip).id
     bodies = {int(model.jnt_bodyid[k]) for k in ids}
-    tops = [body for body in bodies if not _above(model, body, hand) & bodies]
+    depth = np.sum([below(model, np.array([body])) for body in bodies], axis=0)
+    tops = [body for body in bodies if depth[body] == 1]
     centres = [_centre(model, data, body) for body in tops]
     middle = np.mean(centres, axis=0) if len(tops) > 1 else _centre(model, data, hand)
     moved = int(model.jnt_bodyid[joint])
@@ -130,14 +122,6 @@ def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str
     return _Finger(high, low, lever, sideways)
 
 
-def _above(model: mujoco.MjModel, body: int, hand: int) -> set[int]:
-    """Return the bodies between one and the hand."""
-    found = set()
-    while (body := int(model.body_parentid[body])) not in (0, hand):
-        found.add(body)
-    return found
-
-
 def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
     geoms = geoms_of(model, below(model, np.array([body])))
     if not len(geoms):
@@ -147,14 +131,9 @@ def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
 
 def _groups(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
     """Return the joints of the gripper, those together that equalities tie to each other."""
-    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    data = mujoco.MjData(model)
-    mujoco.mj_fwdPosition(model, data)
-    rows = data.efc_J.reshape(-1, model.nv)[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
-    columns = {name: model.joint(name).dofadr[0] for name in arm.fingers}
     groups = [{name} for name in arm.fingers]
-    for row in rows:
-        tied = {name for name, column in columns.items() if abs(row[column]) > ROUNDING}
+    for equality in range(model.neq):
+        tied = {model.joint(joint).name for joint in tied_joints(model, equality)} & {*arm.fingers}
         together = [group for group in groups if group & tied]
         groups = [group for group in groups if not group & tied]
         if together:

@@ -1,0 +1,195 @@
+"""Which joints of a model are the arm's, which are passive, and what is done with the rest."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rack.levels.errors import RobotError
+from rack.tools.robot.arm import ArmParts, find_arm
+from rack.tools.robot.draft import Wishes, draft
+from rack.tools.robot.source import read_source
+from tests.tools.command_line import ROOT, rack
+from tests.tools.robot.models import joint, link, urdf, written
+
+DESK_ARM = (ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml").read_text()
+JOINTS = ("waist", "shoulder", "elbow", "roll", "pitch", "twist")
+SPRING = 'stiffness="20" damping=".2"'
+
+
+def rod(name: str, inner: str = "", spring: str = SPRING) -> str:
+    """Return a light body on a hinge named so."""
+    return (
+        f'<body name="{name} body" pos="0 0 .06"><joint name="{name}" axis="1 0 0" {spring}/>'
+        f'<geom type="capsule" size=".008" fromto="0 0 .012 0 0 .04" mass=".01"/>{inner}</body>'
+    )
+
+
+def with_tool(body: str, tool: str, text: str = DESK_ARM) -> str:
+    """Return an MJCF arm whose `body` carries a tool."""
+    head, name, rest = text.partition(f'<body name="{body}"')
+    tag, end, rest = rest.partition(">")
+    return head + name + tag + end + tool + rest
+
+
+def without_motor(name: str, text: str = DESK_ARM) -> str:
+    """Return an MJCF arm in which a joint has no actuator."""
+    head, _, rest = text.partition("<actuator>")
+    lines = [line for line in rest.splitlines() if f'joint="{name}"' not in line]
+    return head + "<actuator>" + "\n".join(lines)
+
+
+def found(folder: Path, text: str, tip: str = "", joints: tuple[str, ...] = ()) -> ArmParts:
+    name = "arm.urdf" if "<robot" in text else "arm.xml"
+    return find_arm(read_source(written(folder, text, name)).compiled(), tip, joints)
+
+
+HOSE = rod("h1", rod("h2", rod("h3", rod("h4", rod("h5", rod("h6", rod("h7", rod("h8"))))))))
+FLEXIBLE = with_tool("flange", rod("flex1", rod("flex2")))
+TRAY = (
+    link("tray", "0.02 0.02 0.02", "0 0 0")
+    + joint("swing", "l6", "tray", "0 0 .05", "1 0 0", limit='<dynamics damping="0.1"/>',
+            kind="continuous")
+)  # fmt: skip
+GRIPPER = (
+    '<body name="pad1"><joint name="pad1" type="slide" range="0 .04"/><geom size=".01"/></body>'
+    '<body name="pad2"><joint name="pad2" type="slide" range="0 .04"/><geom size=".01"/></body>'
+)
+COUPLED_PADS = with_tool("flange", GRIPPER).replace(
+    "</mujoco>", '<equality><joint joint1="pad1" joint2="pad2"/></equality></mujoco>'
+).replace("</actuator>", '<motor joint="pad1" ctrlrange="-9 9"/></actuator>')  # fmt: skip
+
+PASSIVE = {
+    "springs at the tip": (FLEXIBLE, JOINTS, (), ("flex1", "flex2")),
+    "a hose longer than the arm": (with_tool("forearm", HOSE), JOINTS, (), ()),
+    "a joint of a URDF without effort": (
+        urdf(gripper=False).replace("</robot>", TRAY + "</robot>"),
+        ("j1", "j2", "j3", "j4", "j5", "j6"),
+        (),
+        ("swing",),
+    ),
+    "a base": (without_motor("waist"), JOINTS[1:], (), ()),
+    "a finger that follows": (COUPLED_PADS, JOINTS, ("pad1", "pad2"), ()),
+    "nothing is driven": (
+        FLEXIBLE.partition("<actuator>")[0] + "</mujoco>",
+        (*JOINTS, "flex1", "flex2"),
+        (),
+        (),
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "joints", "fingers", "passive"), PASSIVE.values(), ids=PASSIVE)
+def test_the_arm_ends_at_its_last_driven_joint(
+    tmp_path: Path, text: str, joints: tuple[str, ...], fingers: tuple[str, ...],
+    passive: tuple[str, ...],
+) -> None:  # fmt: skip
+    arm = found(tmp_path, text)
+    assert (arm.joints, arm.fingers, arm.passive) == (joints, fingers, passive)
+
+
+def test_joints_that_are_named_are_driven(tmp_path: Path) -> None:
+    arm = found(tmp_path, FLEXIBLE, joints=(*JOINTS, "flex1"))
+    assert arm.joints == (*JOINTS, "flex1")
+    assert arm.passive == ("flex2",)
+
+
+@pytest.mark.parametrize(
+    ("text", "tip", "names"),
+    [(without_motor("elbow"), "", "elbow"), (FLEXIBLE, "flex2 body", "flex1, flex2")],
+)
+def test_a_passive_joint_within_the_arm_is_refused_with_what_to_do(
+    tmp_path: Path, text: str, tip: str, names: str
+) -> None:
+    with pytest.raises(RobotError, match=rf"nothing drives {names}, .* --tip .* --joints"):
+        found(tmp_path, text, tip)
+
+
+def test_an_arm_of_too_many_joints_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    inner = ""
+    for number in range(12, 0, -1):
+        inner = rod(f"snake{number}", inner, spring='range="-1 1"')
+    motors = "".join(f'<motor joint="snake{k}" ctrlrange="-9 9"/>' for k in range(1, 13))
+    text = with_tool("flange", inner).replace("</actuator>", f"{motors}</actuator>")
+    with pytest.raises(RobotError, match=r"at most 16 joints, and not 18: waist, .* --tip"):
+        found(tmp_path, text)
+
+
+@pytest.mark.slow
+def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) -> None:
+    text = with_tool("flange", rod("flex1") + rod("loose", spring=""))
+    made = draft(read_source(written(tmp_path, text, "arm.xml")), Wishes(), tmp_path, "drafted")
+    model = made.cell().model
+    names = [model.joint(k).name for k in range(model.njnt)]
+    assert set(names) == {*JOINTS, "flex1"}
+    assert model.joint("flex1").stiffness[0] == 20.0
+    assert model.nu == len(JOINTS)
+    assert any(note.startswith("passive, beyond the arm: flex1, loose;") for note in made.notes)
+
+
+@pytest.mark.thorough
+def test_an_arm_with_springs_at_its_tip_does_its_task(tmp_path: Path) -> None:
+    done = rack("robot", "new", written(tmp_path, FLEXIBLE, "springy.xml"), folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    words = ("--lockstep", "--json", "--out", tmp_path / "run", "--set", "name=springy-of-test")
+    done = rack("run", "springy", *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["worked"]
+
+
+BASE = 'inertia ixx="{}" iyy="0.01" izz="0.01" ixy="{}"'
+UNPHYSICAL = {
+    "unbalanced": BASE.format(1, 0),
+    "negative": BASE.format(-1, 0),
+    "full": BASE.format(0.01, 5),
+}
+BAD_MJCF = '<body name="base"><inertial pos="0 0 0" mass="1" diaginertia="1 .1 .1"/></body>'
+
+
+@pytest.mark.parametrize("case", [*UNPHYSICAL, "MJCF"])
+def test_the_inertia_of_a_base_that_never_moves_does_not_matter(tmp_path: Path, case: str) -> None:
+    text = DESK_ARM.replace("<worldbody>", f"<worldbody>{BAD_MJCF}", 1)
+    if case in UNPHYSICAL:
+        text = urdf().replace(BASE.format(0.01, 0), UNPHYSICAL[case], 1)
+    assert text not in (urdf(), DESK_ARM)
+    name = "arm.xml" if case == "MJCF" else "arm.urdf"
+    source = read_source(written(tmp_path, text, name))
+    assert source.compiled().nbody > len(JOINTS)
+    assert "inertias that no body can have are balanced" not in source.notes
+
+
+def test_the_inertia_of_a_body_that_moves_is_still_refused(tmp_path: Path) -> None:
+    one = '<link name="l1"><inertial><origin xyz="0 0 0.02"/><mass value="1.0"/>\n<' + BASE
+    text = urdf().replace(one.format(0.01, 0), one.format(-1, 0))
+    with pytest.raises(RobotError, match=r"positive eigenvalues.*'l1'"):
+        read_source(written(tmp_path, text))
+
+
+LIMITS = 'lower="-2.8" upper="2.8"'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limits", ['lower="0" upper="0"', "", 'lower="2" upper="-2"'])
+def test_a_range_that_is_none_is_said_and_mujoco_prints_nothing(
+    tmp_path: Path, limits: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = read_source(written(tmp_path, urdf(gripper=False).replace(LIMITS, limits, 3)))
+    made = draft(source, Wishes(), tmp_path, "drafted")
+    assert "without limits: j1, j2, j3; [robot] position can state them" in made.notes
+    assert capfd.readouterr() == ("", "")
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effort", ["inf", "1e12"])
+def test_an_effort_without_bound_is_none_and_torques_are_guessed(
+    tmp_path: Path, effort: str
+) -> None:
+    text = urdf(gripper=False).replace('effort="60.0"', f'effort="{effort}"')
+    made = draft(read_source(written(tmp_path, text)), Wishes(), tmp_path, "drafted")
+    assert "torque" in made.guessed
+    assert made.robot.torque is not None
+    assert max(made.robot.torque) < 1e3
