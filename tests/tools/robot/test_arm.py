@@ -129,6 +129,16 @@ def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) 
     assert any(note.startswith("passive, beyond the arm: flex1, loose;") for note in made.notes)
 
 
+@pytest.mark.slow
+def test_a_body_that_something_outside_moves_is_left_out_with_its_weld(tmp_path: Path) -> None:
+    hand = '<body name="drag" mocap="true"/></worldbody>'
+    weld = '<equality><weld body1="drag" body2="flange"/></equality></mujoco>'
+    text = DESK_ARM.replace("</worldbody>", hand).replace("</mujoco>", weld)
+    made = draft(read_source(written(tmp_path, text, "arm.xml")), Wishes(), tmp_path, "drafted")
+    assert "left out, as nothing holds it: drag" in made.notes
+    assert made.cell().model.neq == 0
+
+
 @pytest.mark.thorough
 def test_an_arm_with_springs_at_its_tip_does_its_task(tmp_path: Path) -> None:
     done = rack("robot", "new", written(tmp_path, FLEXIBLE, "springy.xml"), folder=tmp_path)

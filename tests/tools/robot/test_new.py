@@ -14,12 +14,23 @@ import pytest
 from rack.boards.config import load
 from tests.processes import RACK
 from tests.tools.command_line import ROOT, rack
-from tests.tools.robot.models import urdf, written
+from tests.tools.robot.models import LIMIT, joint, link, urdf, written
 
 DESK_ARM = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml"
 MESH = '<geometry><mesh filename="package://small/meshes/l2.stl" scale="1 -1 1"/></geometry>'
 BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 TAIL = "</robot>"
+LEVER = link("lever", "0.01 0.01 0.01", "0 0 0") + joint(
+    "aside", "base", "lever", "0 0.2 0", "0 0 1", limit=LIMIT.format(low=-1, high=1, effort=9)
+)
+
+
+def follows(leader: str) -> str:
+    """Return an arm of which the third joint mimics another one."""
+    third = '<joint name="j3" type="revolute">'
+    return urdf().replace(third, f'{third}<mimic joint="{leader}"/>')
+
+
 BAD = {
     "no inertia": (urdf().replace('"1.0"', '"0"').replace('"0.01"', '"0"'), "inertia"),
     "no mesh": (urdf().replace(BOX, MESH), "no mesh 'package://small/meshes/l2.stl'"),
@@ -38,6 +49,11 @@ BAD = {
         "no actuator and no effort at waist",
     ),
     "no drives": (urdf(effort=0.0, gripper=False), "no actuator and no effort at j1"),
+    "coupled": (follows("j2"), "couples j2, j3, but the joints of an arm are driven independently"),
+    "coupled to a joint that would be held": (
+        follows("aside").replace(TAIL, f"{LEVER}{TAIL}"),
+        "couples j3, aside, but",
+    ),
     "no XML": ("not a model", "malformed XML"),
     "another language": ("<sdf/>", "<sdf>; valid: <mujoco> (MJCF), <robot> (URDF)"),
 }
