@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Role, TaskSpec, Wake
+from rack.backplane.rack_name import RACK_NAME
 from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
@@ -54,7 +55,7 @@ def _listed(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-RackName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
+RackName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
 Neighbours = Annotated[tuple[str, ...], BeforeValidator(_listed)]
 Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_listed)]

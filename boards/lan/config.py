@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, ValidationError
 
 from rack.backplane.message import MessageType
+from rack.backplane.rack_name import RACK_NAME
 from rack.boards.lan.endpoint import Endpoint, proper
 from rack.levels.references import module_and_name
 from rack.levels.tables import Positive, Table
@@ -21,12 +22,12 @@ Rights = Annotated[
     tuple[Right, ...],
     BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),
 ]
-PeerName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")]
+PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
 EndpointText = Annotated[str, AfterValidator(proper)]
 Local = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Remote = Annotated[
-    str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")
+    str, StringConstraints(pattern=rf"^{RACK_NAME}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")
 ]
 TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
 ENDPOINT_NOTE = (

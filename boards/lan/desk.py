@@ -36,6 +36,7 @@ from rack.backplane.operator_table import (
     RequestStage,
     RequestWord,
 )
+from rack.backplane.rack_name import RACK_NAME
 from rack.backplane.segment import VERSION, Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, System
@@ -77,7 +78,7 @@ REMEMBERED = 64
 """Commands of which the desk remembers that it gave them, in case they are asked for again."""
 MOST_CLIENTS = 16
 """Requests that wait for clients of this desk, at most."""
-_ASKER = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
+_ASKER = re.compile(RACK_NAME)
 
 
 @dataclass

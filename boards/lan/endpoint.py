@@ -7,10 +7,12 @@ from contextlib import suppress
 from ipaddress import ip_address
 from typing import NamedTuple
 
+from rack.backplane.rack_name import RACK_NAME
+
 TLS = ("tls", "quic")
 UNIX = "unix"
 _SHAPE = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})", re.ASCII)
-_OWN = re.compile(rf"{UNIX}/([a-z0-9][a-z0-9_-]{{0,39}})")
+_OWN = re.compile(rf"{UNIX}/({RACK_NAME})")
 _NUMBERS = re.compile(r"[0-9.]*")
 PERMITTED = (
     "permitted: tcp/, tls/ or quic/, an address or a host name, and a port from 1 to 65535; or"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rack.backplane.rack_name import derive_name, is_free_name
 from rack.boards.config import load, names
 from rack.levels.errors import RobotError
 from rack.tools.console.answer import Document, Failure, print_answer
@@ -90,20 +93,20 @@ def new(
     from rack.tools.robot.draft import Wishes
 
     asks = sys.stdin.isatty() and sys.stdout.isatty() and not as_json
-    if asks:
-        name = name or _asked("name", _plain(model.stem))
-    name = name or _plain(model.stem)
+    taken = names()
+    derived = derive_name(model.stem, taken)
+    name = name or (_asked("name", derived) if asks else derived)
+    if not is_free_name(name, taken):
+        why = "permitted: a-z, 0-9, '-' and '_', at most 40, and no bundled config's name"
+        raise Failure(f"--name = {name}: {why}; for example {derive_name(name, taken)}", 2)
     folder = out or Path(name)
     if folder.exists():
         raise Failure(f"--out: '{folder}' is there already; name a folder that is not", 2)
-    if name != _plain(name) or name in names():
-        why = "permitted: letters, digits, '-' and '_', and no bundled config's name"
-        raise Failure(f"--name = {name}: {why}", 2)
     chain = tuple(filter(None, joints.split(",")))
     wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque, "--torque"))
-    with TemporaryDirectory() as draft:
-        made = _made(model, wanted, Path(draft) / name, name, asks)
-        shutil.copytree(Path(draft) / name, folder)
+    with drafting(model) as draft:
+        made = _made(model, wanted, draft / name, name, asks)
+        shutil.copytree(draft / name, folder)
     print_answer(made | {"folder": str(folder)}, _lines(made, folder, name), as_json)
 
 
@@ -123,11 +126,8 @@ def check(model: ModelOrConfig, out: Picture = None, as_json: Json = False) -> N
       rack robot check nasrem
       rack robot check arm.urdf --out arm.png
     """
-    with TemporaryDirectory() as folder:
-        try:
-            examined, name = _examined(model, Path(folder))
-        except RobotError as error:
-            raise Failure(str(error), 2) from None
+    with drafting(Path(model)) as folder:
+        examined, name = _examined(model, folder)
         from rack.tools.robot.picture import draw
 
         picture = draw(examined.cell, out or Path(f"{name}.png"))
@@ -153,7 +153,7 @@ def _examined(given: str, folder: Path) -> tuple[Examined, str]:
 
     if Path(given).suffix not in ("", ".toml"):
         made = draft(read_source(Path(given)), Wishes(), folder, "arm")
-        return examine(made.robot, NOTHING, CLOCK_NS), _plain(Path(given).stem)
+        return examine(made.robot, NOTHING, CLOCK_NS), derive_name(Path(given).stem, ())
     config = load(given)
     if config.robot is None:
         raise RobotError(f"config '{given}' has no [robot]")
@@ -197,8 +197,19 @@ def _completed(source: Source, wanted: Wishes) -> Wishes:
     return replace(wanted, tool=tool, gripper=gripper, home=home)
 
 
-def _plain(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-") or "arm"
+@contextmanager
+def drafting(model: Path) -> Iterator[Path]:
+    """Provide a temporary folder; errors name the user's model in place of files in it. Raises
+    `Failure`."""
+    with TemporaryDirectory() as folder:
+        try:
+            yield Path(folder)
+        except RobotError as error:
+            raise Failure(_without(Path(folder), str(error), model), 2) from None
+
+
+def _without(folder: Path, text: str, model: Path) -> str:
+    return re.sub(f"{re.escape(str(folder))}[^']*", lambda _: str(model), text)
 
 
 def _numbers(text: str, option: str) -> tuple[float, ...]:
@@ -210,7 +221,7 @@ def _numbers(text: str, option: str) -> tuple[float, ...]:
 
 def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> Document:
     """Write the folder of an arm, asking for more if `asks`; return what it is. Raises
-    `Failure`."""
+    `RobotError`."""
     from rack.tools.robot.assignment import lay_out
     from rack.tools.robot.draft import draft
     from rack.tools.robot.folder import config_text, document
@@ -218,18 +229,16 @@ def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> D
     from rack.tools.robot.source import read_source
 
     folder.mkdir()
-    try:
-        source = read_source(model)
-        if asks:
-            wanted = _completed(source, wanted)
-        made = draft(source, wanted, folder, name)
-        layout = lay_out(made)
-    except RobotError as error:
-        raise Failure(str(error), 2) from None
+    source = read_source(model)
+    if asks:
+        wanted = _completed(source, wanted)
+    made = draft(source, wanted, folder, name)
+    layout = lay_out(made)
     (folder / f"{name}.toml").write_text(config_text(made, layout, name, model), encoding="utf-8")
     picture = draw(made.cell(layout.scene), folder / f"{name}.png")
     if picture == NO_PICTURE:
         made.notes.append(picture)
+    made.notes = [_without(folder, note, model) for note in made.notes]
     return document(made, layout, folder, name)
 
 
@@ -238,5 +247,7 @@ def _lines(made: Document, folder: Path, name: str) -> Iterator[str]:
     yield from made["notes"]
     for key, why in made["guessed"].items():
         yield f"guessed: {key}: {why}"
-    ways = name if folder == Path(name) else folder / f"{name}.toml"
-    yield f"rack run {ways}"
+    own = folder / f"{name}.toml"
+    # By name a file beside the folder is found first.
+    is_found = folder == Path(name) and not Path(own.name).exists()
+    yield f"rack run {name if is_found else shlex.quote(str(own))}"

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from rack.backplane.rack_name import RACK_NAME
 from rack.tools.console.answer import Failure
 from rack.tools.console.parameters import CERTIFICATES
 
@@ -17,7 +18,6 @@ OPERATOR = "operator"
 EVERYWHERE = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 AT_THE_RACK = "resets an emergency stop on its own machine alone: rack estop {} --reset"
 """Why a rack refuses a reset from afar."""
-_NAME = r"[a-z0-9][a-z0-9_-]{0,39}"
 _HOST = r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?"
 
 
@@ -36,7 +36,7 @@ class Asker(NamedTuple):
     @classmethod
     def of(cls, name: str, certificates: str) -> Asker:
         """Return who asks by the options of a command. Raises `Failure`."""
-        if re.fullmatch(_NAME, name) is None:
+        if re.fullmatch(RACK_NAME, name) is None:
             raise Failure(
                 f'--as = "{name}": not a name; permitted: small letters, digits, "-" and "_", at'
                 " most 40",
@@ -86,7 +86,7 @@ class RackAddress(NamedTuple):
     def of(cls, text: str) -> RackAddress:
         """Return the address in HOST[:PORT]/RACK. Raises `Failure`."""
         host, _, rack = text.partition("/")
-        if re.fullmatch(_NAME, rack) is None:
+        if re.fullmatch(RACK_NAME, rack) is None:
             raise Failure(
                 f'RACK = "{text}": not a rack; permitted: RACK, or HOST/RACK, as in 10.0.0.5/cell',
                 2,

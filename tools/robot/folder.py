@@ -11,7 +11,7 @@ from rack.levels.tables import Table
 from rack.tools.robot.assignment import Assignment
 from rack.tools.robot.draft import Draft
 
-HEAD = """# {name}: the levels and boards of nasrem with the arm of {model}, by `rack robot new`.
+HEAD = """# {name}: the levels and boards of nasrem with the arm of {model!r}, by `rack robot new`.
 format = 2
 name = "{name}"
 extends = ["nasrem"]

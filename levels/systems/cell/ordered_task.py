@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import StringConstraints, ValidationError
 
 from rack.backplane.message import Message, MessageType, State, fill_counts
+from rack.backplane.rack_name import RACK_NAME
 from rack.levels.errors import ProgramError, Refused
 from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
 from rack.levels.messages import TASK_PLAN, WORLD_MODEL, Error
@@ -31,7 +32,7 @@ from rack.levels.task.planner import TaskPlanner
 from rack.levels.task.program import AnyAction, TaskConfig, TaskParams
 from rack.levels.task.rehearsal import Rehearsed, finish_times
 
-RackName = Annotated[str, StringConstraints(pattern=r"^([a-z0-9][a-z0-9_-]{0,39})?$")]
+RackName = Annotated[str, StringConstraints(pattern=f"^({RACK_NAME})?$")]
 PLANNED = (Response.POSSIBLE, Response.DOING, Response.REFUSED)
 """Answers to an order that rest on its plan."""
 MAX_STRAY_RAD = 0.005

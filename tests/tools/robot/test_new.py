@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import shlex
 import sys
 import tomllib
 from pathlib import Path
@@ -12,11 +13,15 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
+from rack.levels.errors import RobotError
+from rack.tools.commands.robot import drafting
+from rack.tools.console.answer import Failure
 from tests.processes import RACK
 from tests.tools.command_line import ROOT, rack
 from tests.tools.robot.models import LIMIT, joint, link, urdf, written
 
 DESK_ARM = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml"
+EXAMPLE = DESK_ARM.with_suffix(".toml")
 MESH = '<geometry><mesh filename="package://small/meshes/l2.stl" scale="1 -1 1"/></geometry>'
 BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 TAIL = "</robot>"
@@ -127,11 +132,51 @@ def test_a_bad_model_is_one_line_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == [model]
 
 
-@pytest.mark.parametrize("name", ["nasrem", "a b", ".."])
-def test_a_name_that_rack_run_would_not_find_is_refused(tmp_path: Path, name: str) -> None:
-    done = rack("robot", "new", DESK_ARM, "--name", name, "--out", "new", folder=tmp_path)
+@pytest.mark.parametrize(
+    ("name", "better"), [("nasrem", "nasrem-arm"), ("A b", "a-b"), ("..", "arm"), ("-x", "x")]
+)
+def test_a_name_that_rack_run_would_refuse_is_refused_with_one_that_serves(
+    tmp_path: Path, name: str, better: str
+) -> None:
+    done = rack("robot", "new", DESK_ARM, f"--name={name}", "--out", "new", folder=tmp_path)
     assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
-    assert f"--name = {name}: permitted" in done.stderr
+    assert done.stderr.startswith(f"--name = {name}: permitted")
+    assert done.stderr.endswith(f"; for example {better}\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "words", "command"),
+    [
+        ("SixArm.urdf", (), "rack run sixarm"),
+        ("6 Ä_.urdf", ("--out", "my arms/new"), "rack run 'my arms/new/6-a.toml'"),
+        ("own.urdf", (), "rack run own/own.toml"),
+    ],
+)
+def test_the_command_that_it_prints_finds_the_new_rack(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    model: str,
+    words: tuple[str, ...],
+    command: str,
+) -> None:
+    written(tmp_path, urdf(gripper=False), model)
+    # By name `rack run` finds this file first.
+    written(tmp_path, EXAMPLE.read_text(), "own.toml")
+    done = rack("robot", "new", model, *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == command
+    monkeypatch.chdir(tmp_path)
+    config = load(shlex.split(command)[2])
+    assert config.robot is not None
+    assert config.robot.joints == tuple(f"j{k}" for k in range(1, 7))
+
+
+def test_errors_name_the_users_file_in_place_of_a_temporary_one(tmp_path: Path) -> None:
+    with pytest.raises(Failure) as refused, drafting(Path("own arm.urdf")) as folder:
+        raise RobotError(f"no gripper: model '{folder / 'a' / 'a.xml'}': geom 'g' not found")
+    assert str(refused.value) == "no gripper: model 'own arm.urdf': geom 'g' not found"
+    assert not folder.exists()
 
 
 def test_a_model_that_is_not_there_is_one_line(tmp_path: Path) -> None:
