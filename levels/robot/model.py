@@ -1,21 +1,16 @@
-"""Read an MJCF file and fit it to the servo level: torque motors, integrator, time step, tool,
-keyframe.
-
-The file is not trusted: every mistake is one `RobotError`, in bounded time and memory.
-"""
+"""Fit a model to the servo level: torque motors, integrator, time step, tool, keyframe."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.errors import RobotError
+from rack.levels.robot.model_file import ModelReader
 from rack.levels.robot.state import SLEEP
 from rack.levels.tables import (
     MOST,
@@ -26,14 +21,8 @@ from rack.levels.tables import (
     ToolConfig,
 )
 
-GRID_CELLS = 4_000_000
-"""Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x
-20000 takes 10 s)."""
-MODEL_BYTES = 16_000_000
-"""Size of one XML file, at most."""
 LONGEST_STEP_S = 0.1
 """A longer time step in an MJCF file is a mistake, such as ms for s."""
-GRIDS = (("nrow", "ncol"), ("width", "height"))
 JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 SET_POINT_ROWS = 3
 """Numbers a joint that MuJoCo's state keeps of simulated drives that follow set points: position,
@@ -47,14 +36,13 @@ mujoco.set_mju_user_warning(lambda _: None)
 def load_spec(path: Path) -> mujoco.MjSpec:
     """Return the parsed, not yet compiled, MJCF file.
 
-    Raises `RobotError` for a file that is missing, malformed, too large, includes a file outside
-    its own folder, holds a NaN, or has an invalid time step.
+    Raises `RobotError` for a file that `ModelReader` or MuJoCo refuses, or that has an invalid time
+    step.
     """
-    path = Path(path)
-    screen(path, path.resolve().parent, set())
+    texts = ModelReader(path).texts
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as problem:
+        spec = mujoco.MjSpec.from_file(str(path.resolve().with_name(next(iter(texts)))), texts)
+    except (ValueError, RuntimeError) as problem:
         raise RobotError(f"model '{path}': {one_line(problem)}") from None
     step = float(spec.option.timestep)
     if not 0 < step <= LONGEST_STEP_S:
@@ -70,7 +58,7 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     Raises `RobotError` with MuJoCo's reason in one line."""
     try:
         return spec.compile()
-    except (ValueError, mujoco.FatalError) as problem:
+    except (ValueError, RuntimeError, mujoco.FatalError) as problem:
         if drop_fixed_inertias(spec.worldbody):
             return compile_spec(spec, path)
         raise RobotError(f"model '{path}': {one_line(problem)}") from None
@@ -312,59 +300,6 @@ def remove(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -> None:
             spec.delete(sensor)
     for actuator in actuators:
         spec.delete(actuator)
-
-
-def screen(path: Path, folder: Path, seen: set[Path]) -> None:
-    """Check one XML file and what it includes, before MuJoCo reads them. Raises `RobotError`."""
-    if not path.is_file():
-        raise RobotError(f"model '{path}': no such file")
-    if path.stat().st_size > MODEL_BYTES:
-        raise RobotError(
-            f"model '{path}': {path.stat().st_size} bytes; at most {MODEL_BYTES} are read"
-        )
-    try:
-        root = ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, ValueError) as problem:
-        raise RobotError(f"model '{path}': malformed XML: {problem}") from None
-    seen.add(path.resolve())
-    for element in root.iter():
-        for mistake in mistakes(element):
-            raise RobotError(f"model '{path}': {mistake}")
-        if element.tag == "include":
-            included = (folder / element.get("file", "")).resolve()
-            if not included.is_relative_to(folder):
-                raise RobotError(
-                    f"model '{path}': include '{element.get('file')}' leaves the model's folder"
-                )
-            if included not in seen:
-                screen(included, folder, seen)
-
-
-def mistakes(element: ElementTree.Element) -> Iterator[str]:
-    """Yield the mistakes of one element: a NaN, a grid too large."""
-    for name, value in element.attrib.items():
-        if name != "name" and "nan" in value.lower() and any(math.isnan(x) for x in numbers(value)):
-            yield f"<{element.tag}> '{element.get('name', '')}': {name} = '{value}' is not a number"
-    for first, second in GRIDS:
-        cells = math.prod(
-            max(numbers(element.get(key, "0")), default=0.0) for key in (first, second)
-        )
-        if cells > GRID_CELLS:
-            yield (
-                f"<{element.tag}> '{element.get('name', '')}': {first} x {second} = {cells:g}; at"
-                f" most {GRID_CELLS}"
-            )
-
-
-def numbers(text: str) -> list[float]:
-    """Return the numbers among the words of an attribute."""
-    found = []
-    for word in text.split():
-        try:
-            found.append(float(word))
-        except ValueError:
-            continue
-    return found
 
 
 def one_line(problem: Exception) -> str:

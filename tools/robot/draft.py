@@ -136,7 +136,10 @@ class Draft:
 def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
     """Return the arm of a model, as `rack run` takes it: a gripper that it would refuse is held.
     Raises `RobotError`, one line."""
-    made = _draft(source, wanted, folder, name)
+    try:
+        made = _draft(source, wanted, folder, name)
+    except RobotError as error:
+        raise RobotError("; ".join([str(error), *source.notes])) from None
     try:
         build_cell(made.robot, NOTHING, CLOCK_NS)
     except RobotError as error:

@@ -13,7 +13,8 @@ from xml.etree import ElementTree
 import mujoco
 
 from rack.levels.errors import RobotError
-from rack.levels.robot.model import compile_spec, listed, load_spec, one_line, screen
+from rack.levels.robot.model import compile_spec, listed, load_spec, one_line
+from rack.levels.robot.model_file import ModelReader, check_asset, find_file
 
 READ = (".stl", ".obj", ".msh")
 """Meshes that MuJoCo reads."""
@@ -23,6 +24,8 @@ UNBALANCED = "balanceinertia"
 SLACK_S = 0.02
 """MuJoCo's time constant of dry friction, which makes it a damper: a light link with the friction
 of a large gear, as models for position servos have it, hardly ever meets all of it."""
+LARGE_M = 20.0
+"""Size of a part beyond which a model is probably in millimetres."""
 DRY_SOLREF = (0.001, 1.0)
 DRY_SOLIMP = (0.99, 0.99)
 """Of dry friction that is about what the equation of motion says."""
@@ -45,8 +48,7 @@ class Source:
 def read_source(path: Path) -> Source:
     """Return a model by its file. Raises `RobotError`, one line, where nothing can be made of
     it."""
-    screen(path, path.resolve().parent, set())
-    root = ElementTree.parse(path).getroot()
+    root = ModelReader(path).root
     if root.tag == "mujoco":
         source = Source(path, load_spec(path), {})
     elif root.tag == "robot":
@@ -56,38 +58,25 @@ def read_source(path: Path) -> Source:
     _name_all(source.spec)
     _stiffen(source)
     try:
-        source.compiled()
+        model = source.compiled()
     except RobotError as error:
         if UNBALANCED not in str(error):
             raise
         source.spec.compiler.balanceinertia = True
         source.notes.append("inertias that no body can have are balanced")
-        source.compiled()
+        model = source.compiled()
+    size = max(model.geom_rbound.max(initial=0.0), abs(model.body_pos).max())
+    if size > LARGE_M:
+        source.notes.append(f"{size:.4g} m from one part to the next: is it in mm?")
     return source
 
 
 def _urdf(path: Path, root: ElementTree.Element) -> Source:
-    if any("xacro" in element.tag for element in root.iter()):
-        raise RobotError(f"model '{path}': holds xacro; expand it first: xacro IN > arm.urdf")
-    named = Counter((e.tag, e.get("name", "")) for e in root if e.tag in ("link", "joint"))
-    children = {child.get("link") for child in root.findall("joint/child")}
-    roots = [name for tag, name in named if tag == "link" and name not in children]
-    twice = [f"{tag} '{name}'" for (tag, name), count in named.items() if count > 1]
-    if twice or len(roots) != 1:
-        why = f"named twice: {listed(twice)}" if twice else f"roots: {listed(roots)}"
-        raise RobotError(f"model '{path}': {why}; one of each is valid")
-    notes = []
-    if root.find("link/collision") is None:
-        notes.append("without collision geometry: what is visible counts")
-        for visual in root.findall("link/visual"):
-            visual.tag = "collision"
-    own = root.find("mujoco/compiler")
-    meshes = "." if own is None else own.get("meshdir", ".")
-    for link in root.findall("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-        for mesh in link.iter("mesh"):
-            mesh.set("filename", str(_mesh(path, mesh.get("filename", ""), meshes)))
+    _check_tree(path, root)
+    notes = _find_shapes(path, root)
+    for joint in root.findall("joint[@type='planar']"):
+        joint.set("type", "fixed")
+        notes.append(f"held, as a mobile base stands: the planar joint '{joint.get('name')}'")
     for extension in root.findall("mujoco"):
         root.remove(extension)
     ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", COMPILER)
@@ -100,6 +89,93 @@ def _urdf(path: Path, root: ElementTree.Element) -> Source:
         name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None
     }
     return Source(path, spec, {name: value for name, value in stated.items() if value > 0}, notes)
+
+
+def _check_tree(path: Path, root: ElementTree.Element) -> None:
+    """Raise `RobotError` unless all links of a URDF are declared once and hang on one root."""
+    named = Counter((e.tag, e.get("name", "")) for e in root if e.tag in ("link", "joint"))
+    links = [name for tag, name in named if tag == "link"]
+    children = [child.get("link", "") for child in root.findall("joint/child")]
+    parents = [parent.get("link", "") for parent in root.findall("joint/parent")]
+    twice = [f"{tag} '{name}'" for (tag, name), count in named.items() if count > 1]
+    roots = [name for name in links if name not in children]
+    if unknown := [name for name in parents + children if name not in links]:
+        why = f"no link '{unknown[0]}', to which a joint refers; add <link name=\"{unknown[0]}\"/>"
+    elif twice:
+        why = f"named twice: {listed(twice)}; one of each is valid"
+    elif len(roots) != 1:
+        why = f"roots: {listed(roots)}; one is valid"
+    else:
+        return
+    raise RobotError(f"model '{path}': {why}")
+
+
+def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
+    """Give each link of a URDF its shapes for planning; return what to tell the user of them.
+    Raises `RobotError`."""
+    own = root.find("mujoco/compiler")
+    folder = "." if own is None else own.get("meshdir", ".")
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    visible = [name for name, link in links.items() if _is_only_visible(link)]
+    unread = {
+        name: problem
+        for name, link in links.items()
+        if (problem := _find_shape(path, link, folder)) is not None
+    }
+    if unread and root.find("link/collision") is None:
+        raise next(iter(unread.values()))
+    moved = {child.get("link", "") for child in root.findall("joint/child")}
+    told = {
+        "no <collision>, so what is visible counts in planning": [
+            n for n in visible if n not in unread
+        ],
+        "no <collision> and no mesh that can be read, so no shape in planning": [*unread],
+        "no <inertial>, so shapes weigh what water does": [
+            name
+            for name, link in links.items()
+            if name in moved
+            and link.find("collision") is not None
+            and link.find("inertial") is None
+        ],
+    }
+    return [f"{why}: {listed(names)}" for why, names in told.items() if names]
+
+
+def _is_only_visible(link: ElementTree.Element) -> bool:
+    return link.find("collision") is None and link.find("visual") is not None
+
+
+def _find_shape(path: Path, link: ElementTree.Element, folder: str) -> RobotError | None:
+    """Leave in a link its collision geometry, or else what is visible as such, with its meshes.
+
+    Args:
+        path: File of the model.
+        link: The link, which is changed.
+        folder: Where the model says that its meshes are.
+
+    Returns:
+        Why the link has no shape although it is visible. None if it has one, or is not.
+
+    Raises:
+        RobotError: A mesh of its collision geometry cannot be read.
+    """
+    is_only_visible = _is_only_visible(link)
+    visuals = link.findall("visual")
+    if not is_only_visible:
+        for visual in visuals:
+            link.remove(visual)
+    try:
+        for mesh in link.iter("mesh"):
+            mesh.set("filename", str(_mesh(path, mesh.get("filename", ""), folder)))
+    except RobotError as problem:
+        if not is_only_visible:
+            raise
+        for visual in visuals:
+            link.remove(visual)
+        return problem
+    for visual in visuals:
+        visual.tag = "collision"
+    return None
 
 
 def _mesh(path: Path, name: str, meshes: str) -> Path:
@@ -121,9 +197,14 @@ def _mesh(path: Path, name: str, meshes: str) -> Path:
         for suffix in (file.suffix, *READ)
         if suffix.lower() in READ
     ]
-    found = next((file for file in files if file.is_file()), None)
+    found = find_file(files)
     if found is None:
-        raise RobotError(f"model '{path}': no mesh '{name}'; valid: an {', '.join(READ)} file")
+        other = find_file(tried)
+        why = f"looked for as {listed([*dict.fromkeys(map(str, tried))], most=6)}"
+        if other is not None:
+            why = f"convert '{other}', in its folder, as Collada and the like are not read"
+        raise RobotError(f"model '{path}': no mesh '{name}': {why}; valid: {', '.join(READ)}")
+    check_asset(found, path)
     return found
 
 

@@ -222,7 +222,7 @@ def test_a_scene_that_does_not_fit_the_model_is_refused_in_one_line(
 
 
 WRONG_MODELS = {
-    "nan step": ({"timestep": "nan"}, "timestep = 'nan' is not a number"),
+    "nan step": ({"timestep": "nan"}, "<option>: timestep = 'nan'; valid: finite numbers"),
     "no step": ({"timestep": "0"}, "timestep 0 s is not valid"),
     "long step": ({"timestep": "2.5"}, "timestep 2.5 s is not valid; above 0, at most 0.1"),
     "no limit": (

@@ -1,0 +1,282 @@
+"""Read the XML of a model before MuJoCo does.
+
+The files are not trusted: every mistake is one `RobotError`, in bounded time and memory. MuJoCo
+gets the text that is checked here, and opens no XML file itself.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path, PureWindowsPath
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+from rack.backplane.regular_file import check_regular_file, read_regular_file
+from rack.levels.errors import RobotError
+
+MODEL_BYTES = 16_000_000
+"""Size of all XML files of a model, at most."""
+ASSET_BYTES = 200_000_000
+"""Size of one mesh, texture or height field, at most."""
+PIXELS = 70_000_000
+"""Pixels of one image, at most: a small file may hold more than memory does."""
+MOST_DEPTH = 300
+"""Elements within each other, at most."""
+MOST_FILES = 100
+"""XML files of a model, at most; a file that includes itself has more."""
+MOST_PARTS = 6_000
+"""Parts of a model with all their replicas, at most: the time in which MuJoCo reads them grows with
+the square of their number."""
+PARTS = ("body", "composite", "flexcomp", "geom", "joint", "link", "site")
+REPEATING = ("replicate", "composite", "flexcomp")
+GRID_CELLS = 4_000_000
+"""Cells of one height field or texture, at most: MuJoCo allocates them while it parses (20000 x
+20000 takes 10 s)."""
+GRIDS = (("nrow", "ncol"), ("width", "height"))
+PNG = b"\x89PNG\r\n\x1a\n"
+EXPAND = "expand it first: xacro IN > arm.urdf"
+VECTORS = ("xyz", "rpy", "size", "scale")
+"""Attributes of three numbers."""
+NUMBERS = (
+    *VECTORS,
+    *("ixx", "ixy", "ixz", "iyy", "iyz", "izz", "value", "radius", "length", "lower", "upper"),
+    *("effort", "velocity", "damping", "friction", "multiplier", "offset"),
+)
+"""Numeric attributes in links and joints of a URDF."""
+LIMITS = ("range", "cutoff", "effort")
+"""Ends of the names of attributes in which infinity means that there is no limit."""
+FASTEST = 1e9
+"""Velocity that no joint has, rad/s or m/s."""
+
+
+class _Place(NamedTuple):
+    """The surroundings of an element."""
+
+    file: Path  # that contains it
+    owner: str  # kind and name of the nearest element around it that has a name
+    copies: float  # number of its replicas
+    depth: int
+
+
+class ModelReader:
+    """Reads the XML file of a model, and those that it includes or attaches.
+
+    Elements and attributes with a prefix are left out: they belong to other programs.
+
+    Attributes:
+        root: Root of the model's own file.
+        texts: Content of all files, its own first, by the names under which MuJoCo finds them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the files of a model.
+
+        Args:
+            path: The model's own file.
+
+        Raises:
+            RobotError: A file is missing, malformed, too large or no regular file, or includes one
+                outside its folder; a number cannot be used; there are too many parts.
+        """
+        self._files: dict[str, tuple[Path, ElementTree.Element]] = {}
+        self._models: dict[str | None, str] = {}  # names of attached files
+        self._assets: set[tuple[Path, str]] = set()  # folder of a model, and what it names
+        self._folders = {""}  # of assets
+        self._bytes = 0
+        self._parts = 0.0
+        self.root = self._read(path, path.resolve().parent)
+        self._check(self.root, _Place(path, "", 1.0, 1))
+        if self.root.tag == "mujoco":
+            self._check_assets(path)
+        self.texts = {
+            name: ElementTree.tostring(root, encoding="unicode").encode()
+            for name, (_, root) in self._files.items()
+        }
+
+    def _read(self, path: Path, folder: Path) -> ElementTree.Element:
+        """Read a file of a model in this folder, and those to which it refers."""
+        try:
+            text = read_regular_file(path, MODEL_BYTES - self._bytes)
+            root = parse_xml(text)
+        except FileNotFoundError:
+            raise RobotError(f"model '{path}': no such file") from None
+        except OSError as problem:
+            raise RobotError(f"model '{path}': {problem.strerror}") from None
+        except expat.ExpatError as problem:
+            raise RobotError(f"model '{path}': malformed XML: {problem}") from None
+        except (ValueError, LookupError) as problem:
+            raise RobotError(f"model '{path}': {problem}") from None
+        self._bytes += len(text)
+        self._files[f"{len(self._files)}.xml"] = (path, root)
+        if len(self._files) > MOST_FILES:
+            why = f"more than {MOST_FILES} files are included; does one include itself?"
+            raise RobotError(f"model '{path}': {why}")
+        for element in root.iter():
+            if element.tag not in ("include", "model"):
+                self._folders |= {value for key, value in element.items() if key.endswith("dir")}
+                files = {value for key, value in element.items() if key.startswith("file")}
+                self._assets |= {(folder, file) for file in files if file}
+            elif "file" in element.attrib:
+                self._refer(element, path, folder)
+        return root
+
+    def _refer(self, element: ElementTree.Element, path: Path, folder: Path) -> None:
+        """Read the file to which an element refers, and let it refer to the text of that file.
+
+        Args:
+            element: It includes the file, or declares it as a model to attach.
+            path: File that contains the element.
+            folder: Folder of the model.
+        """
+        name = element.get("file", "")
+        places = (folder / name, path.resolve().parent / name)
+        found = find_file(places) or places[0]
+        own = f"{len(self._files)}.xml"
+        if element.tag == "model":
+            self._models[element.get("name")] = own
+            folder = found.resolve().parent
+        elif not found.resolve().is_relative_to(folder):
+            raise RobotError(f"model '{path}': include '{name}' leaves the model's folder")
+        self._read(found, folder)
+        # MuJoCo looks for texts by the last part of a path.
+        element.set("file", str(Path(name).with_name(own)))
+
+    def _check(self, element: ElementTree.Element, place: _Place) -> None:
+        """Check an element, and all in it or to which it refers, with the number of replicas."""
+        file, owner, copies, depth = place
+        tag = element.tag
+        if name := element.get("name"):
+            owner = f"{tag} '{name}'"
+        for mistake in _mistakes(element, owner, self.root.tag == "robot"):
+            raise RobotError(f"model '{file}': {mistake}")
+        if tag in REPEATING:
+            copies *= math.prod(max(1.0, n) for n in numbers(element.get("count", "")))
+        self._parts += copies * (tag in PARTS)
+        if self._parts > MOST_PARTS:
+            why = f"more than {MOST_PARTS} bodies, joints, geoms and sites, with all replicas"
+            raise RobotError(f"model '{file}': {why}")
+        if depth > MOST_DEPTH:
+            raise RobotError(f"model '{file}': more than {MOST_DEPTH} elements within each other")
+        for child in element:
+            self._check(child, _Place(file, owner, copies, depth + 1))
+        refers = {"include": element.get("file"), "attach": self._models.get(element.get("model"))}
+        if own := refers.get(tag):
+            inner, root = self._files[own.rpartition("/")[2]]
+            self._check(root, _Place(inner, owner, copies, depth + 1))
+
+    def _check_assets(self, model: Path) -> None:
+        """Check that meshes, images and height fields are regular files of bounded size."""
+        for folder, name in self._assets:
+            places = [folder / place for place in sorted(self._folders)]
+            # MuJoCo strips paths of Windows as well.
+            own = PureWindowsPath(name)
+            files = [place / part for place in places for part in (own.as_posix(), own.name)]
+            if find_file(files) is None:
+                looked = ", ".join(map(str, places))
+                raise RobotError(f"model '{model}': no file '{name}'; looked for in {looked}")
+            for file in files:
+                if find_file([file]):
+                    check_asset(file, model)
+
+
+def parse_xml(text: bytes) -> ElementTree.Element:
+    """Parse a file, but for elements and attributes with a prefix, declared or not.
+
+    Every start tag remains on its line, which MuJoCo names in its messages.
+
+    Raises:
+        ExpatError: It is malformed.
+        ValueError: It declares entities, or holds xacro that is not expanded.
+    """
+    builder = ElementTree.TreeBuilder()
+    parser = expat.ParserCreate()
+    foreign = 0  # depth within an element with a prefix
+    line = 1
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal foreign, line
+        prefix, _, name = tag.rpartition(":")
+        if prefix == "xacro" and name not in ("property", "arg"):
+            raise ValueError(f"line {parser.CurrentLineNumber} holds <{tag}>; {EXPAND}")
+        if foreign or prefix:
+            foreign += 1
+            return
+        builder.data("\n" * (parser.CurrentLineNumber - line))
+        line = parser.CurrentLineNumber
+        builder.start(tag, {key: value for key, value in attributes.items() if ":" not in key})
+
+    def end(tag: str) -> None:
+        nonlocal foreign
+        if foreign:
+            foreign -= 1
+        else:
+            builder.end(tag)
+
+    def refuse(*_: object) -> None:
+        raise ValueError(f"line {parser.CurrentLineNumber} declares an entity; write its text out")
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.EntityDeclHandler = refuse
+    parser.Parse(text, True)
+    return builder.close()
+
+
+def find_file(paths: Iterable[Path]) -> Path | None:
+    """Return the first path that exists, and that the system does not refuse, as one too long."""
+    for path in paths:
+        with suppress(OSError):
+            path.stat()
+            return path
+    return None
+
+
+def check_asset(file: Path, model: Path) -> None:
+    """Raise `RobotError` for an asset of a model that is no regular file, or too large, also once
+    it is decoded."""
+    try:
+        check_regular_file(file, ASSET_BYTES)
+        with file.open("rb") as opened:
+            head = opened.read(24)
+    except OSError as problem:
+        raise RobotError(f"model '{model}': '{file}': {problem.strerror}") from None
+    if head.startswith(PNG) and math.prod(struct.unpack(">II", head[16:])) > PIXELS:
+        raise RobotError(f"model '{model}': '{file}': more than {PIXELS} pixels")
+
+
+def _mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterator[str]:
+    """Yield the mistakes of one element, of `owner`: an invalid number, a grid too large."""
+    place = owner if "name" in element.attrib else f"<{element.tag}>" + f" of {owner}" * bool(owner)
+    is_part = owner.startswith(("link", "joint"))
+    for key, value in element.items():
+        found = numbers(value)
+        is_wrong = key != "name" and not all(
+            math.isfinite(x) or (math.isinf(x) and key.endswith(LIMITS)) for x in found
+        )
+        valid = "finite numbers"
+        if is_urdf:
+            is_wrong |= not len(value.split()) == len(found) == (3 if key in VECTORS else 1)
+            is_wrong |= key == "velocity" and not 0.0 <= min(found, default=0.0) < FASTEST
+            is_wrong &= is_part and key in NUMBERS
+            valid = "3 finite numbers" if key in VECTORS else "a finite number, such as 2.5"
+            valid += f", from 0 to {FASTEST:g}" * (key == "velocity")
+        if is_wrong:
+            hint = f"; {EXPAND}" * ("$" in value)
+            yield f"{place}: {key} = '{value[:60]}'; valid: {valid}{hint}"
+    for keys in [(key,) for key in element.attrib] if element.tag == "size" else GRIDS:
+        cells = math.prod(max(numbers(element.get(key, "0")), default=0.0) for key in keys)
+        if cells > GRID_CELLS:
+            yield f"{place}: {' x '.join(keys)} = {cells:g}; at most {GRID_CELLS}"
+
+
+def numbers(text: str) -> list[float]:
+    """Return the numbers among the words of an attribute; nan(7), as C reads it, is one of them."""
+    found = []
+    for word in text.split():
+        with suppress(ValueError):
+            found.append(float(word.partition("(")[0]))
+    return found

@@ -1,0 +1,175 @@
+"""URDFs as they are found: what is read, what is said of it, and what is refused in one line."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from rack.levels.errors import RobotError
+from rack.tools.robot.source import Source, read_source
+from tests.tools.robot.models import urdf, written
+
+MODEL = urdf(gripper=False)
+TAIL = "</robot>"
+NEWLINE = "\n"
+CUBE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+
+
+def read(folder: Path, text: str) -> Source:
+    return read_source(written(folder, text))
+
+
+def refusal(folder: Path, text: str) -> str:
+    with pytest.raises(RobotError) as refused:
+        read(folder, text)
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
+VELOCITY = "valid: a finite number, such as 2.5, from 0 to 1e+09"
+NUMBERS = {
+    "comma": ('velocity="2"', 'velocity="2,5"', f"velocity = '2,5'; {VELOCITY}"),
+    "empty": ('velocity="2"', 'velocity=""', f"velocity = ''; {VELOCITY}"),
+    "xacro": ('velocity="2"', 'velocity="${vmax}"', f"velocity = '${{vmax}}'; {VELOCITY}; expand"),
+    "infinite": ('velocity="2"', 'velocity="inf"', f"velocity = 'inf'; {VELOCITY}"),
+    "NaN": ('velocity="2"', 'velocity="nan"', f"velocity = 'nan'; {VELOCITY}"),
+    "negative": ('velocity="2"', 'velocity="-2"', f"velocity = '-2'; {VELOCITY}"),
+    "too fast": ('velocity="2"', 'velocity="1e300"', f"velocity = '1e300'; {VELOCITY}"),
+    "two": ('velocity="2"', 'velocity="2 3"', f"velocity = '2 3'; {VELOCITY}"),
+    "lower": ('lower="-2.8"', 'lower="-2.8 rad"', "<limit> of joint 'j1': lower = '-2.8 rad'"),
+    "upper": ('upper="2.8"', 'upper="inf"', "<limit> of joint 'j1': upper = 'inf'"),
+    "effort": ('effort="60.0"', 'effort="60 N"', "<limit> of joint 'j1': effort = '60 N'"),
+    "mass": ('mass value="1.0"', 'mass value="nan"', "<mass> of link 'base': value = 'nan'"),
+    "inertia": ('ixx="0.01"', 'ixx="inf"', "<inertia> of link 'base': ixx = 'inf'"),
+    "place": ('xyz="0 0 0.05"', 'xyz="0 0"', "xyz = '0 0'; valid: 3 finite numbers"),
+    "axis": ('axis xyz="0 0 1"', 'axis xyz="z"', "<axis> of joint 'j1': xyz = 'z'"),
+    "size": ('size="0.1 0.1 0.1"', 'size="0,1 0,1 0,1"', "<box> of link 'base': size = '0,1"),
+    "friction": ("<axis", '<dynamics friction=""/><axis', "of joint 'j1': friction = ''"),
+    "mimic": ("<axis", '<mimic joint="j2" multiplier="x"/><axis', "joint 'j1': multiplier = 'x'"),
+}
+
+
+@pytest.mark.parametrize("case", NUMBERS)
+def test_a_number_that_is_none_is_named_with_its_joint_or_link(tmp_path: Path, case: str) -> None:
+    good, bad, why = NUMBERS[case]
+    assert good in MODEL
+    assert why in refusal(tmp_path, MODEL.replace(good, bad, 1))
+
+
+def test_numbers_of_other_programs_and_infinite_efforts_are_read(tmp_path: Path) -> None:
+    text = MODEL.replace('effort="60.0"', 'effort="inf"')
+    other = '<gazebo><velocity value="fast"/></gazebo><sensor name="s"><origin xyz="x"/></sensor>'
+    assert read(tmp_path, text.replace(TAIL, other + TAIL)).velocity["j1"] == 2.0
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        "<gazebo><controller:manager name='m'/></gazebo>",
+        "<a:link name='base'/>",
+        "<xacro:property name='a' value='1'/>",
+    ],
+)
+def test_elements_and_attributes_with_a_prefix_are_ignored(tmp_path: Path, extra: str) -> None:
+    text = MODEL.replace(TAIL, extra + TAIL).replace("<mass", '<mass drake:value="x"')
+    assert len(read(tmp_path, text).spec.joints) == 6
+
+
+STRUCTURE = {
+    "world": (
+        '<joint name="w" type="fixed"><parent link="world"/><child link="base"/></joint>',
+        "no link 'world', to which a joint refers; add <link name=\"world\"/>",
+    ),
+    "xacro": (
+        '\n\n<xacro:arm prefix="a"/>',
+        f"line {MODEL.count(NEWLINE) + 3} holds <xacro:arm>; expand it first",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", STRUCTURE)
+def test_what_is_missing_from_a_urdf_is_said_with_what_to_do(tmp_path: Path, case: str) -> None:
+    extra, why = STRUCTURE[case]
+    assert why in refusal(tmp_path, MODEL.replace(TAIL, extra + TAIL))
+
+
+def with_visuals(links: range) -> str:
+    """Return an arm, some links of which have no shape but a visual."""
+    text = MODEL
+    for k in links:
+        start, end = text.index(f'<link name="l{k}">'), text.index(f'<joint name="j{k}"')
+        link = text[start:end].replace("collision>", "visual>")
+        text = text[:start] + link + text[end:]
+    return text
+
+
+def test_what_is_only_visible_counts_in_planning_and_is_said(tmp_path: Path) -> None:
+    source = read(tmp_path, with_visuals(range(3, 6)))
+    assert source.notes == ["no <collision>, so what is visible counts in planning: l3, l4, l5"]
+    model = source.compiled()
+    shown = [int(model.body(f"l{k}").geomnum[0]) for k in range(1, 7)]
+    assert shown == [1] * 6
+    assert model.geom_contype.all()
+
+
+def test_links_without_inertia_are_named(tmp_path: Path) -> None:
+    text = re.sub(r'(<link name="l[12]">)<inertial>.*?</inertial>', r"\1", MODEL, flags=re.DOTALL)
+    notes = read(tmp_path, text).notes
+    assert notes == ["no <inertial>, so shapes weigh what water does: l1, l2"]
+
+
+def test_visuals_that_cannot_be_read_are_said_or_refused_if_there_is_nothing_else(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "l.dae").touch()
+    mesh = '<geometry><mesh filename="l.dae"/></geometry>'
+    box = "<geometry><box"
+    some = with_visuals(range(6, 7))
+    head, _, tail = some.rpartition(box)
+    text = head + mesh + tail[tail.index("</geometry>") + len("</geometry>") :]
+    assert read(tmp_path, text).notes == [
+        "no <collision> and no mesh that can be read, so no shape in planning: l6"
+    ]
+    nothing = re.sub("<geometry>.*?</geometry>", mesh, MODEL.replace("collision>", "visual>"))
+    assert "as Collada and the like are not read" in refusal(tmp_path, nothing)
+
+
+MESH = '<geometry><mesh filename="{}"/></geometry>'
+BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
+
+
+def test_a_mesh_that_is_not_found_is_said_with_all_places(tmp_path: Path) -> None:
+    why = refusal(tmp_path, MODEL.replace(BOX, MESH.format("package://arm/meshes/b.stl")))
+    assert "no mesh 'package://arm/meshes/b.stl': looked for as " in why
+    for place in ("arm/meshes/b.stl", "b.stl"):
+        assert str(tmp_path / place) in why
+
+
+def test_collada_is_said_not_to_be_read_unless_a_mesh_is_beside_it(tmp_path: Path) -> None:
+    text = MODEL.replace(BOX, MESH.format("b.dae"))
+    (tmp_path / "b.dae").touch()
+    why = f"convert '{tmp_path / 'b.dae'}', in its folder, as Collada and the like are not read"
+    assert why in refusal(tmp_path, text)
+    (tmp_path / "b.obj").write_text(CUBE)
+    assert read(tmp_path, text).compiled().nmesh == 1
+
+
+def test_a_fifo_in_place_of_a_mesh_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "b.stl")
+    why = refusal(tmp_path, MODEL.replace(BOX, MESH.format("b.stl")))
+    assert why.endswith("b.stl': not a regular file, but a FIFO")
+
+
+def test_a_planar_joint_below_the_base_is_held_and_said(tmp_path: Path) -> None:
+    joint = '<joint name="drive" type="planar"><parent link="map"/><child link="base"/></joint>'
+    source = read(tmp_path, MODEL.replace(TAIL, f'<link name="map"/>{joint}{TAIL}'))
+    assert [one.name for one in source.spec.joints] == [f"j{k}" for k in range(1, 7)]
+    assert source.notes == ["held, as a mobile base stands: the planar joint 'drive'"]
+
+
+def test_a_model_in_millimetres_is_asked_about(tmp_path: Path) -> None:
+    text = re.sub('xyz="0 0 (0.3)"', 'xyz="0 0 300"', MODEL)
+    assert read(tmp_path, text).notes == ["300 m from one part to the next: is it in mm?"]
