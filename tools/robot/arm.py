@@ -28,14 +28,12 @@ BASE_JOINTS = 3
 """Joints before a branch, at least, for that."""
 
 
-REFERRING = ("tendon", "equality", "actuator", "contact", "sensor")
-"""Sections of an MJCF file that refer to others, in such an order."""
-KINDS = {
-    "target": "body",
-    "jointinparent": "joint",
-    **{f"{kind}{k}": kind for kind in ("joint", "body", "site", "tendon", "geom") for k in (1, 2)},
-}
-"""To what an attribute refers, where its name is not that of the kind."""
+REFERRING = ("tendon", "equality", "actuator", "contact", "deformable", "sensor", "custom")
+"""Sections of an MJCF file that refer to others."""
+KINDS = {"jointinparent": "joint", "node": "body", "subtree": "body", "target": "body"}
+KINDS |= {"xbody": "body", "refsite": "site", "sidesite": "site"}
+KINDS |= {"cranksite": "site", "slidersite": "site"}
+"""To what an attribute refers, where its name, but for a number, is not that of the kind."""
 
 
 @dataclass(frozen=True)
@@ -117,31 +115,49 @@ def hold(path: Path, kept: Iterable[str]) -> list[str]:
     flying = []
     world = root.find("worldbody")
     assert world is not None, "MuJoCo writes one"
-    for body in world.findall("body"):
-        own = {(inner.tag, inner.get("name", "")) for inner in body.iter()}
-        flies = body.find("freejoint") is not None or body.find("joint[@type='free']") is not None
-        if not own & moving and (flies or "mocap" in body.attrib):
-            world.remove(body)
-            gone |= own
-            flying.append(body.get("name", ""))
-    for body in world.iter("body"):
-        for joint in [*body.findall("joint"), *body.findall("freejoint")]:
+    parts = [part for part in world.iter() if part.tag in ("worldbody", "body", "frame")]
+    for part in parts:
+        for body in part.findall("body"):
+            own = {(inner.tag, inner.get("name", "")) for inner in body.iter()}
+            flies = (
+                body.find("freejoint") is not None or body.find("joint[@type='free']") is not None
+            )
+            if not own & moving and (flies or "mocap" in body.attrib):
+                part.remove(body)
+                gone |= own
+                flying.append(body.get("name", ""))
+        for joint in [*part.findall("joint"), *part.findall("freejoint")]:
             if ("joint", joint.get("name", "")) not in moving:
-                body.remove(joint)
+                part.remove(joint)
                 gone.add(("joint", joint.get("name", "")))
     for keys in root.findall("keyframe"):
         root.remove(keys)
-    sections = [*world.iter("body"), world]
-    sections += [section for tag in REFERRING for section in root.findall(tag)]
-    for section in sections:
-        for element in list(section):
-            named = [*element.items(), *(item for inner in element for item in inner.items())]
-            is_frame = section.tag.endswith("body") and element.tag not in ("light", "camera")
-            if not is_frame and {(KINDS.get(key, key), value) for key, value in named} & gone:
-                section.remove(element)
-                gone.add((section.tag, element.get("name", "")))
+    sections = [section for section in root if section.tag in REFERRING]
+    # What refers to an element that is taken out may be referred to itself.
+    while dropped := [
+        (section, element)
+        for section in parts + sections
+        for element in section
+        if (section in sections or element.tag in ("camera", "light")) and _refers(element, gone)
+    ]:
+        for section, element in dropped:
+            section.remove(element)
+            is_mixed = section in parts or section.tag in ("custom", "deformable")
+            gone.add((element.tag if is_mixed else section.tag, element.get("name", "")))
     tree.write(path)
     return flying
+
+
+def _refers(element: ElementTree.Element, gone: set[tuple[str, str]]) -> bool:
+    """Return whether an element, or one in it, refers to one that is gone."""
+    for inner in element.iter():
+        for key, value in inner.items():
+            is_typed = key in ("objname", "refname")
+            kind = (inner.get(f"{key[:3]}type", "") if is_typed else key).rstrip("12")
+            names = value.split() if inner.tag == "flex" else [value]
+            if any((KINDS.get(kind, kind), name) in gone for name in names):
+                return True
+    return False
 
 
 def _longest(
