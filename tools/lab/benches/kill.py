@@ -145,8 +145,7 @@ class Killing:
     def _braked_ns(self, run: KilledRun, braked: Event) -> int:
         """Return when the brakes engaged, CLOCK_MONOTONIC, ns.
 
-        A servo level that was away reports them late, with the tick at which the arm itself engaged
-        waited long enough.
+        A servo level that was away reports them late, with the tick at which they did so.
         """
         if not braked.value:
             return braked.time_ns - run.offset_ns
