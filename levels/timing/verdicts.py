@@ -194,7 +194,7 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
 
 def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
     for task in rack.responses:
-        response_ns = task.response_ns
+        response_ns: float | None = task.response_ns
         endless = ""
         if response_ns is None:
             response_ns = inf
