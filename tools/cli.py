@@ -195,7 +195,7 @@ def _open_closed_streams() -> None:
     # The lowest free descriptor is that of the first closed stream.
     if sys.stdin is None:
         os.open(os.devnull, os.O_RDONLY)
-        sys.stdin = ClosedInput()  # type: ignore[assignment]
+        sys.stdin = ClosedInput()
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))

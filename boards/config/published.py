@@ -76,7 +76,8 @@ class PublishedLevel:
         """A table that checks the values of live parameters."""
         fields: dict[str, Any] = dict.fromkeys(self.keys, (Any, None))
         for key, param in self.live.items():
-            declared = Field(None, description=param.meaning, **param.constraints)
+            constraints: Any = param.constraints
+            declared = Field(None, description=param.meaning, **constraints)
             fields[key] = (TYPES.get(param.kind, Any), declared)
         return create_model("Params", __base__=Table, **fields)
 
