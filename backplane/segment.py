@@ -23,6 +23,7 @@ import posix_ipc
 from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
 from rack.backplane.byte_lock import ProcessLock, await_unlocked, is_locked
 from rack.backplane.errors import SegmentError
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import (
     ExchangeSpec,
     FieldSpec,
@@ -103,7 +104,7 @@ class Segment:
         if (machine := os.uname().machine) != PROCESSOR:
             why = f"the backplane's memory order is argued for {PROCESSOR} alone"
             raise SegmentError(f"rack '{layout.rack}': the processor here is {machine}; {why}")
-        texts = [json.dumps(asdict(layout)).encode(), config.encode(), published.encode()]
+        texts = [encode_json(asdict(layout)).encode(), config.encode(), published.encode()]
         places = AddressMap(layout)
         size = pages(places.size + sum(len(t) for t in texts))
         try:

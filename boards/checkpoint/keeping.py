@@ -8,7 +8,6 @@ the board is back: a process that is not there has no state.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from threading import Thread
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
@@ -111,7 +111,7 @@ class TaskKeeper(Keeper):
 
     def _save(self, parts: Parts) -> None:
         if self._level is not None:
-            attributes = json.dumps(Attributes(parts).of(self._level))
+            attributes = encode_json(Attributes(parts).of(self._level))
             self._path.with_suffix(ATTRIBUTES).write_text(attributes)
         self._path.write_bytes(bytes.fromhex(parts.shape) + parts.save())
 

@@ -12,7 +12,6 @@ list the others in `connect`, and let the firewall admit their addresses alone.
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple, Protocol, Self
 
 import zenoh
 
+from rack.backplane.json_text import encode_json
 from rack.boards.lan.access import access_control
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.credentials import OTHERS, Credential, Credentials
@@ -255,7 +255,7 @@ def _settings(
         settings["transport/link/tls"] = _tls(credentials)
     config = zenoh.Config()
     for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+        config.insert_json5(key, encode_json(value))
     return config
 
 

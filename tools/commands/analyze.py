@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rack.tools.console.answer import print_json
+from rack.tools.console.answer import print_json, write_json
 from rack.tools.console.parameters import Json, RunFolder
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
@@ -82,7 +81,7 @@ def analyze(
     found = document(analysis)
     progress(0.9)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "analysis.json").write_text(json.dumps(found, indent=2) + "\n")
+    write_json(folder / "analysis.json", found)
     files = f"{folder}/analysis.json, residuals.png, residuals.svg"
     if can_draw():
         from rack.tools.timing.analysis.residuals import plot

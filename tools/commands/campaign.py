@@ -3,7 +3,6 @@ recovery."""
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.answer import Failure, print_json, write_json
 from rack.tools.console.parameters import ConfigName, Json, Settings
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 
@@ -200,7 +199,7 @@ def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, o
     report = CampaignReport(work, results, wall_s)
     document = report.document()
     text = report.markdown()
-    (work.folder / "campaign.json").write_text(json.dumps(document, indent=2) + "\n")
+    write_json(work.folder / "campaign.json", document)
     (work.folder / "campaign.md").write_text(text)
     # An interrupted campaign has no time for it.
     if not results.is_interrupted and can_draw():

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Annotated
 
 import typer
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
@@ -82,7 +82,7 @@ def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
             found = [*messages.new()]
             if as_json:
                 for document in found:
-                    print(json.dumps(document), flush=True)
+                    print(encode_json(document), flush=True)
             elif live is not None and found:
                 live.update(Text("\n".join(messages.lines(found[-1]))), refresh=True)
             elif found:

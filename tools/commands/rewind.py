@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import cmd
-import json
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rack.backplane.json_text import encode_json
 from rack.boards.errors import one_line
 from rack.levels.tables import LAST_TICK
 from rack.tools.console.answer import MAX_LINE, Failure, as_failure
@@ -115,11 +115,11 @@ class RewindPrompt(cmd.Cmd):
     def _fail(self, why: str) -> None:
         self.failed += 1
         text = one_line(why, MAX_LINE)
-        print(json.dumps({"error": text}) if self._as_json else text, flush=True)
+        print(encode_json({"error": text}) if self._as_json else text, flush=True)
 
     def _answer(self, found: Glance) -> None:
         if self._as_json:
-            print(json.dumps(found.document), flush=True)
+            print(encode_json(found.document), flush=True)
         else:
             print(*found.lines, sep="\n", flush=True)
 

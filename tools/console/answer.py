@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NoReturn
 
+from rack.backplane.json_text import encode_json
 from rack.boards.errors import one_line
 
 Document = dict[str, Any]
@@ -48,9 +49,22 @@ def as_failure() -> Iterator[None]:
         raise Failure(str(error), status) from None
 
 
+def write_file(path: Path, text: str) -> None:
+    """Write a file of an answer; whatever has its name is replaced, never opened."""
+    unfinished = path.with_name(f"{path.name}.unfinished")
+    unfinished.unlink(missing_ok=True)
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write a document as a file, as `write_file` does."""
+    write_file(path, encode_json(document, indent=2) + "\n")
+
+
 def print_json(document: Any) -> None:
     """Print the answer to --json."""
-    print(json.dumps(document, indent=2))
+    print(encode_json(document, indent=2))
 
 
 def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> None:

@@ -3,13 +3,13 @@ missed, and no board is held up."""
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.tools.recording.signal import Signal
@@ -126,7 +126,7 @@ class Lines:
         if self._as_json:
             names = [signal.name for signal in self._strip.signals]
             line = {"time_s": time_s, "tick": tick, **dict(zip(names, values, strict=True))}
-            print(json.dumps(line), flush=True)
+            print(encode_json(line), flush=True)
         else:
             print(f"{time_s:10.4f}", *map(cell, values), sep="  ", flush=True)
 

@@ -7,7 +7,6 @@ by core. A core that runs at a lower frequency computes longer; cpufreq shows it
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Iterator
@@ -17,6 +16,8 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 from pydantic import TypeAdapter
+
+from rack.backplane.json_text import encode_json
 
 STAT = Path("/proc/stat")
 CPUINFO = Path("/proc/cpuinfo")
@@ -52,7 +53,7 @@ class CoreRecord:
 
     def text(self) -> str:
         """Return it as JSON."""
-        return json.dumps(asdict(self))
+        return encode_json(asdict(self))
 
     @classmethod
     def of(cls, text: str | bytes) -> Self:

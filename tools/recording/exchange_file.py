@@ -7,7 +7,6 @@ clock when it was written. Events are a channel of their own.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from heapq import merge
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import NamedTuple
 
 from mcap.writer import Writer
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import MailboxSpec
 from rack.tools.console.answer import Document
 from rack.tools.recording.parquet import CONFIG
@@ -69,7 +69,7 @@ def export(recording: Recording, path: Path, show: Callable[[float], None]) -> i
 
 
 def _channel(writer: Writer, topic: str, message: str, schema: Document) -> int:
-    made = writer.register_schema(message, ENCODING, json.dumps(schema).encode())
+    made = writer.register_schema(message, ENCODING, encode_json(schema).encode())
     return writer.register_channel(topic, "json", made)
 
 
@@ -110,7 +110,7 @@ def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[C
             zip(*columns, strict=True), block["stamp_ns"].tolist(), strict=True
         ):
             serial, tick = values[:2]
-            data = json.dumps(dict(zip(names, values, strict=True))).encode()
+            data = encode_json(dict(zip(names, values, strict=True))).encode()
             sequence = serial & 0xFFFFFFFF
             yield ChannelMessage(tick * clock_ns, channel, sequence, stamp_ns + wall_ns, data)
 
@@ -119,5 +119,5 @@ def _events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
     ticked = [event for event in recording.events if event.get("tick", -1) >= 0]
     clock_ns = recording.layout.clock_ns
     for number, event in enumerate(ticked):
-        data = json.dumps(event).encode()
+        data = encode_json(event).encode()
         yield ChannelMessage(event["tick"] * clock_ns, channel, number, event["time_ns"], data)

@@ -3,7 +3,6 @@ its threads."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from contextlib import suppress
 from math import inf
 from pathlib import Path
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.process import STOPPED, processor_ns, readable, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -99,7 +99,7 @@ class RecorderProcess:
 
         With the `words` of a rack in lockstep, that waits for it, in any case.
         """
-        self._request = json.dumps([rack, str(folder), port]).encode() + b"\n"
+        self._request = encode_json([rack, str(folder), port]).encode() + b"\n"
         self._words = words
         self._ask()
         return self.await_begun(ATTACH_S)

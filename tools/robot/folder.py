@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from rack.backplane.json_text import encode_json
 from rack.levels.tables import Table
 from rack.tools.robot.assignment import Assignment
 from rack.tools.robot.draft import Draft
@@ -55,7 +55,7 @@ def _lines(made: Draft, layout: Assignment, name: str) -> Iterator[str]:
 def _keys(table: Mapping[str, Any], guessed: Mapping[str, str]) -> Iterator[str]:
     # Of numbers, texts and lists JSON is TOML.
     for key, value in table.items():
-        yield f"{key} = {json.dumps(value)}" + _comment(guessed.get(key))
+        yield f"{key} = {encode_json(value)}" + _comment(guessed.get(key))
 
 
 def _comment(guess: str | None) -> str:

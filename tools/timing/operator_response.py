@@ -7,7 +7,6 @@ operator command that it rests on.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
 from rack.levels.timing.command_path import CommandPath, command_paths
-from rack.tools.console.answer import Document, Failure, print_json
+from rack.tools.console.answer import Document, Failure, print_json, write_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
 from rack.tools.console.tables import decimal, fitted, print_wrapped
 from rack.tools.recording.recording import Recording
@@ -281,7 +280,7 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
         )
     folder.mkdir(parents=True, exist_ok=True)
     document = response.document()
-    (folder / "response.json").write_text(json.dumps(document, indent=2) + "\n")
+    write_json(folder / "response.json", document)
     files = f"{folder}/response.json"
     if can_draw():
         files += "".join(f", {path.name}" for path in plot(response, folder))

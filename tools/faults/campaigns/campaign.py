@@ -11,10 +11,11 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout
 from rack.boards.config import wire
 from rack.boards.config.schema import RackConfig
-from rack.tools.console.answer import Document, Failure
+from rack.tools.console.answer import Document, Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
 from rack.tools.faults.campaigns.base import BaseRun
@@ -122,7 +123,7 @@ class Campaign:
     def _open(self) -> None:
         """Make the folder, or continue in it. Raises `Failure` where it is another campaign's."""
         path = self.folder / ORDER
-        wanted = json.loads(json.dumps(self.order.document()))
+        wanted = json.loads(encode_json(self.order.document()))
         if path.exists():
             there = json.loads(path.read_text())
             if other := [key for key in wanted if wanted[key] != there.get(key)]:
@@ -132,7 +133,7 @@ class Campaign:
                 )
             return
         self.folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(wanted, indent=2) + "\n")
+        write_json(path, wanted)
 
     def _under_test(self, lockstep: bool) -> RackUnderTest:
         restart = restart_s(self._config, lockstep)

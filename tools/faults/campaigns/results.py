@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from rack.boards.events import Event
 from rack.boards.faults.kind import KINDS
-from rack.tools.console.answer import Document
+from rack.tools.console.answer import Document, write_json
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.statistics import EventRate, rate
 from rack.tools.faults.campaigns.trial import Trial
@@ -88,9 +88,7 @@ def keep(trial: Trial, path: Path) -> None:
         "events": [asdict(event) for event in trial.events],
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_suffix(".unfinished")
-    unfinished.write_text(json.dumps(document) + "\n")
-    unfinished.replace(path)
+    write_json(path, document)
 
 
 _KEPT = TypeAdapter(TrialResult)

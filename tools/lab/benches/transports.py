@@ -10,7 +10,6 @@ removed as soon as both ends are open, so that nothing is left even if the proce
 from __future__ import annotations
 
 import ctypes
-import json
 import mmap
 import multiprocessing
 import os
@@ -24,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.message import Message
 from rack.backplane.segment import SHM_FOLDER
 from rack.tools.console.answer import Failure
@@ -203,7 +203,7 @@ def _zenoh(listen: str, connect: str) -> Any:
         config.insert_json5(f"{key}/enabled", "false")
     for key, place in (("listen", listen), ("connect", connect)):
         places = [place] if place else []
-        config.insert_json5(f"{key}/endpoints", json.dumps(places))
+        config.insert_json5(f"{key}/endpoints", encode_json(places))
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

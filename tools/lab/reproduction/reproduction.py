@@ -3,12 +3,12 @@ page."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rack.backplane.errors import BackplaneError
+from rack.backplane.json_text import encode_json
 from rack.boards.errors import BoardError
 from rack.levels.errors import LevelError
 from rack.tools.console.answer import Failure
@@ -111,7 +111,7 @@ def write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
     documents = {
         HTML: html(page, workshop.folder),
         MARKDOWN: markdown(page),
-        DATA: json.dumps(page.document(), indent=2) + "\n",
+        DATA: encode_json(page.document(), indent=2) + "\n",
     }
     for name, document in documents.items():
         (workshop.folder / name).write_text(document, encoding="utf-8")

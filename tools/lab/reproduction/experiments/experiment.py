@@ -29,7 +29,7 @@ from rack.backplane.segment import racks
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.clean import remove_dead
-from rack.tools.console.answer import Failure
+from rack.tools.console.answer import Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.lab.benches.cyclictest import permits_fifo
 from rack.tools.lab.benches.observed import UNVIEWED, Recorded, record
@@ -180,11 +180,7 @@ def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
         found, round(time.monotonic() - started, 1), time.strftime("%Y-%m-%d %H:%M:%S"), lacking
     )
     path = workshop.folder / KEPT / f"{experiment.name}.json"
-    part = path.with_suffix(".part")
-    part.write_text(
-        json.dumps({"depends": basis, **vars(result)}, indent=1) + "\n", encoding="utf-8"
-    )
-    part.replace(path)
+    write_json(path, {"depends": basis, **vars(result)})
     return result
 
 

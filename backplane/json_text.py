@@ -1,0 +1,26 @@
+"""Strict JSON: the one place of the project that encodes it.
+
+JSON has no NaN and no infinity, and programs that read JSON refuse a file that holds one.
+"""
+
+from __future__ import annotations
+
+import json
+from math import isfinite
+from typing import Any
+
+
+def encode_json(document: Any, indent: int | None = None) -> str:
+    """Return plain data as JSON, with null in place of every number that is not finite."""
+    try:
+        return json.dumps(document, indent=indent, allow_nan=False)
+    except ValueError:
+        return json.dumps(_replace_infinite(document), indent=indent, allow_nan=False)
+
+
+def _replace_infinite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _replace_infinite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_replace_infinite(inner) for inner in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
