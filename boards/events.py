@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -147,13 +147,13 @@ class Outcome:
         return not self.faults and self.cause in ("task done", "time over")
 
 
-def in_order(entries: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the entries of an event log by tick, and of a tick as they became known.
+def order_key(entry: Mapping[str, Any]) -> float:
+    """Return the place of an entry in an event log: its tick.
 
-    Some are known late: a board that drives an arm tells, once it is back, when the brakes engaged.
-    Entries without a tick, such as the outcome, come last.
+    Some events are known late: a board that drives an arm tells, once it is back, when the brakes
+    engaged. Entries without a tick, such as the outcome, come last.
     """
-    return sorted(entries, key=lambda entry: float(entry.get("tick", math.inf)))
+    return float(entry.get("tick", math.inf))
 
 
 class Journal:

@@ -145,6 +145,19 @@ def test_no_file_grows_beyond_what_one_can_read() -> None:
 
 
 @pytest.mark.slow
+def test_json_is_encoded_in_one_file() -> None:
+    """Python's own encoder writes NaN, which is no JSON."""
+    encoding = {
+        str(path.relative_to(ROOT))
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if (isinstance(node, ast.Attribute) and ast.unparse(node) in ("json.dump", "json.dumps"))
+        or (isinstance(node, ast.ImportFrom) and node.module in ("json", "orjson", "simplejson"))
+    }
+    assert encoding == {"backplane/json_text.py"}
+
+
+@pytest.mark.slow
 def test_no_two_classes_share_a_name() -> None:
     places = defaultdict(list)
     for path in SOURCES:

@@ -14,7 +14,9 @@ from dataclasses import asdict, dataclass
 from hashlib import blake2b
 from pathlib import Path
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout
+from rack.backplane.regular_file import read_regular_file
 from rack.backplane.segment import VERSION as SEGMENT_VERSION
 from rack.boards.errors import CheckpointError
 
@@ -27,6 +29,8 @@ ATTRIBUTES = ".attributes"
 """Suffix of the file, next to a checkpoint, with the attributes of a task's level as JSON."""
 _HEAD = struct.Struct("<8sIII")
 """Magic, version, size of the head as JSON, and CRC of that size and all that follows."""
+MOST_BYTES = 1 << 32
+"""Largest checkpoint that is read."""
 _OF_MACHINE = ("core", "priority", "slot")
 """Properties of a task that depend on the machine and on its other racks."""
 
@@ -62,7 +66,7 @@ class Checkpoint:
             "parts": {name: part.shape for name, part in self.parts.items()},
             "sizes": [len(blob) for blob in blobs],
         }
-        text = json.dumps(head).encode()
+        text = encode_json(head).encode()
         body = b"".join((text, *blobs))
         path = folder / NAME.format(self.tick)
         unfinished = path.with_suffix(".unfinished")
@@ -77,7 +81,7 @@ def read(path: Path) -> Checkpoint:
     """Return the checkpoint in a file. Raises `CheckpointError` for one of another version, or that
     was cut off or changed."""
     try:
-        content = path.read_bytes()
+        content = read_regular_file(path, MOST_BYTES)
     except OSError as error:
         raise CheckpointError(f"{path}: {error.strerror}") from None
     if len(content) < _HEAD.size or not content.startswith(MAGIC):
@@ -114,7 +118,7 @@ def layout_hash(layout: Layout) -> str:
         {key: value for key, value in asdict(task).items() if key not in _OF_MACHINE}
         for task in layout.tasks
     ]
-    return blake2b(json.dumps(found).encode(), digest_size=16).hexdigest()
+    return blake2b(encode_json(found).encode(), digest_size=16).hexdigest()
 
 
 def checkpoints(run: Path) -> dict[int, Path]:

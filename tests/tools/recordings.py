@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,9 +11,11 @@ import numpy as np
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
+from rack.tools.recording.checksums import Checksums, checked_line
 from rack.tools.recording.cores import UNMEASURED
 from rack.tools.recording.parquet import CyclesFile, SignalTables
 from rack.tools.recording.recording import Recording
+from rack.tools.recording.run_files import TABLES
 
 MS, US = 1_000_000, 1_000
 EPOCH_NS = 5_000_000_123
@@ -66,7 +67,7 @@ def recorded(
     return it."""
     folder.mkdir(exist_ok=True)
     (folder / "config.toml").write_text(config.text())
-    (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events))
+    (folder / "events.jsonl").write_text("".join(checked_line({**event}) for event in events))
     layout = wire(config)
     cycles = CyclesFile(folder / "cycles.parquet", layout, Launch(EPOCH_NS, EPOCH_NS))
     signals = SignalTables(folder / "signals", layout)
@@ -77,4 +78,5 @@ def recorded(
         signals.add(mailbox, rows)
     cycles.close({}, UNMEASURED, (), ())
     signals.close()
+    Checksums(folder).store("config.toml", *TABLES)
     return Recording(folder)

@@ -13,6 +13,7 @@ import typer
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import reading_progress
+from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.divergence import other_run
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
@@ -96,10 +97,14 @@ def replay(runs: Runs, out: Out = None, against: Against = None) -> None:
 
 
 def _own(run: Path) -> list[Path]:
-    """Return the viewer's files of a run: a long one has several, as has a restarted recorder."""
-    if run.suffix == ".rrd":
-        return [run] if run.is_file() else []
-    return parts_of(run / FILE)
+    """Return the viewer's files of a run: a long one has several, as has a restarted recorder.
+    Raises `Failure` for a damaged one."""
+    is_file = run.suffix == ".rrd"
+    checksums = Checksums(run.parent if is_file else run)
+    found = [run] if is_file and run.is_file() else parts_of(run / FILE)
+    # A recorder that was killed has left one without a checksum.
+    checksums.verify(*{part.name for part in found} & {*(checksums.stored or ())})
+    return found
 
 
 def _parts(run: Path) -> list[Path]:

@@ -10,9 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TextIO
 
-from rack.boards.events import Event, in_order
+from rack.boards.events import Event, order_key
 from rack.tools.console.answer import Document, Failure
 from rack.tools.live.display import Display
+from rack.tools.recording.checksums import checked_line
 
 RUNS = Path("runs")
 
@@ -38,13 +39,16 @@ class EventLog:
     launched.
 
     A write that fails, on a full disk, is reported once and does not end the run.
+
+    Attributes:
+        has_failed: Whether an event could not be written.
     """
 
     def __init__(self, display: Display) -> None:
         self._display = display
         self._waiting: list[str] = []
         self._file: TextIO | None = None
-        self._has_failed = False
+        self.has_failed = False
 
     def add(self, event: Event) -> None:
         """Show and write an event."""
@@ -64,7 +68,7 @@ class EventLog:
         they became known."""
         self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
-        if self._file is not None and not self._has_failed:
+        if self._file is not None and not self.has_failed:
             self._put_in_order(Path(self._file.name))
 
     def close(self) -> None:
@@ -76,18 +80,18 @@ class EventLog:
 
     def _put_in_order(self, path: Path) -> None:
         """Sort the lines of the file; where there is no room for that, they stay as they are."""
-        entries = [json.loads(line) for line in path.read_text().splitlines()]
-        ordered = in_order(entries)
-        if ordered == entries:
+        lines = path.read_text().splitlines(keepends=True)
+        ordered = sorted(lines, key=lambda line: order_key(json.loads(line)))
+        if ordered == lines:
             return
         draft = path.with_suffix(".part")
         with suppress(OSError):
-            draft.write_text("".join(f"{json.dumps(entry)}\n" for entry in ordered))
+            draft.write_text("".join(ordered))
             draft.replace(path)
         draft.unlink(missing_ok=True)
 
     def _write(self, entry: Document) -> None:
-        line = json.dumps(entry) + "\n"
+        line = checked_line(entry)
         if self._file is None:
             self._waiting.append(line)
         else:
@@ -95,9 +99,9 @@ class EventLog:
 
     def _put(self, text: str) -> None:
         try:
-            if self._file is not None and not self._has_failed:
+            if self._file is not None and not self.has_failed:
                 self._file.write(text)
         except OSError as error:
-            self._has_failed = True
+            self.has_failed = True
             lost = f"events.jsonl ends here: {error.strerror}"
             self._display.show_event(Event(time.time_ns(), -1, "recorder", "", lost))

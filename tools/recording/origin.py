@@ -11,8 +11,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
+from rack.backplane.json_text import encode_json
 from rack.boards.events import CONTINUES
 from rack.tools.console.answer import Document, Failure
+from rack.tools.recording.checksums import read_file
 from rack.tools.recording.recorder_process import ORIGIN
 
 if TYPE_CHECKING:
@@ -45,10 +47,11 @@ class Origin:
         if not path.exists():
             tick = continued_at(recording)
             return None if tick is None else cls(None, tick, None)
+        recording.checksums.verify(ORIGIN)
         try:
-            found = json.loads(path.read_bytes())
+            found = json.loads(read_file(path))
             return cls(str(found["folder"]), int(found["tick"]), found["launched_ns"])
-        except (OSError, ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError) as error:
             raise Failure(f"{path}: not the origin of a run: {error!r}", 2) from None
 
     def is_of(self, run: Recording) -> bool:
@@ -57,7 +60,7 @@ class Origin:
 
     def write(self, folder: Path) -> None:
         """Write it into the folder of the later run. Raises `OSError`."""
-        (folder / ORIGIN).write_text(json.dumps(asdict(self)) + "\n")
+        (folder / ORIGIN).write_text(encode_json(asdict(self)) + "\n")
 
     def document(self, clock_ns: int) -> Document:
         """Return it as plain data, with its simulated time, s."""

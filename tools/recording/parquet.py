@@ -1,8 +1,7 @@
 """The parquet tables of a run.
 
 cycles.parquet is the trace: one row a cycle of a task, the same columns for all tasks. Its metadata
-hold the layout, when the rack was launched, and the checksum of the config.toml next to it: a
-config that is cut off at the end of a table is a valid config.
+hold the layout, and when the rack was launched.
 
 signals/ has a table for each mailbox that tasks and clock write, one row a message. Each is a
 folder, which parquet's readers take for one table: a long run has many parts.
@@ -10,7 +9,6 @@ folder, which parquet's readers take for one table: a long run has many parts.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import prod
@@ -20,8 +18,8 @@ from shutil import rmtree
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from xxhash import xxh3_64_hexdigest
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.backplane.segment import Launch
 from rack.backplane.trace import FIELDS
@@ -47,12 +45,6 @@ PART_ENTRIES = 1 << 12
 """Entries after which a part is finished: until then they are in memory, 0.7 kB each."""
 
 
-def config_check(folder: Path) -> str:
-    """Return the checksum of a run's config.toml; empty where there is none."""
-    path = folder / CONFIG
-    return xxh3_64_hexdigest(path.read_bytes()) if path.is_file() else ""
-
-
 class CyclesFile:
     """cycles.parquet, being written."""
 
@@ -60,13 +52,16 @@ class CyclesFile:
         self._waiting: list[tuple[str, np.ndarray]] = []
         self._rows = 0
         metadata = {
-            "layout": json.dumps(asdict(layout)),
-            "config": config_check(path.parent),
-            "launch": json.dumps(launch),
+            "layout": encode_json(asdict(layout)),
+            "launch": encode_json(launch),
         }
         self._schema = pa.schema(TRACE_FIELDS, metadata=metadata)
         self._writer = pq.ParquetWriter(
-            path, self._schema, compression="zstd", use_dictionary=["task"]
+            path,
+            self._schema,
+            compression="zstd",
+            use_dictionary=["task"],
+            write_page_checksum=True,
         )
 
     def add(self, task: str, rows: np.ndarray) -> None:
@@ -102,10 +97,10 @@ class CyclesFile:
         did to its cores, the gaps, and the ticks of the stretches that a flight recorder kept."""
         self._flush()
         metadata = {
-            "lost": json.dumps(lost),
+            "lost": encode_json(lost),
             "cores": cores.text(),
-            "gaps": json.dumps(gaps),
-            "kept": json.dumps(kept),
+            "gaps": encode_json(gaps),
+            "kept": encode_json(kept),
         }
         self._writer.add_key_value_metadata(metadata)
         self._writer.close()
@@ -158,6 +153,7 @@ class _SignalTable:
             compression="zstd",
             use_dictionary=[column.label for column in self._columns if column.kind[1] == "S"],
             write_statistics=["tick"],
+            write_page_checksum=True,
         )
 
     def add(self, rows: np.ndarray) -> None:
@@ -219,7 +215,7 @@ class Column:
         element = pa.string() if self.kind[1] == "S" else pa.from_numpy_dtype(np.dtype(self.kind))
         arrow = pa.list_(element, prod(self.shape)) if self.shape else element
         return pa.field(
-            self.label, arrow, metadata={"shape": json.dumps(self.shape), "unit": self.unit}
+            self.label, arrow, metadata={"shape": encode_json(self.shape), "unit": self.unit}
         )
 
     def of(self, messages: np.ndarray) -> np.ndarray:

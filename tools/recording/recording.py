@@ -24,8 +24,9 @@ from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, read_stored
 from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError
-from rack.boards.events import Event, in_order
+from rack.boards.events import Event, order_key
 from rack.tools.console.answer import Document, Failure
+from rack.tools.recording.checksums import Checksums, is_cut_off, read_file, read_line
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import (
     CONFIG,
@@ -35,9 +36,8 @@ from rack.tools.recording.parquet import (
     SIGNALS,
     TABLE,
     columns_of,
-    config_check,
 )
-from rack.tools.recording.run_files import Missing, mend
+from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, mend
 from rack.tools.recording.spool import STRETCHES, rings
 
 
@@ -74,8 +74,7 @@ class Recording:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.config = self._text(CONFIG)
-        """The resolved config, as TOML text."""
+        self._there(CONFIG)
         with _naming(folder):
             is_flight = (folder / STRETCHES).is_dir()
             if mend(folder) and not is_flight:
@@ -83,22 +82,25 @@ class Recording:
                     f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and"
                     " signals"
                 )
-        path = self._there("cycles.parquet")
-        self._cycles = _opened(path, ("task", "tick"))
+        self.checksums = Checksums(folder)
+        if self.checksums.stored is None:
+            _note(f"{folder}: recorded by an earlier version: it cannot be checked for damage")
+        self.checksums.verify(CONFIG)
+        self.config = self._text(CONFIG)
+        """The resolved config, as TOML text."""
+        path = self._there(CYCLES)
+        self._cycles = self._opened(path, ("task", "tick"))
         if (folder / "signals.parquet").exists():
             why = "recorded by an earlier version, its signals in one table"
             raise Failure(f"{folder}: {why}, signals.parquet; run the rack again", 2)
         with _naming(path):
             self._metadata = self._cycles.metadata.metadata
-            recorded = self._metadata[b"config"].decode()
             self.layout = layout_of(json.loads(self._metadata[b"layout"]))
             """The rack's layout."""
-        if recorded != config_check(folder):
-            raise Failure(
-                f"{folder / CONFIG}: not the config of this run: it was cut off or changed later", 2
-            )
         self._columns = {box.name: columns_of(box) for box in self.layout.mailboxes}
         self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
+        self.events = self._read_events()
+        """The events of the run by tick, then its outcome."""
 
     @cached_property
     def rack_config(self) -> RackConfig:
@@ -114,6 +116,7 @@ class Recording:
         `Failure`."""
         path = self.folder / PUBLISHED
         if path.exists():
+            self.checksums.verify(PUBLISHED)
             with _naming(path):
                 PublishedRack.read(self._text(PUBLISHED))
 
@@ -123,40 +126,51 @@ class Recording:
         with _naming(path):
             count = max(len([*path.iterdir()]), 1)
         parts = [path / PART.format(number) for number in range(1, count + 1)]
-        if absent := [part.name for part in parts if not part.is_file()]:
+        if absent := [part.name for part in parts if not part.exists()]:
             raise Failure(f"{path}: {absent[0]} is missing", 2)
         names = (*HEAD, *(column.label for column in self._columns[mailbox]))
-        return [_opened(part, names) for part in parts]
+        return [self._opened(part, names) for part in parts]
+
+    def _opened(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
+        """Return an undamaged parquet file that has these columns. Raises `Failure`."""
+        self.checksums.verify(str(path.relative_to(self.folder)))
+        with _naming(path):
+            file = pq.ParquetFile(path, page_checksum_verification=True)
+        names = file.schema_arrow.names
+        if absent := [column for column in columns if column not in names]:
+            raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
+        return file
 
     def _text(self, name: str) -> str:
         path = self._there(name)
         try:
-            return path.read_text(encoding="utf-8")
+            return read_file(path).decode()
         except UnicodeDecodeError as error:
             raise Failure(
                 f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2
             ) from None
-        except OSError as error:
-            raise Failure(f"{path}: {error.strerror}", 2) from None
 
     def _there(self, name: str) -> Path:
         if not (self.folder / name).exists():
             raise Failure(f"{self.folder}: not a run: it has no {name}", 2)
         return self.folder / name
 
-    @cached_property
-    def events(self) -> list[Document]:
-        """The events of the run by tick, then its outcome. Raises `Failure` when a line is not an
-        event."""
-        path = self.folder / "events.jsonl"
-        if not path.is_file():
+    def _read_events(self) -> list[Document]:
+        path = self.folder / EVENTS
+        if not path.exists():
             return []
-        *lines, last = self._text(path.name).split("\n")
-        found = [_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1)]
-        if last:
+        *lines, last = self._text(EVENTS).split("\n")
+        if last and is_cut_off(last):
             # A run that was killed leaves half a line.
             _note(f"{path}: line {len(lines) + 1} is cut off, and left out")
-        return in_order(found)
+        elif last:
+            lines.append(last)
+        is_checked = self.checksums.stored is not None
+        found = (
+            _event(line, is_checked, f"{path}: line {number}")
+            for number, line in enumerate(lines, 1)
+        )
+        return sorted(found, key=order_key)
 
     @cached_property
     def ended(self) -> Document:
@@ -186,14 +200,14 @@ class Recording:
 
     @cached_property
     def _lost_before_the_end(self) -> dict[str, int]:
-        with _naming(self.folder / "cycles.parquet"):
+        with _naming(self.folder / CYCLES):
             return dict(json.loads(self._metadata[b"lost"]))
 
     @cached_property
     def kept(self) -> list[tuple[int, int]]:
         """The ticks of the stretches that a flight recorder kept, [first, end); none if it removed
         nothing."""
-        with _naming(self.folder / "cycles.parquet"):
+        with _naming(self.folder / CYCLES):
             found = [tuple(ends) for ends in json.loads(self._metadata.get(b"kept", b"[]"))]
         return [] if len(found) == 1 and found[0][0] == 0 else found
 
@@ -224,7 +238,7 @@ class Recording:
         """
         lost = self.lost if lost is None else lost
         ticks = self.ended.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
-        with _naming(self.folder / "cycles.parquet"):
+        with _naming(self.folder / CYCLES):
             found = json.loads(self._metadata.get(b"gaps", b"[]"))
         for name, count in lost.items():
             if count > self._lost_before_the_end.get(name, 0):
@@ -279,7 +293,7 @@ class Recording:
     def cores(self) -> CoreRecord:
         """What the machine did to its cores; empty if the recorder did not measure it, or was
         killed."""
-        with _naming(self.folder / "cycles.parquet"):
+        with _naming(self.folder / CYCLES):
             text = self._metadata.get(b"cores")
             return UNMEASURED if text is None else CoreRecord.of(text)
 
@@ -296,7 +310,7 @@ class Recording:
     def cycles(self) -> dict[str, np.ndarray]:
         """The trace by task: structured rows, oldest first, with the fields of
         `rack.backplane.trace.RECORD`."""
-        with _naming(self.folder / "cycles.parquet"):
+        with _naming(self.folder / CYCLES):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
             # 0 in columns that an earlier version did not record.
@@ -375,16 +389,6 @@ class Recording:
         return [name for name, parts in tables if any(part.metadata.num_rows for part in parts)]
 
 
-def _opened(path: Path, columns: Iterable[str]) -> pq.ParquetFile:
-    """Return a parquet file that has these columns. Raises `Failure`."""
-    with _naming(path):
-        file = pq.ParquetFile(path)
-    names = file.schema_arrow.names
-    if absent := [column for column in columns if column not in names]:
-        raise Failure(f"{path}: not a recording of a rack: it has no column '{absent[0]}'", 2)
-    return file
-
-
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
     """Turn an error of reading into a `Failure` that names the file."""
@@ -396,10 +400,11 @@ def _naming(path: Path) -> Iterator[None]:
         ) from None
 
 
-def _event(line: str, place: str) -> Document:
-    """Return an event from its line. Raises `Failure`."""
+def _event(line: str, is_checked: bool, place: str) -> Document:
+    """Return an event from its line, as `read_line` does. Raises `Failure`, which names the
+    place."""
     try:
-        event = json.loads(line)
+        event = read_line(line, is_checked)
         if event["kind"] == "outcome":
             {**event["outcome"], **event["tasks"]}
         else:

@@ -15,6 +15,7 @@ from rack.backplane.layout import Layout
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Launch, Segment
 from rack.tools.console.answer import Failure
+from rack.tools.recording.checksums import CHECKSUMS, Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import CONFIG, PUBLISHED, SIGNALS, CyclesFile, SignalTables
 from rack.tools.recording.recorder_process import LOOK_S, ORIGIN, SPOOL
@@ -32,6 +33,8 @@ from rack.tools.recording.spool import (
 )
 
 CYCLES = "cycles.parquet"
+TABLES = (CYCLES, f"{SIGNALS}/*/*")
+"""Patterns of the files that hold rows."""
 EVENTS = "events.jsonl"
 MENDED = "-mended"
 FINISH_S = 20.0
@@ -196,6 +199,7 @@ def mend(folder: Path) -> bool:
     rmtree(folder / SIGNALS, ignore_errors=True)
     for name in (CYCLES, SIGNALS):
         (folder / f"{name}{MENDED}").replace(folder / name)
+    Checksums(folder).store(*TABLES)
     # First: without it what is left of the stretches is not taken for a run.
     path.unlink()
     rmtree(folder / STRETCHES, ignore_errors=True)
@@ -224,7 +228,7 @@ def save(folder: Path, into: Path) -> None:
     """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
     on."""
     stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
-    for name in (CONFIG, PUBLISHED, ORIGIN, EVENTS, SPOOL, *stretches):
+    for name in (CONFIG, PUBLISHED, ORIGIN, EVENTS, CHECKSUMS, SPOOL, *stretches):
         (into / name).parent.mkdir(parents=True, exist_ok=True)
         # The flight recorder may have removed it meanwhile; few runs have an origin.
         with suppress(FileNotFoundError):

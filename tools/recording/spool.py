@@ -4,8 +4,8 @@ once its footer, written last, is there.
 Every ring's rows also go to `recorder.spool` as they are, compressed, one frame a ring about ten
 times a second. A restarted recorder continues from the spool; `mend` makes the parquet files from
 the spool of a recorder that is gone. The spool is removed when the files are complete. A truncated
-last frame is dropped. The rings hold two seconds, so a recorder that is back within that time loses
-nothing.
+last frame is dropped; any other damage is an error. The rings hold two seconds, so a recorder that
+is back within that time loses nothing.
 
 A flight recorder (`[record] keep`) writes no parquet files: frames go to stretches, files that are
 removed again unless something happened near them. The head of each says what was taken before it,
@@ -24,32 +24,36 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, NamedTuple, Self
+from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 import pyarrow as pa
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.history import MailboxRing, row_dtype
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import RECORD, trace_ring
 from rack.tools.console.answer import Failure
-from rack.tools.recording.recorder_process import SPOOL
+from rack.tools.recording.checksums import Checksums, check_file
+from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.recorder_process import ORIGIN, SPOOL
 
-MAGIC = b"RACKSPL2"
+MAGIC = b"RACKSPL3"
+"""First bytes of a spool and of a stretch. A CRC follows every other part of them."""
 FLUSH_S = 0.1
 """SIGKILL of all processes loses what boards wrote in this time, between two drains, and in one or
 two passes of the recorder, which last longer on a busy machine."""
-_HEAD = struct.Struct("<8sII")
-"""Magic, size and CRC of the layout and launch that follow as JSON."""
-_FRAME = struct.Struct("<IIIII")
-"""Ring, rows, rows lost before them, size and CRC of the data that follow."""
+_SIZE_BYTES = 4
+"""Bytes of the size of the JSON that follows it: layout and launch in a spool, the head of a
+stretch."""
+_FRAME = struct.Struct("<IIII")
+"""Ring, rows, rows lost before them, size of the data that follow."""
 STRETCHES = "stretches"
-_STRETCH = struct.Struct("<8sqII")
-"""Magic, the tick at which it ended, size and CRC of the rest of its head, which follows as
-JSON."""
 _ENDED = struct.Struct("<q")
+"""Tick at which a stretch ended. It follows the magic."""
+_CRC_BYTES = 4
 OPEN = -1
 """End of a stretch that is being written, or whose recorder was killed."""
 
@@ -94,9 +98,8 @@ class StretchHead(NamedTuple):
     def create(self, folder: Path) -> IO[bytes]:
         """Create its file, to be written; the kernel has at once whatever is written."""
         folder.mkdir(exist_ok=True)
-        text = json.dumps(self[:-1]).encode()
         file = self.path(folder).open("wb", buffering=0)
-        _write(file, _STRETCH.pack(MAGIC, self.end, len(text), zlib.crc32(text)) + text)
+        _write(file, MAGIC + _seal(_ENDED.pack(self.end)) + _pack(self[:-1]))
         return file
 
     def path(self, folder: Path) -> Path:
@@ -104,17 +107,13 @@ class StretchHead(NamedTuple):
         return folder / f"{self.number:08}.spool"
 
     @classmethod
-    def read(cls, file: IO[bytes]) -> Self | None:
-        """Read it; None if its recorder was killed as it began."""
-        head = file.read(_STRETCH.size)
-        if len(head) < _STRETCH.size or not head.startswith(MAGIC):
-            return None
-        _, end, size, crc = _STRETCH.unpack(head)
-        text = file.read(size)
-        if zlib.crc32(text) != crc:
-            return None
-        number, begin, taken, rows = json.loads(text)
-        return cls(number, begin, taken, rows, end)
+    def read(cls, file: IO[bytes], path: Path) -> Self | None:
+        """Read it; None if its recorder was killed as it began. Raises `Failure` if it is
+        damaged."""
+        _read_magic(file, path)
+        ended = _unseal(file, _ENDED.size, path)
+        head = _unpack(file, path)
+        return None if ended is None or head is None else cls(*head, *_ENDED.unpack(ended))
 
 
 class Spool:
@@ -139,8 +138,9 @@ class Spool:
             if not locked(self._file):
                 raise Failure(f"{self.path}: another recorder is running there")
             if not self.path.stat().st_size:
-                text = json.dumps({"layout": asdict(layout), "launch": launch}).encode()
-                _write(self._file, _HEAD.pack(MAGIC, len(text), zlib.crc32(text)) + text)
+                # The config and the origin of the run are written before its recorder begins.
+                Checksums(folder).store(CONFIG, ORIGIN)
+                _write(self._file, MAGIC + _pack({"layout": asdict(layout), "launch": launch}))
             if (found := read_head(self._file, self.path)) != (layout, launch):
                 raise Failure(
                     f"{self.path}: holds a recording of another launch or rack, '{found[0].rack}'"
@@ -152,7 +152,7 @@ class Spool:
     def resume(self) -> Iterator[StretchHead | Packed]:
         """Yield what another recorder left, and continue after it."""
         whole = self._file.tell()
-        for packed in _read_frames(self._file, self._layout):
+        for packed in _read_frames(self._file, self._layout, self.path):
             yield packed
             whole = self._file.tell()
         self._file.truncate(whole)
@@ -169,7 +169,7 @@ class Spool:
 
     def _seal(self, end: int) -> None:
         if self._out is not self._file:
-            os.pwrite(self._out.fileno(), _ENDED.pack(end), len(MAGIC))
+            os.pwrite(self._out.fileno(), _seal(_ENDED.pack(end)), len(MAGIC))
             self._out.close()
 
     def add(self, ring: str, rows: np.ndarray, lost: int) -> None:
@@ -199,7 +199,7 @@ class Spool:
                 packed = pa.compress(
                     b"".join(block.tobytes() for block in blocks), codec="zstd", asbytes=True
                 )
-                yield _FRAME.pack(place, rows, lost, len(packed), zlib.crc32(packed)) + packed
+                yield _seal(_FRAME.pack(place, rows, lost, len(packed))) + _seal(packed)
                 self._waiting[ring] = []
                 self._lost[ring] = 0
 
@@ -221,17 +221,58 @@ def _write(file: IO[bytes], data: bytes) -> None:
         data = data[file.write(data) :]
 
 
+def _seal(data: bytes) -> bytes:
+    """Return data with their CRC."""
+    return data + zlib.crc32(data).to_bytes(_CRC_BYTES)
+
+
+def _unseal(file: IO[bytes], size: int, path: Path) -> bytes | None:
+    """Read data with their CRC.
+
+    Args:
+        file: File to read from.
+        size: Size of the data.
+        path: Path of the file.
+
+    Returns:
+        The data. None if the file ends before them.
+
+    Raises:
+        Failure: The data are damaged.
+    """
+    found = file.read(size + _CRC_BYTES)
+    if len(found) < size + _CRC_BYTES:
+        return None
+    data = found[:size]
+    if _seal(data) != found:
+        raise Failure(f"{path}: damaged: the checksum before byte {file.tell()} is wrong", 2)
+    return data
+
+
+def _pack(document: Any) -> bytes:
+    text = encode_json(document).encode()
+    return _seal(len(text).to_bytes(_SIZE_BYTES)) + _seal(text)
+
+
+def _unpack(file: IO[bytes], path: Path) -> Any:
+    """Return a document that `_pack` packed; None if the file ends before it."""
+    size = _unseal(file, _SIZE_BYTES, path)
+    text = size and _unseal(file, int.from_bytes(size), path)
+    return text and json.loads(text)
+
+
+def _read_magic(file: IO[bytes], path: Path) -> None:
+    if not MAGIC.startswith(file.read(len(MAGIC))):
+        raise Failure(f"{path}: not a recorder's spool, or one of an earlier version", 2)
+
+
 def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
     """Return what the head of a spool says of the rack; its frames follow. Raises `Failure`."""
     file.seek(0)
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size or not head.startswith(MAGIC):
-        raise Failure(f"{path}: not a recorder's spool", 2)
-    _, size, crc = _HEAD.unpack(head)
-    text = file.read(size)
-    if len(text) < size or zlib.crc32(text) != crc:
+    _read_magic(file, path)
+    head = _unpack(file, path)
+    if head is None:
         raise Failure(f"{path}: truncated before its first row", 2)
-    head = json.loads(text)
     return layout_of(head["layout"]), Launch(*head["launch"])
 
 
@@ -240,13 +281,14 @@ def read(
 ) -> Iterator[StretchHead | Packed]:
     """Yield the frames of a spool, which is open after its head, then its stretches with theirs, or
     the `newest` ones."""
-    yield from _read_frames(file, layout)
+    yield from _read_frames(file, layout, folder / SPOOL)
     paths = stretch_files(folder)
     for path in paths if newest is None else paths[-newest:]:
+        check_file(path)
         with path.open("rb") as part:
-            if (stretch := StretchHead.read(part)) is not None:
+            if (stretch := StretchHead.read(part, path)) is not None:
                 yield stretch
-                yield from _read_frames(part, layout)
+                yield from _read_frames(part, layout, path)
 
 
 def stretch_files(folder: Path) -> list[Path]:
@@ -254,12 +296,11 @@ def stretch_files(folder: Path) -> list[Path]:
     return sorted((folder / STRETCHES).glob("*.spool"))
 
 
-def _read_frames(file: IO[bytes], layout: Layout) -> Iterator[Packed]:
+def _read_frames(file: IO[bytes], layout: Layout, path: Path) -> Iterator[Packed]:
     rings = list(_dtypes(layout).items())
-    while len(head := file.read(_FRAME.size)) == _FRAME.size:
-        place, count, lost, size, crc = _FRAME.unpack(head)
-        data = file.read(size)
-        if len(data) < size or zlib.crc32(data) != crc or place >= len(rings):
+    while head := _unseal(file, _FRAME.size, path):
+        place, count, lost, size = _FRAME.unpack(head)
+        if (data := _unseal(file, size, path)) is None:
             return
         name, dtype = rings[place]
         yield Packed(name, dtype, count, lost, data)

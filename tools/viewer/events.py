@@ -5,7 +5,6 @@ Each board also has a lane: the kind of its last event, until the next.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import rerun as rr
 
 from rack.boards.events import Event
+from rack.tools.recording.checksums import read_line
 from rack.tools.viewer.cell import Marks
 from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.stream import Moment, Stream
@@ -60,7 +60,7 @@ class Events:
             lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
-            event = json.loads(line)
+            event = read_line(line.decode())
             # The last line, the outcome of the run, is no event. What the launch waited for, class
             # by class on a slow machine, is no news to who sees the run.
             if "tick" in event and not (event["kind"] == "waiting" and event["tick"] < 0):

@@ -3,7 +3,6 @@ read."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +15,10 @@ import pytest
 from rack.backplane.message import State
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
+from rack.tools.recording.checksums import Checksums, read_line
 from rack.tools.recording.parquet import HEAD, SignalTables
 from rack.tools.recording.recording import Recording
+from rack.tools.recording.run_files import TABLES
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.charts.gantt import subject_of
@@ -134,6 +135,7 @@ def test_a_field_named_like_a_column_of_every_mailbox_keeps_its_own_values(
     tables = SignalTables(recording.folder / "signals", recording.layout)
     tables.add(box.name, rows)
     tables.close()
+    Checksums(recording.folder).store(*TABLES)
     again = Recording(recording.folder)
     assert np.array_equal(again.messages(box), rows["message"])
     assert np.array_equal(
@@ -194,7 +196,7 @@ def test_a_last_line_that_is_cut_is_left_out_and_said(
     path = damaged / "events.jsonl"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[0][:20]]))
-    assert Recording(damaged).events == [json.loads(line) for line in lines]
+    assert Recording(damaged).events == [read_line(line) for line in lines]
     assert f"{path}: line {len(lines) + 1} is cut off, and left out" in capsys.readouterr().err
 
 
@@ -206,6 +208,7 @@ def test_a_reason_cannot_command_the_terminal_that_shows_a_report(damaged: Path)
         values = pa.array([value] * len(table), column.type)
         table = table.set_column(table.schema.get_field_index(name), column, values)
     pq.write_table(table, file)
+    Checksums(damaged).store(*TABLES)
     _, text = write_report(damaged)
     assert "\x1b" not in text
     assert r"\x1b[2J" in text

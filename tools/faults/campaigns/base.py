@@ -6,7 +6,6 @@ that, with the events until then, and its verdict is that of a whole trial.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -21,11 +20,12 @@ from rack.boards.errors import UNKEPT
 from rack.boards.events import Event
 from rack.boards.wiring import Keeping
 from rack.tools.faults.campaigns.plan import Plan
+from rack.tools.recording.checksums import checked_line, read_line
 
 EVERY_S = 2.0
 """Simulated time between two checkpoints. For NASREM's rack going on from one takes about as much
 processor time as simulating this long, and keeping one a tenth of that."""
-EVENTS = "events.json"
+EVENTS = "events.jsonl"
 OF_LAUNCH = ("launch", "ready", "start")
 """Kinds of events that each launch has anew."""
 
@@ -94,7 +94,7 @@ class BaseRun:
 
     def keep(self, events: Sequence[Event]) -> None:
         """Keep the events of the run that has been made."""
-        (self.folder / EVENTS).write_text(json.dumps([asdict(event) for event in events]))
+        (self.folder / EVENTS).write_text("".join(checked_line(asdict(one)) for one in events))
 
     @cached_property
     def _kept(self) -> dict[int, Path]:
@@ -102,7 +102,8 @@ class BaseRun:
 
     @cached_property
     def _events(self) -> tuple[Event, ...]:
-        return tuple(Event(**event) for event in json.loads((self.folder / EVENTS).read_text()))
+        lines = (self.folder / EVENTS).read_text().splitlines()
+        return tuple(Event(**read_line(line)) for line in lines)
 
     @cached_property
     def _why_not_kept(self) -> str:

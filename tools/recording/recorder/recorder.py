@@ -15,15 +15,18 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rack.backplane.process import is_alive
+from rack.backplane.process import is_alive, processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
+from rack.tools.console.answer import write_file
+from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
 from rack.tools.recording.occasions import Retention
 from rack.tools.recording.parquet import PUBLISHED
 from rack.tools.recording.recorder.flight import FlightRecorder
-from rack.tools.recording.run_files import RunFiles, Tally
+from rack.tools.recording.recorder_process import LOOK_S
+from rack.tools.recording.run_files import TABLES, RunFiles, Tally
 from rack.tools.recording.spool import Frame, Spool, rings
 
 REALTIME_S = 0.05
@@ -34,9 +37,11 @@ faster than time."""
 HAND_OVER_S = 0.1
 """Time of a pass for a sink that is behind: what boards write meanwhile is not in the spool yet."""
 OPENED_S = 120.0
-"""Time that a recorder at its end waits for a sink that is being opened: on a loaded machine the
-viewer's library alone may take a minute, and for a file that cannot be written it waits for
-ever."""
+"""Longest time that a recorder at its end waits for a sink that is being opened: on a loaded
+machine the viewer's library alone may take a minute."""
+OPENING_LOOKS = 25
+"""Looks, 0.2 s apart, at a process that uses no processor time, after which a sink that is being
+opened counts as hung: the viewer's library waits for ever for a file that cannot be written."""
 OPENING = "opening a sink"
 """Name of a thread that does so."""
 HURRIED_S = 0.5
@@ -86,7 +91,7 @@ class SafeSink:
         if not in_background:
             self._opening.join()
         self._patience_s = OPENED_S
-        self._why_late = f"the viewer's library has not opened it within {OPENED_S:g} s"
+        self._why_late = "the viewer's library has not opened it"
 
     @classmethod
     def of(
@@ -100,9 +105,9 @@ class SafeSink:
         such file: `rack replay` makes it of what is kept."""
         if port is None and Retention.of(segment) is not None:
             return None
-        # A run in real time need not wait for the libraries of the viewer, unless the user wants to
-        # look on from the start.
-        return cls(opened, tell, port is None and not segment.words[System.LOCKSTEP])
+        # No run waits for the libraries of the viewer, which may take long, and for ever on a full
+        # disk, unless the user wants to look on from the start.
+        return cls(opened, tell, port is None)
 
     def add(self, ring: str, rows: np.ndarray) -> None:
         """Keep rows to be passed on."""
@@ -120,7 +125,14 @@ class SafeSink:
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Finish the sink, once it is open."""
         self._waiting.append(lambda sink: sink.close(tick, lost))
-        self._opening.join(self._patience_s)
+        until = time.monotonic() + self._patience_s
+        used_ns = 0
+        idle_looks = 0
+        while self._opening.is_alive() and time.monotonic() < until and idle_looks < OPENING_LOOKS:
+            self._opening.join(min(LOOK_S, self._patience_s))
+            before_ns = used_ns
+            used_ns = processor_ns(os.getpid())
+            idle_looks = idle_looks + 1 if used_ns == before_ns else 0
         if self._opening.is_alive():
             self._tell(f"run.rrd is missing: {self._why_late}; 'rack replay' makes it")
         else:
@@ -174,6 +186,7 @@ class Recorder:
         refresh: Callable[[], object] | None = None,
     ) -> None:
         layout = segment.layout
+        self._folder = folder
         self._view = view
         self._refresh = refresh
         self._segment = segment
@@ -181,7 +194,8 @@ class Recorder:
         # The spool first: it fails where another recorder is running, and leaves that one's files
         # alone.
         self._spool = Spool(folder, layout, segment.launch)
-        (folder / PUBLISHED).write_text(segment.published)
+        write_file(folder / PUBLISHED, segment.published)
+        Checksums(folder).store(PUBLISHED)
         retention = Retention.of(segment)
         self._rings = rings(segment)
         before = {name: ring.before for name, ring in self._rings.items()}
@@ -217,8 +231,12 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self.close()
+    def __exit__(self, kind: object, *error: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            # The tables may lack rows now; the next recorder, or `mend`, makes them from the spool.
+            self._spool.close()
 
     def drain(self) -> None:
         """Record everything written since the last call."""
@@ -282,6 +300,8 @@ class Recorder:
         if self._files is not None:
             self._spool.flush(now=True)
             self._files.close(UNMEASURED if self._cores is None else self._cores.record())
+            Checksums(self._folder).store(*TABLES)
             self._spool.remove()
         if self._view is not None:
             self._view.close(self._words[System.TICK] + 1, self._tally.lost)
+            Checksums(self._folder).store("*.rrd")

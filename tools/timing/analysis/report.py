@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -24,11 +23,13 @@ from rack.levels.timing.trace_times import (
     plan_ages,
     residual_ns,
 )
+from rack.tools.console.answer import write_file, write_json
 from rack.tools.faults.judge import faults
 from rack.tools.live.host_side import ENTRY_COUNTS, entries_of
 from rack.tools.live.interrupts import interrupts
 from rack.tools.live.network import BOARD, COUNTS, STATUS, exchanged
 from rack.tools.live.queues import queues
+from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.history import (
     counted,
     fired_rows,
@@ -72,8 +73,9 @@ def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Report,
     if against is not None:
         report["against"] = import_module(COMPARISON).compared(recording, against)
     text = markdown(report)
-    (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
-    (folder / "report.md").write_text(text)
+    write_json(folder / "report.json", report)
+    write_file(folder / "report.md", text)
+    Checksums(folder).store("report.*")
     return report, text
 
 

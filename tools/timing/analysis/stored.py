@@ -9,7 +9,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from rack.tools.console.answer import Document, print_json
+from rack.tools.console.answer import Document, Failure, print_json
+from rack.tools.recording.checksums import Checksums, read_file
 from rack.tools.recording.recorder_process import SPOOL
 
 FILES = ("report.json", "report.md")
@@ -19,15 +20,18 @@ PROGRAM = Path(__file__).resolve().parents[3]
 
 def stored_report(folder: Path) -> tuple[Document, str] | None:
     """Return the report in the folder of a run, as data and as text; None if it must be made
-    anew."""
+    anew, as of a recording that has been damaged since."""
     try:
+        checksums = Checksums(folder)
+        kept = (*FILES, *RECORDED)
+        checksums.verify(*(name for name in checksums.stored or () if name.startswith(kept)))
         made_ns = min((folder / name).stat().st_mtime_ns for name in FILES)
         newest_ns = max((folder / name).stat().st_mtime_ns for name in RECORDED)
         if (folder / SPOOL).exists() or made_ns <= max(newest_ns, *_changed_ns()):
             return None
-        data = json.loads((folder / FILES[0]).read_bytes())
-        text = (folder / FILES[1]).read_text(encoding="utf-8")
-    except (OSError, ValueError):
+        data = json.loads(read_file(folder / FILES[0]))
+        text = read_file(folder / FILES[1]).decode()
+    except (OSError, ValueError, Failure):
         return None
     # A comparison with another run is no report of this one, and the folder may have been moved.
     is_own = isinstance(data, dict) and "against" not in data and data.get("folder") == str(folder)

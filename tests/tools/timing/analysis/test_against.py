@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from rack.boards.config import load
 from rack.tools.live.continued import branched, state_at
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
+from rack.tools.recording.checksums import checked_line, read_line
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.against import compared
 from rack.tools.timing.analysis.report import OtherRun
@@ -100,11 +100,11 @@ def _losing(run: Recording) -> Path:
     """Return a copy of a recorded run whose recorder lost rows."""
     folder = Path(shutil.copytree(run.folder, run.folder.with_name("losing")))
     events = folder / "events.jsonl"
-    lines = [json.loads(line) for line in events.read_text().splitlines()]
+    lines = [read_line(line) for line in events.read_text().splitlines()]
     ends = [
         line | {"rows_lost": {"wave": 3}} if line["kind"] == "outcome" else line for line in lines
     ]
-    events.write_text("".join(json.dumps(line) + "\n" for line in ends))
+    events.write_text("".join(map(checked_line, ends)))
     return folder
 
 

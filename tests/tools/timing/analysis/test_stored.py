@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from rack.tools.recording.checksums import Checksums
 from rack.tools.timing.analysis import stored
 from rack.tools.timing.analysis.report import OtherRun, write_report
 from rack.tools.timing.analysis.stored import RECORDED, stored_report
@@ -84,6 +85,7 @@ def test_the_command_shows_it_and_writes_it_anew_only_when_it_must(folder: Path)
     report = json.loads((folder / "report.json").read_text())
     (folder / "report.json").write_text(json.dumps(report | {"digest": "as stored"}))
     (folder / "report.md").write_text("as stored\n")
+    Checksums(folder).store("report.*")
     assert json.loads(rack("report", folder, "--json").stdout)["digest"] == "as stored"
     assert rack("report", folder).stdout == "as stored\n\n"
     make_newer(folder / "events.jsonl")

@@ -12,6 +12,7 @@ import pytest
 from rack.boards.config import load
 from rack.levels.timing.schedule import Chart
 from rack.tools.console.answer import Failure
+from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import union, without
@@ -156,6 +157,7 @@ def test_a_trace_without_the_newer_columns_is_refused(folder: Path) -> None:
     fig2(folder, [executor(0, 0, 0, 0, 0, 100)], [])
     table = pq.read_table(folder / "cycles.parquet").drop_columns(["plan_ns"])
     pq.write_table(table, folder / "cycles.parquet")
+    (folder / CHECKSUMS).unlink()
     with pytest.raises(
         Failure,
         match="no column plan_ns: it was recorded by an earlier version; run the rack again",

@@ -1,0 +1,119 @@
+"""Checksums of the files of a run, so that damage is named and never read as other values.
+
+`checksums.xxh128` holds them as `xxh128sum -c checksums.xxh128` reads them. A run may be killed at
+any time, so each line of events.jsonl holds its own.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from hashlib import file_digest
+from math import nan
+from pathlib import Path
+
+from xxhash import xxh3_64_hexdigest, xxh3_128
+
+from rack.backplane.json_text import encode_json
+from rack.backplane.regular_file import check_regular_file, read_regular_file
+from rack.tools.console.answer import Document, Failure, write_file
+
+CHECKSUMS = "checksums.xxh128"
+MOST_BYTES = 1 << 30
+"""Largest file of a run that is read into memory."""
+_LARGEST = 1 << 40
+"""Largest file of a run, in bytes."""
+_KEY = ', "check": "'
+_WHOLE = re.compile(_KEY + r'\w*"}')
+
+
+def read_file(path: Path) -> bytes:
+    """Return the content of a file of a run. Raises `Failure`."""
+    try:
+        return read_regular_file(path, MOST_BYTES)
+    except OSError as error:
+        raise Failure(f"{path}: {error.strerror}", 2) from None
+
+
+class Checksums:
+    """The checksums of a run's files.
+
+    Attributes:
+        stored: Checksum by path in the folder. None for a recording of an earlier version.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.stored: dict[str, str] | None = None
+        self._folder = folder
+        path = folder / CHECKSUMS
+        if path.is_symlink() or path.exists():
+            lines = read_file(path).decode(errors="replace").splitlines()
+            found = [re.fullmatch(r"([0-9a-f]{32})  (.+)", line) for line in lines]
+            if None in found:
+                raise Failure(f"{path}: line {found.index(None) + 1} is damaged", 2)
+            self.stored = {match[2]: match[1] for match in found if match}
+
+    def store(self, *patterns: str) -> None:
+        """Store the checksums of the files that match a pattern. Raises `OSError`."""
+        stored = dict(self.stored or {})
+        for path in (path for pattern in patterns for path in self._folder.glob(pattern)):
+            stored[str(path.relative_to(self._folder))] = _digest(path)
+        text = "".join(f"{value}  {name}\n" for name, value in stored.items())
+        write_file(self._folder / CHECKSUMS, text)
+        self.stored = stored
+
+    def verify(self, *names: str) -> None:
+        """Raise `Failure` for the first of these files that has been damaged or changed."""
+        for name in names:
+            path = self._folder / name
+            digest = _digest(path)
+            if self.stored is not None and self.stored.get(name) != digest:
+                why = f"damaged, or changed later: its checksum is not the one in {CHECKSUMS}"
+                raise Failure(f"{path}: {why}", 2)
+
+
+def check_file(path: Path) -> None:
+    """Raise `Failure` for a file of a run that is not there, or is no regular file."""
+    try:
+        check_regular_file(path, _LARGEST)
+    except OSError as error:
+        raise Failure(f"{path}: {error.strerror}", 2) from None
+
+
+def _digest(path: Path) -> str:
+    check_file(path)
+    with path.open("rb") as file:
+        return file_digest(file, xxh3_128).hexdigest()
+
+
+def checked_line(entry: Document) -> str:
+    """Return an entry of events.jsonl as a line that holds its own checksum."""
+    text = encode_json(entry)
+    return f'{text[:-1]}{_KEY}{xxh3_64_hexdigest(text.encode())}"}}\n'
+
+
+def read_line(line: str, is_checked: bool = False) -> Document:
+    """Return the entry in a line of events.jsonl.
+
+    Args:
+        line: The line. Lines of earlier versions have no checksum.
+        is_checked: Whether a line without a checksum is damaged.
+
+    Raises:
+        ValueError: The line is damaged, or not JSON.
+    """
+    text, key, check = line.removesuffix("\n").rpartition(_KEY)
+    if key or is_checked:
+        text += "}"
+        if check != f'{xxh3_64_hexdigest(text.encode())}"}}':
+            raise ValueError("its checksum is wrong")
+    entry: Document = json.loads(text or line)
+    if "value" in entry and entry["value"] is None:
+        # JSON has no NaN.
+        entry["value"] = nan
+    return entry
+
+
+def is_cut_off(line: str) -> bool:
+    """Return whether a last line without an end is what a killed run leaves."""
+    return not _WHOLE.search(line)
