@@ -189,11 +189,11 @@ def run(
                 step=step,
                 begins=begins,
             )
-        _report(found, folder, result, as_json)
+        is_reported = _report(found, folder, result, as_json)
     if not result.worked:
         # On stderr and last, where it is seen in any case.
         print(result.failure(), file=sys.stderr)
-    sys.exit(0 if result.worked else 1)
+    sys.exit(0 if result.worked and is_reported else 1)
 
 
 def _tables(config: str, overrides: list[str], faults: str | None) -> Tables:
@@ -220,8 +220,8 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
     return crate
 
 
-def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> None:
-    """Make the report and print it; a recording that cannot be read does not fail the run."""
+def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> bool:
+    """Make the report and print it. Return False if the folder of a run has none."""
     from rack.tools.recording.recorder_process import size_of, size_text
     from rack.tools.timing.analysis.report import unrecorded, write_report
     from rack.tools.timing.analysis.stored import print_report
@@ -229,17 +229,19 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
     report: tuple[Document, str] | None = None
     try:
         report = write_report(folder) if folder is not None else None
-    except (Failure, OSError) as error:
-        print(f"no report: {error}", file=sys.stderr)
+    except (Failure, OSError, MemoryError) as error:
+        print(f"{folder}: no report: {error or 'out of memory'}", file=sys.stderr)
     data, text = report or (unrecorded(config, result.document()), result.text())
     if result.others:
         data["others"] = [asdict(other) for other in result.others]
     print_report(data, text, as_json)
+    is_reported = folder is None or report is not None
     if as_json:
-        return
+        return is_reported
     if folder is not None:
         lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
         print(f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}")
     for other in result.others:
         ended = f"{other.rack}: {other.cause} after {other.ticks} ticks"
         print(f"{ended}, digest {other.digest}, {other.folder or 'not recorded'}")
+    return is_reported

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
@@ -229,7 +229,14 @@ def run_rack(
             others=others.ends(),
             failed=failed,
         )
-        log.end(result.document())
+        return _end_log(log, result)
+
+
+def _end_log(log: EventLog, result: RunResult) -> RunResult:
+    """Write the end of a run; return its result, which fails without all events."""
+    log.end(result.document())
+    if log.has_failed:
+        return replace(result, recording="events.jsonl ends before the run")
     return result
 
 

@@ -3,8 +3,11 @@ hangs."""
 
 from __future__ import annotations
 
+import errno
 import os
 import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from tests.processes import children_of
+from tests.tools.command_line import rack
 from tests.tools.recording.struck_recorders import (
     LONG_S,
     FillingDisk,
@@ -58,7 +62,9 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
     folder, display = tmp_path / "run", Keeping()
     folder.mkdir()
     (folder / "events.jsonl").symlink_to("/dev/full")
-    assert run_rack(config, 0.5, folder, display).worked
+    result = run_rack(config, 0.5, folder, display)
+    assert (result.outcome.worked, result.worked) == (True, False)
+    assert result.failure().endswith("not all is recorded: events.jsonl ends before the run")
     assert display.texts.count("events.jsonl ends here: No space left on device") == 1
 
 
@@ -100,3 +106,42 @@ def test_a_folder_that_cannot_be_written_is_named(config: RackConfig, tmp_path: 
     with pytest.raises(Failure, match="/run: No space left on device"):
         run_rack(config, 1.0, tmp_path / "run", Display())
     assert config.name not in racks()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.getuid() != 0, reason="only root mounts a file system")
+@pytest.mark.parametrize("size", ["48k", "80k", "100k", "400k"])
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_small_disk_ends_the_run_with_one_line_and_leaves_no_process(
+    small: Path, rack_name: str, tmp_path: Path, size: str, mode: str
+) -> None:
+    """Recorder, viewer's file and events race for the last bytes."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    command = (
+        *("unshare", "--mount", "sh", "-c"),
+        'mount -t tmpfs -o size=$0 tmpfs "$1" && shift && exec "$@"',
+        *(size, disk, sys.executable, "-m", "rack.tools.cli", "run", small),
+        *("--set", f"name={rack_name}", "--set", f"clock.mode={mode}"),
+        *("--seconds", str(5 * LONG_S), "--out", disk / "run"),
+    )
+    done = subprocess.run(command, capture_output=True, text=True, timeout=2 * FULL_S, check=False)
+    assert done.returncode == 1, done
+    *_, last = done.stderr.splitlines()
+    assert last.startswith(f"{disk}/run: No space left on device")
+    assert rack_name not in racks()
+
+
+@pytest.mark.slow
+def test_a_run_whose_report_cannot_be_written_fails(
+    small: Path, rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(folder: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("rack.tools.timing.analysis.report.write_report", fail)
+    done = rack(
+        *("run", small, "--seconds", 0.2, "--set", f"name={rack_name}", "--out", tmp_path / "run")
+    )
+    assert done.returncode == 1
+    assert f"{tmp_path}/run: no report: [Errno 28] No space left on device" in done.stderr

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rack.boards import Rack
+from rack.boards.config import load
 from rack.tools.recording.recorder.recorder import SafeSink, is_opening
 
 WATCHDOG_S = 30.0
@@ -115,7 +118,7 @@ def test_a_recorder_does_not_wait_for_ever_for_a_sink_whose_opening_hangs(
     safe.close(1, {})
     assert is_opening()
     may_open.set()
-    why = "the viewer's library has not opened it within 0.05 s; 'rack replay' makes it"
+    why = "the viewer's library has not opened it; 'rack replay' makes it"
     assert notes == [f"run.rrd is missing: {why}"]
 
 
@@ -129,3 +132,39 @@ def test_a_sink_that_cannot_be_opened_is_reported_once() -> None:
     safe.add("servo", np.zeros(1))
     safe.close(1, {})
     assert notes == ["run.rrd ends here: no viewer here"]
+
+
+@pytest.mark.slow
+def test_a_sink_whose_opening_uses_no_processor_time_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("rack.tools.recording.recorder.recorder.LOOK_S", 0.02)
+    may_open, notes = threading.Event(), list[str]()
+
+    def opened() -> Taking:
+        assert may_open.wait(WATCHDOG_S)
+        return Taking()
+
+    safe = SafeSink(opened, notes.append, in_background=True)
+    safe.close(1, {})
+    assert not may_open.is_set()
+    may_open.set()
+    assert len(notes) == 1
+    assert notes[0].startswith("run.rrd is missing: ")
+
+
+def test_neither_mode_waits_for_the_library_of_the_viewer(
+    small: Path, rack_name: str, tmp_path: Path
+) -> None:
+    may_open = threading.Event()
+
+    def opened() -> Taking:
+        assert may_open.wait(WATCHDOG_S)
+        return Taking()
+
+    for mode in ("lockstep", "realtime"):
+        config = load(small, [f"name={rack_name}", f"clock.mode={mode}"])
+        with Rack(config) as running:
+            assert SafeSink.of(running.segment, None, opened, pytest.fail) is not None
+            assert is_opening()
+    may_open.set()
