@@ -173,6 +173,15 @@ class TaskSpec:
         """Its releases."""
         return TickGrid(self.every, self.phase)
 
+    @property
+    def slice(self) -> int:
+        """Time for one cycle, or one plan, ticks."""
+        return self.every * self.within_cycles
+
+    def count_unfinished(self, done: int, tick: int) -> int:
+        """Count the releases after `done` that should have been finished by `tick`."""
+        return max(0, (tick - self.slice - self.grid.since(done + 1)) // self.every + 1)
+
 
 @dataclass(frozen=True)
 class Layout:

@@ -68,6 +68,26 @@ class Launch(NamedTuple):
         return self.created_ns - self.monotonic_ns
 
 
+class CycleCounts(NamedTuple):
+    """Cycles of a task: plans or cycles missed, cycles skipped, and all that were due. A plan takes
+    `plan` cycles."""
+
+    missed: int
+    skipped: int
+    due: int
+    plan: int
+
+    @property
+    def lost(self) -> int:
+        """The cycles that were missed or skipped."""
+        return self.missed * self.plan + self.skipped
+
+    def __str__(self) -> str:
+        """Return what was lost, as readable text."""
+        unit = f" plans of {self.plan} cycles" * (self.plan > 1)
+        return f"missed {self.missed}{unit} and skipped {self.skipped} of its {self.due} cycles"
+
+
 class Segment:
     """An attached segment: `layout`, `config` (TOML text), `published` (JSON text: the facts about
     its levels), `map`, and its memory as `words` and `bytes`.
@@ -252,6 +272,15 @@ class Segment:
         """Return a task's control block, as words (`words.Block`). Raises `KeyError`."""
         start = self.map.blocks[task] // 8
         return self.words[start : start + max(Block) + 1]
+
+    def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
+        """Count the cycles of a task by `tick`. Releases since its last cycle are skipped ones as
+        soon as their time is over."""
+        block = self.block(task.name)
+        skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
+        return CycleCounts(
+            block[Block.MISSED], skipped, task.count_unfinished(-1, tick), task.within_cycles
+        )
 
     def box(self, mailbox: str) -> memoryview:
         """Return the head of a mailbox, as words (`words.Box`). Raises `KeyError`."""

@@ -181,9 +181,7 @@ class Watchdog:
         state = state_of(pid)
         if state in STOPPED:
             return True
-        bound_ns = max(
-            LEAST_NS, RELEASES_MISSED * spec.every * spec.within_cycles * self._period_ns
-        )
+        bound_ns = max(LEAST_NS, RELEASES_MISSED * spec.slice * self._period_ns)
         if task.missed * spec.every * self._period_ns <= bound_ns:
             return False
         return state in WAITING or processor_ns(pid) - self._used_ns.get(task.index, 0) > bound_ns

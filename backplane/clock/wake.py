@@ -30,6 +30,7 @@ from rack.backplane.words import Block, Run, System
 
 # Plain integers for the hot path.
 _RELEASED = int(Block.RELEASED)
+_DONE = int(Block.DONE)
 _FIRST = int(Block.FIRST)
 _SAVE = int(Block.SAVE)
 _STATE = int(System.STATE)
@@ -78,8 +79,10 @@ class NextCycle:
         self._silent_clock = (
             None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
         )
-        # A restarted planner takes no release from before its start.
-        self._due = self._block[_RELEASED] + 1
+        # A restarted task takes no release from before its start: those are skipped. The clock does
+        # not write this word until the task has rejoined.
+        self._block[_RELEASED] = self._block[_DONE]
+        self._due = self._block[_DONE] + 1
         self.hold_until(self._due)
         self._slack = 0
         self.skipped = 0

@@ -122,10 +122,10 @@ class LayoutMaker:
             return
         writer = self._tasks[ports.task]
         every = writer.every * output.cycles
-        delay = _slice(writer)
+        delay = writer.slice
         # A reader may read as late as the end of its slice a message that was visible at its start.
         readers = [self._both[reader] for reader in self._wiring.readers(name)]
-        slowest = max(map(_slice, readers), default=0)
+        slowest = max((reader.slice for reader in readers), default=0)
         box = self._mailbox(
             name,
             output.type,
@@ -152,7 +152,7 @@ class LayoutMaker:
     def _queue(self, box: MailboxSpec, reader: TaskSpec, writer: TaskSpec) -> Iterator[MailboxSpec]:
         """Yield a queue with its size, and the mailbox in which its reader writes its position for
         the writer."""
-        delay = _slice(reader)
+        delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
         capacity = self._capacity(box.name)
         # From its release until it can know what the reader has taken, the writer can send no more
@@ -161,7 +161,7 @@ class LayoutMaker:
         # A deep queue keeps fewer.
         slots = depth_for(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
         yield replace(box, capacity=capacity, depth=slots)
-        depth = depth_for(max(_slice(writer) + delay, self._kept), read.every)
+        depth = depth_for(max(writer.slice + delay, self._kept), read.every)
         visible = (read.phase + delay) % read.every
         place = {
             "writer": reader.name,
@@ -202,14 +202,14 @@ class LayoutMaker:
         )
         # As late as it is served, a message is still in its slot.
         waits = -(-(table.depth + 1) * service_ns // clock_ns)
-        slowest = max(map(_slice, readers), default=0)
+        slowest = max((reader.slice for reader in readers), default=0)
         depth = depth_for(max(slowest + delay + waits, self._kept), box.every)
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
 
     def _sent_ns(self, writer: TaskSpec) -> int:
         """Return the time from a release until its messages are sent: its budget, or a tick; a
         plan's: its slice."""
-        longest_ns = _slice(writer) * self._config.clock_ns
+        longest_ns = writer.slice * self._config.clock_ns
         if writer.role == "planner":
             return longest_ns
         budget = self._config.board[writer.board].budget
@@ -274,11 +274,6 @@ class LayoutMaker:
             fields=_specs(kind, dtype),
             **times,
         )
-
-
-def _slice(task: TaskSpec) -> int:
-    """Return the time that a task has for one cycle, or one plan, ticks."""
-    return task.every * task.within_cycles
 
 
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:

@@ -212,7 +212,7 @@ class LoneTask:
         self._read(tick)
         assert isinstance(self.level, Planner), "an executor executes"
         if self.level.wanted(self._values, tick):
-            self._busy_until = tick + self.spec.every * self.spec.within_cycles
+            self._busy_until = tick + self.spec.slice
             self.level.plan(self._values, self._messages.plan, tick)
             self._write(tick)
 

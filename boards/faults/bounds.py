@@ -33,8 +33,7 @@ def cycle_ticks(layout: Layout, board: str) -> int:
     """Return the cycle of a task, in ticks; a planner's is its time slice, the clock's one tick."""
     if board == CLOCK:
         return 1
-    task = layout.task(board)
-    return task.every * task.within_cycles
+    return layout.task(board).slice
 
 
 def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:

@@ -64,7 +64,7 @@ def overrun(load: ExtraComputing, tick: int, now: int) -> int:
 
 def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
     """Make a planner exceed its time slice by `by` cycles."""
-    slice_end = load.clock.time_of(tick + load.spec.every * load.spec.within_cycles)
+    slice_end = load.clock.time_of(tick + load.spec.slice)
     return max(now, slice_end) + load.cycles_ns(load.entry.parameters[0])
 
 

@@ -157,7 +157,7 @@ class PlannerLoop(Task):
     ) -> None:
         super().__init__(segment, wiring, planner, attention)
         self.planner = planner
-        self.slice = self.spec.every * self.spec.within_cycles
+        self.slice = self.spec.slice
         self.read = interrupted(self.inputs.read, self.interrupts)
         self.write_plan = slowed(self.outputs.write, wiring.transfer.update_ns)
         self._critical_priority = wiring.critical_priority

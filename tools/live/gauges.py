@@ -66,7 +66,7 @@ class Gauges:
             self.worst_ms[task], (late.max() * 1e-6, execution.max() * 1e-6)
         )
         spec = self._tasks[task]
-        slice_ns = spec.every * spec.within_cycles * self._segment.words[System.PERIOD_NS]
+        slice_ns = spec.slice * self._segment.words[System.PERIOD_NS]
         self._shares[task] = (execution.mean() / slice_ns, communication_ns(rows).mean() / slice_ns)
 
     def bar(self, task: str) -> str:

@@ -249,7 +249,7 @@ class RackMonitor:
             cycles=block[Block.CYCLES],
             plans=block[Block.PLANS],
             missed=block[Block.MISSED],
-            skipped=block[Block.SKIPPED],
+            skipped=self._segment.count_cycles(task, self._segment.words[System.TICK] - 1).skipped,
             restarts=restarts(self._segment, task.name),
             exec_ms=exec_ms,
             lateness_ms=lateness_ms,

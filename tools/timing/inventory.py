@@ -45,7 +45,7 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
             "rate_hz": 1e9 / (task.every * layout.clock_ns),
             "every_ticks": task.every,
             "phase_ticks": task.phase,
-            "slice_ms": task.every * task.within_cycles * tick_ms,
+            "slice_ms": task.slice * tick_ms,
             "trace_address": places.traces[task.name],
         }
         for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))

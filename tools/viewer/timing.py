@@ -50,11 +50,7 @@ class CycleLanes:
         self._stream = stream
         self._speed = speed
         self._lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
-        self._last_ns = (
-            task.every * task.within_cycles * stream.times.clock_ns - len(MOMENTS)
-            if lockstep
-            else None
-        )
+        self._last_ns = task.slice * stream.times.clock_ns - len(MOMENTS) if lockstep else None
         self._work = "process" if task.role == "executor" else "plan"
         style_lane(stream, self._lane, PHASES, LETTERS)
 
@@ -99,7 +95,7 @@ class Load:
         self._stream = stream
         self._task = task.name
         self._is_lockstep = is_lockstep
-        self._slice_ns = task.every * task.within_cycles * period_ns
+        self._slice_ns = task.slice * period_ns
         curves = [
             f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")
         ]

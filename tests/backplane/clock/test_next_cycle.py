@@ -60,6 +60,7 @@ def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
         seen.append((cycle.wait(), cycle.skipped))
     assert seen == [(3, 0), (7, 0), (19, 2)]
     # A new process takes the next release on the same grid, and a plan ends on it.
+    bus.block("level")[Block.DONE] = 19
     cycle = NextCycle(bus, "level")
     release(bus, 23)
     assert (cycle.wait(), cycle.skipped) == (23, 0)
@@ -132,11 +133,15 @@ def test_a_planner_takes_a_late_release_as_of_its_tick_within_its_slice(
     )
 
 
-def test_a_restarted_task_waits_for_the_next_release(bus: Segment) -> None:
+@pytest.mark.parametrize(("done", "skipped"), [(8, 0), (4, 1), (-1, 3)])
+def test_a_restarted_task_waits_for_the_next_release_and_has_skipped_those_without_a_cycle(
+    bus: Segment, done: int, skipped: int
+) -> None:
     release(bus, 8)
+    bus.block("level")[Block.DONE] = done
     cycle = NextCycle(bus, "level")
     release(bus, 12)
-    assert (cycle.wait(), cycle.skipped) == (12, 0)
+    assert (cycle.wait(), cycle.skipped) == (12, skipped)
 
 
 @WAKES

@@ -238,7 +238,7 @@ def _task(
     _, skipped = counts(cycles)
     cycles = plans(cycles) if task.role == "planner" else cycles
     missed, _ = counts(cycles)
-    slice_ns = task.every * task.within_cycles * tick_ns
+    slice_ns = task.slice * tick_ns
     response = responses.get(task.name)
     fits = None if response is None else response.holds
     predicted_ms = None

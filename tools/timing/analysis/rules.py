@@ -111,7 +111,7 @@ def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
 
 def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
     """Return the time available to one cycle of a task; d R_i, the time slice, of a planner."""
-    return task.every * task.within_cycles * rack.tick_ns
+    return task.slice * rack.tick_ns
 
 
 def response_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
@@ -153,7 +153,7 @@ def _left_to_plan_ns(plans: Cycles, executor: Cycles, rack: RackTiming) -> np.nd
     residual = cycle_ns(rack, executor.task) - executor.used_ns
     before = np.concatenate(([0], np.cumsum(residual)))
     first = plans.rows["tick"]
-    last = first + plans.task.every * plans.task.within_cycles
+    last = first + plans.task.slice
     begin, end = (np.searchsorted(executor.rows["tick"], ticks) for ticks in (first, last))
     # A plan at the end of the run is compared with the fewer cycles that it had.
     cycles = np.clip(
