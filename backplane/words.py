@@ -140,6 +140,7 @@ class Block(IntEnum):
     SAVE = 27
     TRACE_FIRST = 28  # trace records before this run, which continues another; written by the Rack
     FIRST = 29  # in lockstep, first of the releases given together with RELEASED; by the clock
+    FAILED = 30  # where in its code the last process of the task failed, and how often in a row
 
 
 class TaskState(IntEnum):

@@ -8,6 +8,7 @@ import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
 from importlib import import_module
+from zlib import crc32
 
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
@@ -34,6 +35,8 @@ from rack.levels.level import Executor, Planner
 
 SELF_TEST_FAILED = 3
 """Exit status of a board whose start-up test failed."""
+REPEATS = 1 << 16
+"""Factor of the place, a checksum, in the word of a failure; the count of repeats is the rest."""
 FAST_NS = 10_000_000
 """Longest cycle for which memory is touched in advance: that takes a tenth of a second, and longer
 cycles have time for page faults."""
@@ -52,9 +55,24 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
         if isinstance(error, CheckpointError):
             return CANNOT_KEEP
         return CANNOT_GO_ON if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
-    except Exception:
-        print(f"board '{name}' failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
+    except Exception as error:
+        print(_describe_failure(segment, name, error), file=sys.stderr, flush=True)
         return 1
+
+
+def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
+    """Return the traceback of an error; where it ended the board's last process in the same place,
+    only how often it has come again."""
+    if name in segment.map.blocks:
+        block = segment.block(name)
+        place = crc32("".join(traceback.format_tb(error.__traceback__)).encode())
+        last_place, again = divmod(block[Block.FAILED], REPEATS)
+        again = again + 1 if place == last_place else 0
+        block[Block.FAILED] = place * REPEATS + again
+        if again:
+            reason = "".join(traceback.format_exception_only(error)).rstrip()
+            return f"board '{name}' failed in the same place, {again} more so far: {reason}"
+    return f"board '{name}' failed:\n{traceback.format_exc().rstrip()}"
 
 
 def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
