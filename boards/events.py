@@ -120,6 +120,8 @@ Cause = Literal[
 ]
 """A task is refused if it never began, as it has no moves; any other task that ends with an error
 has failed."""
+SUCCESSES: tuple[Cause, ...] = ("task done", "time over")
+"""Causes of a run that may have succeeded."""
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,10 @@ class Outcome:
     then.
 
     `state` and `reason` are those of the level that ends the run; `faults` are latched faults, lost
-    boards, objects beyond their goals when the task says that it is done, and long holds without a
-    cause in sight. `brakings` are those after the start; `objects`: where each ended.
+    boards, objects beyond their goals when the task says that it is done, long holds without a
+    cause in sight, and levels that lost too many cycles. `brakings` are those after the start;
+    `objects`: where each ended; `excused`: a line for each level that lost too many cycles because
+    of injected faults.
     """
 
     cause: Cause
@@ -140,11 +144,21 @@ class Outcome:
     faults: tuple[str, ...]
     brakings: tuple[Braking, ...] = ()
     objects: tuple[ObjectEnd, ...] = ()
+    excused: tuple[str, ...] = ()
+
+    @property
+    def failure(self) -> str:
+        """Why the run failed: a fault, or a task that was refused, failed or cut short; empty if it
+        succeeded."""
+        faults = "; ".join(self.faults)
+        if self.cause in SUCCESSES:
+            return faults
+        return f"{self.cause}: {faults or self.reason or f'after {self.ticks} ticks'}"
 
     @property
     def worked(self) -> bool:
-        """Whether the run succeeded: no fault, and no task was refused, failed or cut short."""
-        return not self.faults and self.cause in ("task done", "time over")
+        """Whether the run succeeded."""
+        return not self.failure
 
 
 def order_key(entry: Mapping[str, Any]) -> float:

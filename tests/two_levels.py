@@ -96,6 +96,14 @@ class Lower(Executor):
         write.status.count = read.command.value.goal
 
 
+class Crashing(Lower):
+    """Fails in its first cycle."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Fail."""
+        raise RuntimeError("no cycle at all")
+
+
 class LowerPlanner(Planner):
     """Plans the way to the goal."""
 

@@ -73,6 +73,8 @@ CHANGED = (
     " given, and classes of levels have moved (old names still work); write format = 2 when that"
     " suits you"
 )
+RESTART_S = 2.0
+"""Longest time of a restart in real time: a planner with its libraries takes 1.5 s."""
 LONGEST_EVERY = 1_000_000
 """Longest cycle of a board, ticks."""
 
@@ -180,8 +182,8 @@ class ExchangeConfig(Table):
 
 
 class SupervisionConfig(Table):
-    """`[supervision]`: restarts of boards that die or hang. When none are left, the brakes stay
-    engaged."""
+    """`[supervision]`: restarts of boards that die or hang, and the cycles that a level may lose.
+    When no restarts are left, the brakes stay engaged."""
 
     restarts: Restarts = 5
     """maximum number of restarts of one task within within_s; 0: never restart"""
@@ -190,6 +192,14 @@ class SupervisionConfig(Table):
     lockstep_restart_s: Positive = 0.5
     """in lockstep, simulated time until a lost task returns, s; in real time it returns when
     ready"""
+    max_missed_fraction: float = Field(0.05, ge=0, le=1)
+    """largest fraction of its cycles that a level may miss or skip in a run that succeeds, rounded
+    up to whole cycles; those due while an injected fault acts, or during the recovery from it, are
+    excused; 1: never judged"""
+
+    def restart_s(self, lockstep: bool) -> float:
+        """Return the longest simulated time that a restart may take."""
+        return self.lockstep_restart_s if lockstep else max(RESTART_S, self.lockstep_restart_s)
 
 
 class BoardConfig(Table):

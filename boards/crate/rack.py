@@ -32,6 +32,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
+from rack.boards.crate.lateness import judge_lost_cycles
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.neighbours import conflicts, holders, occupied, placed
 from rack.boards.crate.patience import Patience, RackAwaited, await_opened
@@ -54,7 +55,16 @@ from rack.boards.errors import (
     LaunchError,
     Mistake,
 )
-from rack.boards.events import CONTINUES, Cause, Ending, Event, Journal, Outcome, brakings
+from rack.boards.events import (
+    CONTINUES,
+    SUCCESSES,
+    Cause,
+    Ending,
+    Event,
+    Journal,
+    Outcome,
+    brakings,
+)
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import Entries, Keeping
 
@@ -70,6 +80,8 @@ UP = (TaskState.READY, TaskState.RUNNING)
 TO_SHARE = "stop that rack, choose other cores, or use --share"
 LEAVE_S = 2.0
 """Time for the boards to end by themselves."""
+LAST_S = 0.2
+"""Time for the boards to finish their last cycles before these are counted."""
 STOP_S = 0.8
 """Time for the clock to end the run after a stop request, before the Rack does so."""
 LOOK_S = 0.5
@@ -419,7 +431,7 @@ class Rack:
         faults = self._losses.faults
         tick_ms = self.config.clock_ns * 1e-6
         found = brakings(self.events, stop, tick_ms)
-        if cause in ("task done", "time over"):
+        if cause in SUCCESSES:
             faults += self._ending.latched()
         if cause == "time over":
             faults += self._ending.held(self.events, found, stop * tick_ms)
@@ -428,17 +440,32 @@ class Rack:
             # Written so that NaN is too far.
             faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
         self._end_boards()
+        self._await_last_cycles()
+        late, excused = judge_lost_cycles(self.segment, self.config, stop)
         self.outcome = Outcome(
             cause=cause,
             ticks=stop,
             state=state,
             reason=reason,
             digest=digest(self.segment, stop),
-            faults=tuple(faults),
+            faults=(*faults, *late),
             brakings=found,
             objects=objects,
+            excused=tuple(excused),
         )
         self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
+
+    def _await_last_cycles(self) -> None:
+        """Wait until boards have finished the cycles that they have begun, at most `LAST_S`."""
+        patience = Patience(self._journal, LAST_S)
+        while any(map(self._is_cycling, self._pids)) and not patience.is_over:
+            self._listen(patience.left_s)
+
+    def _is_cycling(self, name: str) -> bool:
+        if self._losses.is_beyond_help or name not in self.segment.map.blocks:
+            return False
+        block = self.segment.block(name)
+        return block[Block.DONE] < block[Block.RELEASED] and not block[Block.LOST]
 
     def _cause(self) -> Cause:
         if self._losses.given_up:

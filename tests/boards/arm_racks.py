@@ -34,6 +34,7 @@ mode = "lockstep"
 substeps = 2
 
 [supervision]
+max_missed_fraction = 1.0
 lockstep_restart_s = 0.1
 
 [board.arm]

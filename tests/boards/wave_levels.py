@@ -7,6 +7,7 @@ A level's parameter `trouble` selects the trouble, `at` its tick and `ticks` its
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -44,6 +45,10 @@ class Trouble:
             print("a wave", tick)  # noqa: T201  output of boards is tested
         elif self._kind == "raise" and tick == self._at:
             raise ValueError(f"no wave at tick {tick}")
+        elif self._kind == "crash":
+            raise RuntimeError("no cycle at all")
+        elif self._kind == "die" and tick == self._at:
+            os.kill(os.getpid(), signal.SIGKILL)
         elif self._kind == "late" and tick >= self._at:
             # Once, in the first cycle from then on: in real time a loaded machine skips some.
             self._kind = "none"

@@ -123,8 +123,10 @@ def run(
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
-    rack for over 5 s, or brakes for half of the run, without a cause in sight. 2 usage or config
-    error. A full disk ends the run. Ctrl-C ends it in order, with a report and exit status 130.
+    rack for over 5 s, or brakes for half of the run, without a cause in sight; if a level missed or
+    skipped more of its cycles than supervision.max_missed_fraction permits; or if the system
+    response exceeded its bound without a lost cycle. 2 usage or config error. A full disk ends the
+    run. Ctrl-C ends it in order, with a report and exit status 130.
 
     \b
     Examples:
@@ -159,6 +161,7 @@ def run(
     from rack.tools.live.display import display_for
     from rack.tools.live.folder import folder_of
     from rack.tools.live.launch import NO_TIME, Beginning, run_rack
+    from rack.tools.live.verdict import headline
 
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries
@@ -189,11 +192,11 @@ def run(
                 step=step,
                 begins=begins,
             )
-        is_reported = _report(found, folder, result, as_json)
-    if not result.worked:
+        report = _report(found, folder, result, as_json)
+    if not report["worked"]:
         # On stderr and last, where it is seen in any case.
-        print(result.failure(), file=sys.stderr)
-    sys.exit(0 if result.worked and is_reported else 1)
+        print(headline(found.name, report["outcome"], report["failures"]), file=sys.stderr)
+    sys.exit(0 if report["worked"] else 1)
 
 
 def _tables(config: str, overrides: list[str], faults: str | None) -> Tables:
@@ -220,28 +223,32 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
     return crate
 
 
-def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> bool:
-    """Make the report and print it. Return False if the folder of a run has none."""
+def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> Document:
+    """Make the report, print it and return it. A run that has no report where one is wanted has
+    failed."""
     from rack.tools.recording.recorder_process import size_of, size_text
     from rack.tools.timing.analysis.report import unrecorded, write_report
+    from rack.tools.timing.analysis.report_markdown import summary
     from rack.tools.timing.analysis.stored import print_report
 
-    report: tuple[Document, str] | None = None
+    data = unrecorded(config, asdict(result))
+    text = "\n".join(summary(data))
     try:
-        report = write_report(folder) if folder is not None else None
+        if folder is not None:
+            data, text = write_report(folder)
     except (Failure, OSError, MemoryError) as error:
-        print(f"{folder}: no report: {error or 'out of memory'}", file=sys.stderr)
-    data, text = report or (unrecorded(config, result.document()), result.text())
+        why = f"{folder}: no report: {error or 'out of memory'}"
+        data |= {"worked": False, "failures": [*data["failures"], why]}
+        text = "\n".join(summary(data))
     if result.others:
         data["others"] = [asdict(other) for other in result.others]
     print_report(data, text, as_json)
-    is_reported = folder is None or report is not None
     if as_json:
-        return is_reported
+        return data
     if folder is not None:
         lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
         print(f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}")
     for other in result.others:
         ended = f"{other.rack}: {other.cause} after {other.ticks} ticks"
         print(f"{ended}, digest {other.digest}, {other.folder or 'not recorded'}")
-    return is_reported
+    return data

@@ -17,9 +17,9 @@ from rack.boards.checkpoint.taking import are_wanted, keeping_for, outside
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.errors import UNKEPT
-from rack.boards.events import Event, Outcome, braked_text
+from rack.boards.events import Event, Outcome
 from rack.boards.wiring import Entries, Keeping
-from rack.tools.console.answer import Document, Failure
+from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, strikes
 from rack.tools.live.display import Display
@@ -28,14 +28,14 @@ from rack.tools.live.holds import Standstill
 from rack.tools.live.other_racks import OtherEnd, OtherRacks
 from rack.tools.live.queues import Queues
 from rack.tools.live.snapshot import RackMonitor
+from rack.tools.live.verdict import list_failures
 from rack.tools.recording.origin import Origin
 from rack.tools.recording.recorder_process import RecorderProcess
 
 COUNTED = (
     "CYCLES",
     "PLANS",
-    "MISSED",
-    "SKIPPED",
+    "DONE",
     "PRIORITY",
     "CORE",
     "READS",
@@ -75,7 +75,7 @@ class RunResult:
     `clock_offset_ns` converts CLOCK_MONOTONIC, in which boards stamp, to the time of the events.
     `refused`: messages that full queues refused, by queue. `recording` is "complete", "none" (not
     wanted), or what is missing; `rows_lost` are the rows missing, by task and by mailbox. `others`
-    are the racks launched with this one; `failed` says which of them failed.
+    are the racks launched with this one; `failed` says which of them failed, and why.
     """
 
     rack: str
@@ -93,36 +93,13 @@ class RunResult:
 
     @property
     def worked(self) -> bool:
-        """Whether the run succeeded, and was recorded as wanted; those of the others, too."""
-        is_recorded = self.recording in ("complete", "none")
-        return self.outcome.worked and is_recorded and not self.failed
+        """Whether the run succeeded as far as its end shows it: only a report judges its system
+        response."""
+        return not self.failure()
 
     def failure(self) -> str:
         """Return in one line why the run did not succeed."""
-        end = self.outcome
-        if self.failed:
-            return f"{self.rack}: {end.cause}; {self.failed}"
-        if end.worked:
-            return f"{self.rack}: {end.cause}, but not all is recorded: {self.recording}"
-        return (
-            f"{self.rack}: {end.cause}:"
-            f" {'; '.join(end.faults) or end.reason or f'after {end.ticks} ticks'}"
-        )
-
-    def document(self) -> Document:
-        """Return everything as plain data."""
-        return {**asdict(self), "worked": self.worked}
-
-    def text(self) -> str:
-        """Return the outcome as readable text."""
-        end = self.outcome
-        lines = [
-            f"{self.rack}: {end.cause} after {end.ticks}"
-            f" ticks{': ' + end.reason if end.reason else ''}"
-        ]
-        lines += [f"fault: {fault}" for fault in end.faults]
-        lines += [braked_text(end.brakings)] if end.brakings else []
-        return "\n".join([*lines, f"digest {end.digest}"])
+        return "; ".join(list_failures(self.outcome, self.recording, self.failed))
 
 
 def run_rack(
@@ -211,15 +188,17 @@ def run_rack(
             )
         _log_news(news, segment, log)
         failed = others.finish()
-        blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
         result = RunResult(
             rack=config.name,
             outcome=outcome,
             wall_s=wall_s,
             clock_skipped=segment.words[System.CLOCK_SKIPPED],
             tasks={
-                task: {name.lower(): block[Block[name]] for name in COUNTED}
-                for task, block in blocks.items()
+                task.name: {
+                    **{name.lower(): segment.block(task.name)[Block[name]] for name in COUNTED},
+                    **segment.count_cycles(task, outcome.ticks)._asdict(),
+                }
+                for task in segment.layout.tasks
             },
             recording=recording,
             rows_lost=rows_lost,
@@ -234,7 +213,7 @@ def run_rack(
 
 def _end_log(log: EventLog, result: RunResult) -> RunResult:
     """Write the end of a run; return its result, which fails without all events."""
-    log.end(result.document())
+    log.end(asdict(result))
     if log.has_failed:
         return replace(result, recording="events.jsonl ends before the run")
     return result

@@ -9,12 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Self
 
 from rack.backplane.process import die_with_parent, how_ended
 from rack.boards.config.schema import RackConfig
+from rack.tools.console.answer import Document
 
 END_S = 60.0
 """Longest wait for their end after this rack's own: they report on their runs, too."""
@@ -75,9 +77,7 @@ class OtherRacks:
         # Those that have been stopped end by a signal: that is no failure.
         if not self._is_stopped:
             failed = [rack for rack in self._racks if rack.process.poll()]
-            self._failed = "; ".join(
-                f"{rack.config}: {how_ended(rack.process.returncode)}" for rack in failed
-            )
+            self._failed = "; ".join(f"{rack.config}: {_failure_of(rack)}" for rack in failed)
         return self._failed
 
     def stop(self) -> None:
@@ -101,8 +101,7 @@ class OtherRacks:
         """Return how those have ended that ran."""
         found = []
         for rack in self._racks:
-            text = os.pread(rack.report, os.fstat(rack.report).st_size, 0)
-            report = json.loads(text) if text else {}
+            report = _report_of(rack)
             if outcome := report.get("outcome"):
                 end = outcome["cause"], outcome["ticks"], outcome["digest"]
                 found.append(OtherEnd(report["rack"], *end, report["folder"]))
@@ -117,3 +116,18 @@ class OtherRacks:
         for rack in self._racks:
             rack.process.kill()
             os.close(rack.report)
+
+
+def _report_of(rack: Launched) -> Document:
+    """Return the report of a rack; empty if it has not printed all of one."""
+    with suppress(ValueError):
+        found: Document = json.loads(os.pread(rack.report, os.fstat(rack.report).st_size, 0))
+        return found
+    return {}
+
+
+def _failure_of(rack: Launched) -> str:
+    """Return why a rack failed."""
+    report = _report_of(rack)
+    why = report.get("failures") or report.get("error")
+    return "; ".join(why or [how_ended(rack.process.returncode)])

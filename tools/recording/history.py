@@ -26,12 +26,17 @@ def misses(recording: Recording) -> list[Document]:
     count, times.
 
     A skipped release leaves no record of its own: the next record has the number skipped before it.
+    After the last record, the counts of the run's end show them.
     """
-    found = [
-        miss
-        for task in recording.layout.tasks
-        for miss in _misses_of(task, recording.trace(task.name))
-    ]
+    found = []
+    for task in recording.layout.tasks:
+        found += _misses_of(task, recording.trace(task.name))
+        done = recording.ended.get("tasks", {}).get(task.name, {}).get("done")
+        if done is None:
+            # The end is not recorded, or was by an earlier version.
+            continue
+        if count := task.count_unfinished(done, recording.ended["outcome"]["ticks"]):
+            found.append(_skipped(task, task.grid.since(done + 1), count))
     return sorted(found, key=lambda miss: (miss["tick"], miss["task"]))
 
 
@@ -49,18 +54,15 @@ def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
         *(column.tolist() for column in columns), strict=True
     ):
         if before:
-            found.append(
-                {
-                    "task": task.name,
-                    "tick": tick - before * task.every,
-                    "what": "skipped",
-                    "count": before,
-                }
-            )
+            found.append(_skipped(task, tick - before * task.every, before))
         if missed:
             times = {"started_ms": round(late_ms, 6), "took_ms": round(took_ms, 6)}
             found.append({"task": task.name, "tick": tick, "what": "late", "count": 1, **times})
     return found
+
+
+def _skipped(task: TaskSpec, tick: int, count: int) -> Document:
+    return {"task": task.name, "tick": tick, "what": "skipped", "count": count}
 
 
 def counted(found: Sequence[Document]) -> tuple[int, int]:

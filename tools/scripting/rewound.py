@@ -33,6 +33,7 @@ from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import NEAREST, Signal, Trigger
 from rack.tools.scripting.moment import RecordedMoment
 from rack.tools.timing.analysis.report import write_report
+from rack.tools.timing.analysis.report_markdown import summary
 
 
 @dataclass(frozen=True)
@@ -179,7 +180,7 @@ class RewoundRun:
         folder = folder_of(out, config.name)
         with state_at(self.recording, self.tick, states=self._states) as state:
             result = run_rack(config, seconds, folder, display, begins=state.begins)
-        write_report(folder)
+        report, _ = write_report(folder)
         differs = first_difference(self.recording, Recording(folder))
         where = "all that both wrote is equal"
         if differs is not None:
@@ -191,7 +192,7 @@ class RewoundRun:
             "outcome": asdict(result.outcome),
             "first_difference": None if differs is None else asdict(differs),
         }
-        return Glance(document, [result.text(), where, f"recorded into {folder}"])
+        return Glance(document, [*summary(report), where, f"recorded into {folder}"])
 
 
 def _flat(found: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:

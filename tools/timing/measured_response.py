@@ -21,6 +21,7 @@ from rack.levels.timing.system_response import mailboxes_along
 from rack.levels.timing.trace_times import counts, distribution
 from rack.levels.timing.verdicts import response_subject
 from rack.tools.console.answer import Document
+from rack.tools.live.network import exchanged
 from rack.tools.recording.recording import Recording
 
 LOSSES = ("died", "hang")
@@ -34,13 +35,16 @@ def system_response(recording: Recording) -> Document | None:
     It is that of the chains with the longest response; `others` holds the same for all other chains
     of the rack. `beyond` are the responses longer than their bound, each with the delays that the
     run shows; `unseen` counts those that cannot be measured because the recording lacks messages.
+    `crosses_racks`: the rack imports messages of others, of which the bounds know nothing.
     """
     rack = rack_timing(recording.rack_config, recording.layout)
     first = rack.hierarchy
     if not first.chains:
         return None
+    imported = exchanged(recording.config)
     return {
         **_response(recording, rack, first),
+        "crosses_racks": imported is not None and bool(imported.imports),
         "others": [
             _response(recording, rack, chains) for chains in rack.parallel if chains != first
         ],

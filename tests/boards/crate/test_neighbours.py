@@ -159,4 +159,4 @@ def test_without_real_time_priority_the_config_decides(
     assert "SCHED_FIFO refused, ordinary scheduling for wave" in printed
     assert "@GROUP - rtprio 99" in printed
     # Every view of the rack repeats it.
-    assert policy == "refuse" or "NO REAL-TIME PRIORITY" in printed.splitlines()[-3]
+    assert policy == "refuse" or "NO REAL-TIME PRIORITY" in printed.splitlines()[-5]

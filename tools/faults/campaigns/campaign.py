@@ -23,7 +23,6 @@ from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_pl
 from rack.tools.faults.campaigns.environment import examine, load
 from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
 from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult, kept
-from rack.tools.faults.campaigns.trial import restart_s
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
 from rack.tools.faults.ending import EXTERNAL, record_of
 
@@ -79,8 +78,9 @@ class Campaign:
         self.order = order
         self.folder = folder
         self._progress = progress
-        # Only the campaign's faults: the config's own would strike every trial.
-        self._config = order.config.model_copy(update={"fault": ()})
+        # Only the campaign's faults: the config's own would strike every trial. Misses are counted.
+        unjudged = order.config.supervision.model_copy(update={"max_missed_fraction": 1.0})
+        self._config = order.config.model_copy(update={"fault": (), "supervision": unjudged})
         self.layout: Layout = wire(self._config)
         self._second = 1e9 / self._config.clock_ns
         self._targets = Targets(self._config, self.layout)
@@ -136,7 +136,7 @@ class Campaign:
         write_json(path, wanted)
 
     def _under_test(self, lockstep: bool) -> RackUnderTest:
-        restart = restart_s(self._config, lockstep)
+        restart = self._config.supervision.restart_s(lockstep)
         return RackUnderTest(self._targets, self._ticks, self._second, restart)
 
     def _inject(self, results: Results, lockstep: bool) -> None:

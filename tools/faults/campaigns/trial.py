@@ -43,8 +43,6 @@ STILL_S = 120.0
 """Longest time without a tick: no rack plans for longer."""
 STUCK_S = 20.0
 """Longest time from a request to stop to the end."""
-RESTART_S = 2.0
-"""Longest time of a restart in real time: a planner with its libraries takes 1.5 s."""
 LOOK_S = 0.001
 """Time between two looks at the tick in lockstep, which has no grid to sleep on."""
 AGAIN_S = 2.0
@@ -201,7 +199,7 @@ def run_trial(
             layout=rack.segment.layout,
             offset_ns=time.time_ns() - time.monotonic_ns(),
             is_lockstep=plan.lockstep,
-            restart_s=restart_s(config, plan.lockstep),
+            restart_s=config.supervision.restart_s(plan.lockstep),
             has_failed=rack.outcome is not None and not rack.outcome.worked,
             moving=tuple(motion.body for motion in config.scene.motion),
         )
@@ -223,12 +221,6 @@ def run_trial(
         again=again,
         start=start,
     )
-
-
-def restart_s(config: RackConfig, lockstep: bool) -> float:
-    """Return the simulated time that a restart may take."""
-    in_lockstep = config.supervision.lockstep_restart_s
-    return in_lockstep if lockstep else max(RESTART_S, in_lockstep)
 
 
 def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None) -> None:

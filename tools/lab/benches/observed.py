@@ -46,7 +46,9 @@ class Recorded(NamedTuple):
     recording: Recording
 
 
-UNVIEWED = ("record.keep=600", "record.checkpoint_s=0")
+UNJUDGED = "supervision.max_missed_fraction=1"
+"""Setting of a rack whose lost cycles are measured: they do not fail its run."""
+UNVIEWED = ("record.keep=600", "record.checkpoint_s=0", UNJUDGED)
 """Settings of a rack whose recording nobody looks at: a flight recorder makes no viewer's file,
 which takes a recorder of 1 kHz as long as the rest."""
 

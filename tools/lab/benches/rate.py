@@ -38,7 +38,14 @@ from rack.tools.lab.benches.cyclictest import (
     overdue,
 )
 from rack.tools.lab.benches.harness import Absent, BenchResult, interleaved
-from rack.tools.lab.benches.observed import Observed, Runs, endless, missed_share, observe
+from rack.tools.lab.benches.observed import (
+    UNJUDGED,
+    Observed,
+    Runs,
+    endless,
+    missed_share,
+    observe,
+)
 
 RATES_HZ = (400, 500, 800, 1000, 1250, 2000)
 STEP_MS = 0.5
@@ -176,7 +183,7 @@ class Rates(BenchResult):
 
 def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Rates:
     """Run a rack at every rate, by turns with `cyclictest` on the core of its fastest board."""
-    config = load(name, [f"name=bench-{os.getpid()}"])
+    config = load(name, [f"name=bench-{os.getpid()}", UNJUDGED])
     racks = {rate_hz: at_rate(config, rate_hz) for rate_hz in sorted(rates_hz)}
     board = next(name for name in config.board if config.every(name) == 1)
     core = obtained_core(config.board[board].core)
@@ -203,10 +210,7 @@ def _figures(
     rate_hz: float, board: str, runs: Sequence[Observed], late: float | None
 ) -> RateFigures:
     settled = np.concatenate([run.settled(board) for run in runs])
-    ended = [run.outcome for run in runs if not run.outcome.worked]
-    failure = ""
-    if ended:
-        failure = f"{ended[0].cause}: {'; '.join(ended[0].faults) or ended[0].reason}"
+    failure = next(filter(None, (run.outcome.failure for run in runs)), "")
     processor_us = float(np.median(settled["processor_ns"])) * 1e-3 if len(settled) else 0.0
     return RateFigures(
         rate_hz=rate_hz,

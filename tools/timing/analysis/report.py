@@ -29,6 +29,7 @@ from rack.tools.live.host_side import ENTRY_COUNTS, entries_of
 from rack.tools.live.interrupts import interrupts
 from rack.tools.live.network import BOARD, COUNTS, STATUS, exchanged
 from rack.tools.live.queues import queues
+from rack.tools.live.verdict import UNRECORDED, judge_run
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.history import (
     counted,
@@ -88,7 +89,8 @@ def report_of(recording: Recording) -> Report:
     origin = Origin.of(recording)
     found = misses(recording)
     last = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
-    report = _head(config, ended, last + 1)
+    response = system_response(recording)
+    report = _head(config, ended, last + 1, response)
     if not ended:
         # Without the end of the run in the recording, the trace has to do.
         report["missed"], report["skipped"] = counted(found)
@@ -105,7 +107,7 @@ def report_of(recording: Recording) -> Report:
         "state_tables": fired_rows(recording),
         **faults(recording.events, layout),
         "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
-        "system_response": system_response(recording),
+        "system_response": response,
         "entries": _entries(recording),
         "network": network(recording),
         "task": arm_outcome.task_outcome(recording),
@@ -158,16 +160,19 @@ def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
     tasks = {
         task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks
     }
-    head = _head(config, ended, 0)
+    head = _head(config, ended, 0, None)
     return {
         **head,
+        "unjudged": [*head["unjudged"], UNRECORDED],
         **dict.fromkeys(unknown),
         "tasks": tasks,
         "recording": ended["recording"],
     }
 
 
-def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
+def _head(
+    config: RackConfig, ended: Mapping[str, Any], ticks: int, response: Report | None
+) -> Report:
     """Return the part that needs no recording; `ticks` is the length of a run whose end is not
     known."""
     outcome = ended.get("outcome", {})
@@ -178,7 +183,7 @@ def _head(config: RackConfig, ended: Mapping[str, Any], ticks: int) -> Report:
         "mode": config.clock.mode,
         "speed": config.clock.speed,
         "clock_ms": config.clock.period_ms,
-        "worked": ended.get("worked", False),
+        **judge_run(ended, response),
         "outcome": outcome or None,
         "digest": outcome.get("digest"),
         "objects": outcome.get("objects", []),
@@ -242,7 +247,7 @@ def task_times(
     R is their time slice. In lockstep a tick lasts as long as its tasks take: everything relative
     to a release or a time slice is None. `stretches` are as in `gaps_ns`.
     """
-    slice_ns = task.every * task.within_cycles * period_ns
+    slice_ns = task.slice * period_ns
     gaps = gaps_ns(cycles, stretches)
     by_the_clock: Report = {
         "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),

@@ -10,6 +10,7 @@ from rich.console import Console
 from rack.boards.events import Braking, braked_text
 from rack.tools.console.tables import Blocks, TextTable, figure, table
 from rack.tools.live.holds import resume_command
+from rack.tools.live.verdict import headline
 from rack.tools.recording.recording import Gap
 from rack.tools.timing.analysis.arm_outcome import (
     force_text,
@@ -67,21 +68,25 @@ def show(report: Report, terminal: Console) -> None:
     )
 
 
-def _blocks(report: Report) -> Blocks:
-    outcome = report["outcome"] or {"cause": "no outcome recorded", "reason": "", "faults": []}
-    why = outcome["reason"] or "; ".join(outcome["faults"])
-    yield f"# {report['rack']}: {outcome['cause']}{': ' + why if why else ''}"
+def summary(report: Report) -> Iterator[str]:
+    """Yield the verdict, and what is known of a run that was not recorded, too."""
+    outcome = report["outcome"]
+    yield f"# {headline(report['rack'], outcome, report['failures'])}"
     yield ""
     yield (
         f"{report['simulated_s']:.2f} s simulated in {report['wall_s']:.2f} s, {report['mode']}, "
         f"{report['missed']} missed, {report['skipped']} skipped cycles."
         f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
     )
+    yield from (f"- not judged: {line}" for line in report["unjudged"])
+    if found := (outcome or {}).get("brakings"):
+        yield f"- {braked_text([Braking(**one) for one in found])}"
+
+
+def _blocks(report: Report) -> Blocks:
+    yield from summary(report)
     if found := report["continues"]:
         yield f"- continues {found['folder'] or 'another run'} from {found['time_s']:g} s"
-    yield from (f"- fault: {fault}" for fault in outcome["faults"])
-    if found := outcome.get("brakings"):
-        yield f"- {braked_text([Braking(**one) for one in found])}"
     yield from (f"- {note}" for note in report["notes"])
     yield from _machine(report)
     if report["recording"] != "complete":

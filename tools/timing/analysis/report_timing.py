@@ -17,7 +17,7 @@ COUNTS = ("task", "R", "cycles", "missed", "skipped")
 BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation", "alpha")
 """Times relative to a release or a time slice: they mean nothing in lockstep."""
 USED = ("exec p50", "exec p99", "exec max", "comm p99", "proc p99", "plan age max")
-JUDGED = {True: "ok", False: "FAILS", None: "-"}
+JUDGED = {True: "ok", False: "beyond", None: "-"}
 DROPPED = (
     "deviation",
     "comm p99",

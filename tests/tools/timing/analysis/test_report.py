@@ -20,6 +20,7 @@ from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.levels.timing.equations import response_ticks
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
+from rack.tools.live.verdict import ACROSS_RACKS, judge_run
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis import arm_outcome
 from rack.tools.timing.analysis.report import report_of, task_times, write_report
@@ -147,8 +148,40 @@ def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path
         "delayed_by": ["fault: mute of upper"],
     }
     text = markdown(write_report(folder)[0] | {"system_response": response})
-    assert "FAILS" in next(line for line in text.splitlines() if line.startswith("| command, down"))
+    assert "beyond" in next(
+        line for line in text.splitlines() if line.startswith("| command, down")
+    )
     assert "- 1112.5 ms from tick 760: fault: mute of upper" in text.splitlines()
+
+
+@pytest.mark.slow
+def test_a_response_beyond_its_bound_fails_the_run_unless_something_explains_it(
+    folder: Path,
+) -> None:
+    sound = report_of(Recording(folder))
+    assert (sound["worked"], sound["failures"], sound["unjudged"]) == (True, [], [])
+    report = report_of(Silent(folder))
+    (failure,) = report["failures"]
+    assert report["worked"] is False
+    assert failure == (
+        "the response of a command along upper > lower took up to 1112.5 ms; bound: 112.5 ms, 1"
+        " times exceeded without a lost cycle"
+    )
+    assert markdown(report).splitlines()[0] == f"# {report['rack']} failed: {failure}"
+    explained = Silent(folder)
+    mute = {"kind": "mute", "board": "upper", "began": 760, "ends": 1200, "tick": 760}
+    explained.ended["faults"] = [mute | {"fault": 0}]
+    assert report_of(explained)["worked"]
+
+
+@pytest.mark.slow
+def test_the_response_of_a_rack_that_imports_messages_is_not_judged(folder: Path) -> None:
+    response = system_response(Silent(folder))
+    assert response is not None
+    assert response["crosses_racks"] is False
+    ended = Recording(folder).ended
+    judged = judge_run(ended, response | {"crosses_racks": True})
+    assert judged == {"worked": True, "failures": [], "unjudged": [ACROSS_RACKS]}
 
 
 @pytest.mark.slow
@@ -270,15 +303,19 @@ TOUCHED = "level 'servo': unintended contact: 'post' touches 'link4' at 3.125 s"
 @pytest.mark.parametrize(
     ("outcome", "headline"),
     [
-        ({"cause": "task failed", "reason": HELD, "faults": []}, f"task failed: {HELD}"),
-        ({"cause": "task done", "reason": "", "faults": [TOUCHED]}, f"task done: {TOUCHED}"),
+        ({"cause": "task failed", "reason": HELD, "faults": []}, f" failed: task failed: {HELD}"),
+        ({"cause": "task done", "reason": "", "faults": [TOUCHED]}, f" failed: {TOUCHED}"),
+        ({"cause": "task done", "reason": "all done", "faults": []}, ": task done: all done"),
     ],
 )
 def test_what_ended_a_run_or_is_latched_is_its_headline(
     folder: Path, outcome: dict[str, object], headline: str
 ) -> None:
-    text = markdown(write_report(folder)[0] | {"outcome": outcome})
-    assert text.splitlines()[0].endswith(f": {headline}")
+    recording = Recording(folder)
+    recording.ended["outcome"] |= outcome
+    report = report_of(recording)
+    assert report["worked"] is (not outcome["faults"] and outcome["cause"] == "task done")
+    assert markdown(report).splitlines()[0] == f"# {report['rack']}{headline}"
 
 
 @pytest.mark.slow

@@ -138,8 +138,7 @@ class _System:
         grid = self._grid()
         wakes = [cyclictest(grid)] if self._is_compared else []
         late = overdue(wakes, grid.period_ns)
-        failure = "" if run.worked else run.failure()
-        return self._figures(run, recording, late), failure
+        return self._figures(run, recording, late), run.failure()
 
     @property
     def _fastest(self) -> list[str]:
@@ -155,7 +154,7 @@ class _System:
         return WakeGrid.at(cores, 1e9 / period_ns, self._runs.seconds, priority)
 
     def _figures(self, run: RunResult, recording: Recording, late: float | None) -> RealTimeFigures:
-        counts = [cycles_in(run, self._layout, name) for name in self._fastest]
+        counts = [cycles_in(run, name) for name in self._fastest]
         cycles = cycles_of(recording)
         response = system_response(recording) or {"command": {}, "status": {}}
         command = response["command"]

@@ -67,12 +67,11 @@ def kill_each(config: RackConfig, layout: Layout, share: bool) -> KilledBoards:
     killing = config.model_copy(update={"fault": tuple(kills)})
     run = run_killing(killing, kills_s(layout), share)
     end = run.outcome
-    failure = "" if end.worked else f"{end.cause}: {'; '.join(end.faults) or end.reason}"
     return KilledBoards(
         detections=tuple(map(_detection, run.kills)),
         tick_ms=config.clock_ns * 1e-6,
         speed=end.ticks * config.clock_ns / run.lasted_ns,
-        failure=failure,
+        failure=end.failure,
     )
 
 

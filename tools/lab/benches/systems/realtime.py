@@ -45,11 +45,10 @@ class PlanLatency:
     computed_ms: Distribution | None
 
 
-def cycles_in(run: RunResult, layout: Layout, board: str) -> CycleCount:
+def cycles_in(run: RunResult, board: str) -> CycleCount:
     """Count the cycles of a board in a run: those missed or skipped, and those due."""
     counted = run.tasks[board]
-    due = -(-run.outcome.ticks // layout.task(board).every)
-    return CycleCount(min(due, counted["missed"] + counted["skipped"]), due)
+    return CycleCount(counted["missed"] + counted["skipped"], counted["due"])
 
 
 def bus_traffic(

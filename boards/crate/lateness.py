@@ -1,0 +1,71 @@
+"""Judges whether the tasks of a run kept up with the clock.
+
+Every release without a finished cycle is a skipped cycle, whatever the reason: the task was late,
+or its board dead, restarting, or not back before the end of the run.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.segment import Segment
+from rack.boards.config.schema import RackConfig
+from rack.boards.faults.describe import board_of, describe
+from rack.boards.faults.kind import kind_of
+
+
+def judge_lost_cycles(
+    segment: Segment, config: RackConfig, end: int
+) -> tuple[list[str], list[str]]:
+    """Judge the cycles that each task lost, by missing or skipping them.
+
+    Which cycles an injected fault cost is not known without a trace. Each task has the benefit of
+    the doubt: as many lost cycles as were due from a fault's first effect to the end of its
+    recovery, by the bound of its kind, are excused. The rest is compared with the other cycles.
+
+    Args:
+        segment: Memory of the rack, whose boards have finished their last cycles.
+        config: The rack; its `[supervision]` says how many may be lost.
+        end: Length of the run, ticks.
+
+    Returns:
+        A line for each task that lost too many cycles, and for each that only faults excuse.
+    """
+    late = []
+    excused = []
+    layout = segment.layout
+    fraction = config.supervision.max_missed_fraction
+    restart_s = config.supervision.restart_s(config.clock.mode == "lockstep")
+    table = FaultTable(segment).staged((Stage.ACTIVE, Stage.OVER))
+    faults = [fault for fault in table if fault[Entry.STRUCK_TICK] >= 0]
+    for task in layout.tasks:
+        counts = segment.count_cycles(task, end)
+        disturbed = np.zeros(end, bool)
+        for fault in faults:
+            recovery = kind_of(fault).recovery_ticks(board_of(fault, layout), layout, restart_s)
+            # The cycle that is at work when the fault strikes may be lost, too.
+            first = max(0, fault[Entry.STRUCK_TICK] - task.slice + 1)
+            disturbed[first : fault[Entry.UNTIL] + recovery] = True
+        excusable = min(counts.due, int(disturbed[task.phase :: task.every].sum()))
+        rest = counts.lost - excusable
+        judged = counts.due - excusable
+        text = f"level '{task.name}' {counts}"
+        if excusable:
+            named = ", ".join(describe(fault, layout, config.joints) for fault in faults)
+            text += f", {excusable} of which were due during faults and recoveries: {named}"
+        if rest > _permit(judged, fraction, counts.plan):
+            share = f"{100 * rest / judged:.3g} %; at most {100 * fraction:.3g} % permitted"
+            late.append(f"{text} ({share})")
+        elif counts.lost > _permit(counts.due, fraction, counts.plan):
+            excused.append(text)
+    return late, excused
+
+
+def _permit(due: int, fraction: float, plan: int) -> int:
+    """Return how many of the cycles due may be lost: the fraction, rounded up so that one late
+    cycle, or plan, does not fail a short run; but not all of them."""
+    most = plan * math.ceil(fraction * due / plan)
+    return most if fraction == 1 else max(0, min(most, due - 1))

@@ -1,0 +1,146 @@
+"""A level that loses too many of its cycles fails the run; a release without a cycle is a skipped
+cycle, whatever the reason."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rack.backplane.words import Block
+from rack.boards import Rack
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.lateness import _permit
+from rack.boards.events import Event, Outcome
+from rack.boards.faults.config import FaultConfig
+from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
+
+JUDGED = "supervision.max_missed_fraction=0.05"
+SOON = "supervision.lockstep_restart_s=0.05"
+"""A lost board is back after 20 ticks."""
+CRASHES = ('board.wave.params.trouble="crash"', "supervision.restarts=1000")
+COUNTED = tuple[int, int, int, int]  # cycles, missed, skipped, due
+
+
+def run(config: RackConfig, seconds: float) -> tuple[Outcome, list[Event], dict[str, COUNTED]]:
+    """Run a rack; return how it ended, what happened, and the counts of its tasks."""
+    with Rack(config) as rack:
+        outcome = rack.run(seconds)
+        counted = {
+            task.name: (
+                rack.segment.block(task.name)[Block.CYCLES],
+                *rack.segment.count_cycles(task, outcome.ticks)[:3],
+            )
+            for task in rack.segment.layout.tasks
+        }
+        return outcome, rack.events, counted
+
+
+def struck(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
+    """Return the config with these faults."""
+    return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
+
+
+@pytest.mark.parametrize(
+    ("due", "fraction", "plan", "permitted"),
+    [
+        (800, 0.05, 1, 40),
+        (790, 0.05, 1, 40),
+        (10, 0.05, 1, 1),
+        (2, 0.05, 1, 1),
+        (1, 0.05, 1, 0),
+        (0, 0.05, 1, 0),
+        (100, 0.0, 1, 0),
+        (10, 0.99, 1, 9),
+        (10, 1.0, 1, 10),
+        (400, 0.05, 8, 24),
+        (10, 0.05, 4, 4),
+        (4, 0.05, 4, 3),
+    ],
+)
+def test_the_fraction_is_rounded_up_but_never_permits_to_lose_all(
+    due: int, fraction: float, plan: int, permitted: int
+) -> None:
+    assert _permit(due, fraction, plan) == permitted
+
+
+@pytest.mark.slow
+def test_a_level_that_crashes_in_every_first_cycle_has_skipped_all_and_fails_the_run(
+    config: MakeConfig,
+) -> None:
+    outcome, events, counted = run(config(JUDGED, SOON, *CRASHES, text=PLAIN), 0.2)
+    assert counted == {"wave": (0, 0, 80, 80), "watch": (10, 0, 0, 10)}
+    assert (outcome.cause, outcome.worked) == ("time over", False)
+    assert outcome.faults == (
+        "level 'wave' missed 0 and skipped 80 of its 80 cycles (100 %; at most 5 % permitted)",
+    )
+    printed = [event.text for event in events if event.kind == "printed"]
+    assert sum(text.startswith("Traceback") for text in printed) == 1
+    died = sum(event.kind == "died" for event in events)
+    again = [text for text in printed if "in the same place" in text]
+    assert died - len(again) in (1, 2)  # the last one may not have been read
+    assert again[1] == (
+        "board 'wave' failed in the same place, 2 more so far: RuntimeError: no cycle at all"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
+def test_every_release_of_an_executor_is_a_cycle_or_a_skipped_one(
+    config: MakeConfig, coupling: tuple[str, ...]
+) -> None:
+    # The last board is not back before the end of the run.
+    faults = [
+        {"kind": "kill", "board": "wave", "tick": 30},
+        {"kind": "kill", "board": "wave", "tick": 60},
+        {"kind": "clock-skip", "board": "clock", "tick": 100, "ticks": 7},
+        {"kind": "kill", "board": "watch", "tick": 150},
+    ]
+    _, _, counted = run(struck(config(JUDGED, SOON, *coupling), *faults), 0.4)
+    for name in ("wave", "watch"):
+        cycles, missed, skipped, due = counted[name]
+        assert (cycles + skipped, missed) == (due, 0), name
+    assert counted["wave"][2] == 20 + 20 + 7
+    assert counted["watch"][2] == 1
+
+
+@pytest.mark.slow
+def test_lost_cycles_are_excused_by_an_injected_fault_as_far_as_it_can_have_cost_them(
+    config: MakeConfig,
+) -> None:
+    kill = {"kind": "kill", "board": "wave", "tick": 80}
+    outcome, _, counted = run(struck(config(JUDGED, SOON, text=PLAIN), kill), 0.8)
+    assert (outcome.worked, counted["wave"]) == (True, (300, 0, 20, 320))
+    # Its tick, one cycle, 20 ticks for the restart, and 100 for the recovery.
+    named = "122 of which were due during faults and recoveries: kill of wave"
+    assert outcome.excused == (f"level 'wave' missed 0 and skipped 20 of its 320 cycles, {named}",)
+    # What else is lost is not excused.
+    kill["board"] = "watch"
+    named = "129 of which were due during faults and recoveries: kill of watch"
+    outcome, _, _ = run(struck(config(JUDGED, SOON, *CRASHES, text=PLAIN), kill), 0.8)
+    assert outcome.faults == (
+        f"level 'wave' missed 0 and skipped 320 of its 320 cycles, {named}"
+        " (100 %; at most 5 % permitted)",
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("fraction", "worked"), [(0.05, False), (0.15, True), (1.0, True)])
+def test_a_board_that_dies_by_itself_is_not_excused(
+    config: MakeConfig, fraction: float, worked: bool
+) -> None:
+    settings = (f"supervision.max_missed_fraction={fraction}", SOON)
+    dies = ('board.wave.params.trouble="die"', "board.wave.params.at=100")
+    outcome, _, counted = run(config(*settings, *dies, text=PLAIN), 0.4)
+    assert counted["wave"] == (140, 0, 20, 160)
+    assert outcome.worked is worked
+    assert outcome.excused == ()
+
+
+@pytest.mark.slow
+def test_a_planner_is_judged_by_its_releases_of_which_a_plan_takes_several(
+    config: MakeConfig,
+) -> None:
+    outcome, _, counted = run(config(JUDGED), 0.5)
+    assert outcome.worked
+    assert counted["wave.planner"][1:] == (0, 0, 197)
