@@ -79,8 +79,8 @@ class CycleCounts(NamedTuple):
 
     @property
     def lost(self) -> int:
-        """The cycles that were missed or skipped."""
-        return self.missed * self.plan + self.skipped
+        """The cycles missed or skipped; a plan may have ended after the last cycle due."""
+        return min(self.due, self.missed * self.plan + self.skipped)
 
     def __str__(self) -> str:
         """Return what was lost, as readable text."""

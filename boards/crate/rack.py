@@ -406,7 +406,10 @@ class Rack:
                 is_board = name == CLOCK or name in self.segment.map.blocks
                 is_over = self._is_stopped or self.outcome is not None
                 if is_board and not (is_over and status == 0):
-                    self._losses.lose(end, self._is_stopped, self._record_printed)
+                    # Of one that died before the end the policy decides, however late this is read.
+                    died_before = name != CLOCK and self.segment.block(name)[Block.LOST]
+                    is_late = self._is_stopped and not died_before
+                    self._losses.lose(end, is_late, self._record_printed)
             case None:
                 self._losses.lose_crate()
 
