@@ -84,7 +84,6 @@ class ActuatorMonitor:
             0.0  # N m: commanded and given at first, most given since
         )
         self._alone = True  # it is the only motor that lacks torque
-        self.observed = ""  # the last finding in words, without its joint
 
     def begin(self) -> None:
         """Begin a cycle with `torque`, at the velocity and terms last looked at."""
@@ -113,7 +112,6 @@ class ActuatorMonitor:
         if verdict == ASTRAY:
             astray = wanted[0] - state[0]
             joint = int((np.abs(astray) - self._off).argmax())
-            self.observed = f"is {abs(astray[joint]):.3g} rad from its set point"
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
         return self._lacking(self._left, state[1], holds)
 
@@ -159,8 +157,6 @@ class ActuatorMonitor:
         ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
         if (ahead > self._fastest).any() or self._sure(joint, commanded[joint], lacks[joint]):
             self._cycles = 0
-            moved = self.torque[joint] - left[joint]
-            self.observed = f"moves as by {moved:.3g} N m; commanded: {self.torque[joint]:.3g} N m"
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
         return None
 

@@ -352,7 +352,7 @@ class ArmDriver(Executor):
     def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
         if not self.stopping.trying:
             self.findings.append(finding)
-        return self.stopping.motor_fails(finding, self.motors.observed, tick)
+        return self.stopping.motor_fails(finding.subject, finding.value, tick)
 
     def _refuse(self, finding: Finding, tick: int) -> None:
         """React to a torque that the arm refused, engaging its brakes."""

