@@ -59,7 +59,6 @@ RUNS_THEM = {
     "campaign": "it runs a config",
     "bench": "it runs configs",
     "reproduce": "it runs configs",
-    "claims": "it runs commands of the project",
 }
 """The commands that may import what a config names. Any other one is tested below."""
 

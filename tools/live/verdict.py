@@ -27,7 +27,7 @@ def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
     """
     unjudged: list[str] = []
     failures = ["the end of the run is not recorded"]
-    if ended:
+    if ended.get("outcome"):
         outcome = Outcome(**ended["outcome"])
         unjudged += outcome.excused
         failures = list_failures(outcome, ended["recording"], ended["failed"])

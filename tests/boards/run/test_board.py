@@ -69,7 +69,7 @@ def test_a_mistake_in_a_level_ends_its_board_with_a_traceback(
     status, said = ended(make_bus(task("level")), raising(ZeroDivisionError("by zero")))
     assert status == 1
     assert said.startswith("board 'level' failed:\nTraceback")
-    assert said.endswith("ZeroDivisionError: by zero\n\n")
+    assert said.endswith("ZeroDivisionError: by zero\n")
 
 
 @pytest.mark.filterwarnings(FORKS)

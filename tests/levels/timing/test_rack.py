@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rack.levels.timing.forecast import Forecast
+from rack.levels.timing.forecast import NO_BUDGET, Forecast
 from rack.levels.timing.level import BoardTiming
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
@@ -166,13 +166,10 @@ def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
         FIGURE_3, name="silent", budget=replace(FIGURE_3.budget, plan_ns=0), core=2, planner_core=2
     )
     plain = replace(silent, name="plain", has_planner=False, core=3)
-    notes = Forecast.of(rack(FIGURE_3, silent, plain, board("unknown", 4))).notes
-    assert [note for note in notes if note.startswith("planner not judged")] == [
-        "planner not judged, no plan_ms in the budget: silent"
-    ]
-    assert not any(
-        "planner not judged" in note for note in Forecast.of(rack(FIGURE_3, plain)).notes
-    )
+    found = Forecast.of(rack(FIGURE_3, silent, plain, board("unknown", 4))).uncounted
+    assert found.keys() - {CLOCK.name} == {"silent.planner", "unknown"}
+    assert {found["silent.planner"], found["unknown"]} == {NO_BUDGET}
+    assert not Forecast.of(rack(FIGURE_3, plain)).uncounted.keys() - {CLOCK.name}
 
 
 def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
@@ -192,7 +189,7 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     bare = Forecast.of(
         replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False
     ).notes
-    assert [note.partition(" ")[0] for note in bare] == ["no", "the"]
+    assert [note.partition(" ")[0] for note in bare] == ["no"]
     # Two ordinary tasks that compute share a core; one has it to itself.
     both = replace(FIGURE_3, priority=0, planner_priority=0)
     assert "ordinary scheduling" in Forecast.of(replace(counted, boards={"level": both})).notes[-1]

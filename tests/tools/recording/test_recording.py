@@ -3,7 +3,6 @@ read."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 from rack.backplane.message import State
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
-from rack.tools.recording.checksums import Checksums, read_line
+from rack.tools.recording.checksums import Checksums, checked_line, read_line
 from rack.tools.recording.parquet import HEAD, SignalTables
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import TABLES
@@ -181,14 +180,14 @@ def test_events_of_something_else_are_named_with_their_line(damaged: Path, text:
 
 def test_an_event_that_became_known_late_is_in_its_place(damaged: Path) -> None:
     path = damaged / "events.jsonl"
-    *lines, outcome = path.read_text().splitlines()
-    late = json.loads(lines[-1]) | {"tick": 7, "code": "late"}
-    path.write_text("\n".join([*lines, json.dumps(late), outcome, ""]))
+    *lines, outcome = path.read_text().splitlines(keepends=True)
+    late = read_line(lines[-1]) | {"tick": 7, "code": "late"}
+    path.write_text("".join([*lines, checked_line(late), outcome]))
     events = Recording(damaged).events
     ticks = [event["tick"] for event in events[:-1]]
     assert late in events
     assert ticks == sorted(ticks)
-    assert events[-1] == json.loads(outcome)
+    assert events[-1] == read_line(outcome)
 
 
 def test_a_last_line_that_is_cut_is_left_out_and_said(

@@ -14,7 +14,7 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards.config import load
 from rack.tools.faults.campaigns import trial
 from rack.tools.faults.campaigns.plan import Kill, Plan
-from rack.tools.faults.campaigns.trial import Killer, _watch, restart_s, run_trial
+from rack.tools.faults.campaigns.trial import Killer, _watch, run_trial
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
@@ -195,6 +195,7 @@ def test_a_run_that_stands_still_is_stopped_and_left_if_it_is_stuck(
 
 def test_a_restart_takes_at_least_its_real_time_where_time_is_real(small: Path) -> None:
     config = load(small, ["supervision.lockstep_restart_s=0.5"])
-    assert (restart_s(config, lockstep=True), restart_s(config, lockstep=False)) == (0.5, 2.0)
-    slow = load(small, ["supervision.lockstep_restart_s=3.0"])
-    assert (restart_s(slow, lockstep=True), restart_s(slow, lockstep=False)) == (3.0, 3.0)
+    supervision = config.supervision
+    assert (supervision.restart_s(True), supervision.restart_s(False)) == (0.5, 2.0)
+    slow = load(small, ["supervision.lockstep_restart_s=3.0"]).supervision
+    assert (slow.restart_s(True), slow.restart_s(False)) == (3.0, 3.0)
