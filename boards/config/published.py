@@ -7,16 +7,17 @@ there: it imports no class that a config names, since that would run the code of
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any, Literal
 
 from pydantic import Field, TypeAdapter, create_model
 from pydantic.fields import FieldInfo
 
 from rack.backplane.errors import SegmentError
+from rack.backplane.json_text import encode_json
 from rack.backplane.segment import Segment
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.wiring import commandable, executors
@@ -95,7 +96,7 @@ class PublishedRack:
 
     def text(self) -> str:
         """Return it as text, without the parts of kinds that are code."""
-        return json.dumps(ADAPTER.dump_python(self, exclude=CODE))
+        return encode_json(ADAPTER.dump_python(self, exclude=CODE))
 
     @classmethod
     def read(cls, text: str) -> PublishedRack:
@@ -173,7 +174,9 @@ def _param(declared: FieldInfo, launched: object) -> PublishedParam:
     constraints: dict[Constraint, float | bool] = {}
     for bound in declared.metadata:
         for key in CONSTRAINTS:
-            if (value := getattr(bound, key, None)) is not None:
+            value = getattr(bound, key, None)
+            # An infinite bound is none, and JSON has no infinity.
+            if value is not None and isfinite(value):
                 constraints[key] = value if isinstance(value, bool) else float(value)
     kind = getattr(declared.annotation, "__name__", "")
     is_known = kind in TYPES

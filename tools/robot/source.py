@@ -130,7 +130,7 @@ def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
             n for n in visible if n not in unread
         ],
         "no <collision> and no mesh that can be read, so no shape in planning": [*unread],
-        "no <inertial>, so shapes weigh what water does": [
+        "no <inertial>, so the mass is computed from the shapes, with the density of water": [
             name
             for name, link in links.items()
             if name in moved

@@ -118,7 +118,9 @@ def test_what_is_only_visible_counts_in_planning_and_is_said(tmp_path: Path) -> 
 def test_links_without_inertia_are_named(tmp_path: Path) -> None:
     text = re.sub(r'(<link name="l[12]">)<inertial>.*?</inertial>', r"\1", MODEL, flags=re.DOTALL)
     notes = read(tmp_path, text).notes
-    assert notes == ["no <inertial>, so shapes weigh what water does: l1, l2"]
+    assert notes == [
+        "no <inertial>, so the mass is computed from the shapes, with the density of water: l1, l2"
+    ]
 
 
 def test_visuals_that_cannot_be_read_are_said_or_refused_if_there_is_nothing_else(
