@@ -234,10 +234,15 @@ def test_a_report_made_again_knows_kinds_that_levels_add(guarded: Spied) -> None
     published = guarded.run / "published.json"
     text = published.read_text()
     try:
-        for damaged, said in {"": "published.json", "{}": "unknown kind 'spy-drop'"}.items():
+        for is_there, said in (
+            (True, "published.json: damaged"),
+            (False, "unknown kind 'spy-drop'"),
+        ):
             kind = KINDS._by_name.pop("spy-drop", None)
             KINDS._by_number.pop(kind.number if kind else 0, None)
-            published.write_text(damaged)
+            published.unlink()
+            if is_there:
+                published.write_text("{}")
             (guarded.run / "report.json").unlink(missing_ok=True)
             refused = rack("report", guarded.run)
             assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
