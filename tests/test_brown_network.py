@@ -241,7 +241,8 @@ def test_a_rack_that_cannot_be_launched_ends_the_other_with_status_1(
         status, said = both.await_end()
     assert status == 1
     assert 'config = "none/none.toml": no such file' in said
-    assert said.splitlines()[-1].endswith("stopped; none/none.toml: exit status 2")
+    assert " failed: stopped: " in said.splitlines()[-1]
+    assert '; none/none.toml: config = "none/none.toml": no such file' in said.splitlines()[-1]
 
 
 def repeated(run: Path, out: Path) -> tuple[str, str]:

@@ -7,10 +7,10 @@ or its board dead, restarting, or not back before the end of the run.
 from __future__ import annotations
 
 import math
-
-import numpy as np
+from collections.abc import Iterable
 
 from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.describe import board_of, describe
@@ -43,13 +43,13 @@ def judge_lost_cycles(
     faults = [fault for fault in table if fault[Entry.STRUCK_TICK] >= 0]
     for task in layout.tasks:
         counts = segment.count_cycles(task, end)
-        disturbed = np.zeros(end, bool)
+        disturbed = []
         for fault in faults:
             recovery = kind_of(fault).recovery_ticks(board_of(fault, layout), layout, restart_s)
             # The cycle that is at work when the fault strikes may be lost, too.
             first = max(0, fault[Entry.STRUCK_TICK] - task.slice + 1)
-            disturbed[first : fault[Entry.UNTIL] + recovery] = True
-        excusable = min(counts.due, int(disturbed[task.phase :: task.every].sum()))
+            disturbed.append((first, min(end, fault[Entry.UNTIL] + recovery)))
+        excusable = min(counts.due, _count_releases(task, disturbed))
         rest = counts.lost - excusable
         judged = counts.due - excusable
         text = f"level '{task.name}' {counts}"
@@ -62,6 +62,20 @@ def judge_lost_cycles(
         elif counts.lost > _permit(counts.due, fraction, counts.plan):
             excused.append(text)
     return late, excused
+
+
+def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
+    """Return how many releases of a task lie in any of these spans of ticks, which may overlap."""
+    count = 0
+    reached = 0
+    for first, end in sorted(spans):
+        first = max(first, reached)
+        if first < end:
+            reached = end
+            # Releases before a tick, rounded up.
+            before, within = (-(-max(0, tick - task.phase) // task.every) for tick in (first, end))
+            count += within - before
+    return count
 
 
 def _permit(due: int, fraction: float, plan: int) -> int:

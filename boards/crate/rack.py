@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Self
 from rack.backplane import semaphores
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import pick
-from rack.backplane.errors import EmergencyStopError
+from rack.backplane.errors import DamageError, EmergencyStopError
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import digest
@@ -80,6 +80,8 @@ UP = (TaskState.READY, TaskState.RUNNING)
 TO_SHARE = "stop that rack, choose other cores, or use --share"
 LEAVE_S = 2.0
 """Time for the boards to end by themselves."""
+MOST_TICKS = 1 << 48
+"""No run has so many."""
 LAST_S = 0.2
 """Time for the boards to finish their last cycles before these are counted."""
 STOP_S = 0.8
@@ -429,6 +431,8 @@ class Rack:
             self._journal.keep(rung.event)
         words = self.segment.words
         stop = words[System.STOP_TICK] or words[System.TICK] + 1
+        if not 0 <= stop < MOST_TICKS:
+            raise DamageError(f"a run of {stop} ticks")
         state, reason = self._ending.final_state()
         cause = self._cause()
         faults = self._losses.faults

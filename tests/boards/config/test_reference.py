@@ -18,6 +18,7 @@ DIMENSIONLESS = {
     *(
         "speed",
         "small_share",
+        "max_missed_fraction",
         "phase",
         "damping",
         "braking",

@@ -171,8 +171,8 @@ MISTAKES = {
     "no class": (
         "board.upper.executor='two_levels:Uper'",
         (
-            "has no class 'Uper'; it has: Lower, PlanWriter, Programmed, Reasonless, Stateless,"
-            " Unfinished, Upper"
+            "has no class 'Uper'; it has: Crashing, Lower, PlanWriter, Programmed, Reasonless,"
+            " Stateless, Unfinished, Upper"
         ),
     ),
     "no executor": (
