@@ -148,7 +148,10 @@ def file_at(path: Path) -> Path | None:
     exist or the path is invalid (unknown ~user)."""
     try:
         path = path.expanduser()
-        return path.resolve() if path.exists() and not path.is_dir() else None
+        if path.is_file():
+            return path.resolve()
+        # Its own name says more than the device to which it may be a link.
+        return path.absolute() if path.exists() and not path.is_dir() else None
     except (OSError, RuntimeError, ValueError):
         return None
 

@@ -50,7 +50,9 @@ def slowed(name: str) -> list[str]:
 
 def run(name: str, folder: Path, *settings: str, seconds: float = SECONDS) -> TracedRun:
     """Run a rack of the figures under a name of its own, into `folder`, and return the run."""
-    config = load(name, [f"name=test-{os.getpid()}-{name}", *settings])
+    # Some figures show levels that are late throughout.
+    own = (f"name=test-{os.getpid()}-{name}", "supervision.max_missed_fraction=1")
+    config = load(name, [*own, *settings])
     result = run_rack(config, seconds, folder, Display())
     assert result.worked, result.failure()
     return TracedRun(Recording(folder))

@@ -34,8 +34,11 @@ on a loaded machine it is slow, but never idle. Fewer for one that a signal has 
 seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
-RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", ".checkpoint")
-"""Endings of the files of a recording."""
+RECORDED = (
+    *(".toml", ".jsonl", ".spool", ".parquet", ".rrd", ".checkpoint"),
+    *(".xxh128", "published.json"),
+)
+"""Endings of the names of a recording's files."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
 """Exit status of a recorder whose files cannot be written, as on a full disk: another one could not
@@ -238,7 +241,7 @@ def size_of(folder: Path) -> int:
     for file in folder.rglob("*"):
         # A flight recorder removes some.
         with suppress(FileNotFoundError):
-            if file.suffix in RECORDED and file.is_file():
+            if file.name.endswith(RECORDED) and file.is_file():
                 size += file.stat().st_size
     return size
 

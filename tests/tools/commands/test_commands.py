@@ -145,6 +145,7 @@ def test_run_prints_one_json_document_and_nothing_else(
         "config.toml",
         "cycles.parquet",
         "events.jsonl",
+        "published.json",
         "report.json",
         "report.md",
         "run.rrd",
