@@ -1,4 +1,4 @@
-"""Names of racks, which are also those of their segments."""
+"""Names of racks. A rack and its segment have the same name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ RACK_NAME = "[a-z0-9][a-z0-9_-]{0,39}"
 
 
 def is_free_name(name: str, taken: Container[str]) -> bool:
-    """Return whether a name is valid, and not among those that are taken."""
+    """Return True if a name is valid and not taken."""
     return re.fullmatch(RACK_NAME, name) is not None and name not in taken
 
 

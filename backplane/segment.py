@@ -38,7 +38,7 @@ from rack.backplane.words import Block, Box, Head, Run, System
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 16
 LOCKED_SINCE = 16
-"""First version in which the launcher holds a lock."""
+"""First layout version whose launcher holds a lock."""
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 """Words with the addresses of the texts; the word after each has its size."""
 PREFIX = "nasrem-rack."

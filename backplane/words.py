@@ -31,7 +31,7 @@ class Head(IntEnum):
     VERSION = 1
     SIZE = 2
     LAUNCHER_PID = 3  # the launcher holds the kernel's lock on this word
-    LAUNCHER_NAMESPACE = 4  # inode of the PID namespace in which it has that process id
+    LAUNCHER_NAMESPACE = 4  # inode of the launcher's PID namespace
     CREATED_NS = 5  # CLOCK_REALTIME
     LAYOUT_AT = 6
     LAYOUT_SIZE = 7

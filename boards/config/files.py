@@ -150,7 +150,7 @@ def file_at(path: Path) -> Path | None:
         path = path.expanduser()
         if path.is_file():
             return path.resolve()
-        # Its own name says more than the device to which it may be a link.
+        # Keep the name as given: the file may be a link to a device.
         return path.absolute() if path.exists() and not path.is_dir() else None
     except (OSError, RuntimeError, ValueError):
         return None
@@ -235,7 +235,7 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
 def _read(
     path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
 ) -> Tables:
-    """Return the tables of a file, merged with those that it extends.
+    """Read a file and merge its tables into the tables of the files that it extends.
 
     Args:
         path: The file.

@@ -130,7 +130,7 @@ CODE: Any = {
         }
     }
 }
-"""What is not published: functions and classes."""
+"""Fields that are left out, because they hold functions or classes."""
 
 
 def publish(config: RackConfig) -> PublishedRack:

@@ -173,7 +173,7 @@ class Rack:
         shared = conflicts(self.config, held)
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
-        # First of all: the steps that follow are those that take long on occupied cores.
+        # Reported first, because the next steps take long on occupied cores.
         for note in shared or occupied(held):
             self._journal.add("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()

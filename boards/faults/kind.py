@@ -216,7 +216,7 @@ class Kinds:
             self._by_name[kind.name] = self._by_number[kind.number] = kind
 
     def adopt(self, kinds: Iterable[Kind]) -> None:
-        """Add kinds that a rack has published, besides those that are known here."""
+        """Add the kinds that a rack has published and this process does not know."""
         self.add(*(kind for kind in kinds if kind.number not in self._by_number))
 
     def __iter__(self) -> Iterator[Kind]:

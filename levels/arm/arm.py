@@ -115,7 +115,7 @@ class Arm(Plant, ABC):
         self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
         self.grip_force = 0.0  # N: given to the gripper last
         self.state = DriveState.DISABLED  # of the drives, as of the last `step`
-        # Why the brakes are engaged, see `Alarm.BRAKES_CLOSED`, and since which tick; None: not.
+        # Reason (see `Alarm.BRAKES_CLOSED`) and first tick of braking. None while released.
         self._brakes: tuple[int, int] | None = (AT_START, self.tick)
         self.dynamics = Dynamics(
             cell

@@ -287,14 +287,14 @@ def equality_name(model: mujoco.MjModel, equality: int) -> str:
 
 
 def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: bool = True) -> None:
-    """Refuse a model in which an equality ties a joint of the arm to anything.
+    """Refuse a model with an equality that ties a joint of the arm.
 
     Planning, inverse kinematics, dynamics and the servo loop treat these joints as independent.
 
     Args:
         model: The compiled model.
         joints: The arm's joints.
-        of_bodies: Whether equalities of bodies count, beside those of joints and tendons.
+        of_bodies: Whether to check equalities between bodies as well.
 
     Raises:
         RobotError: A joint of the arm is tied.
@@ -311,7 +311,7 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
 
 
 def tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
-    """Return the joints that an equality ties: of bodies, those that move only one of the two."""
+    """Return the joints that an equality ties. Bodies are tied by joints that move only one."""
     ends = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
     ends = ends[ends >= 0]
     kind = model.eq_type[equality]

@@ -48,7 +48,7 @@ NUMBERS = (
 )
 """Numeric attributes in links and joints of a URDF."""
 LIMITS = ("range", "cutoff", "effort")
-"""Ends of the names of attributes in which infinity means that there is no limit."""
+"""Endings of attribute names whose value may be infinite, meaning no limit."""
 FASTEST = 1e9
 """Velocity that no joint has, rad/s or m/s."""
 
@@ -63,7 +63,7 @@ class _Place(NamedTuple):
 
 
 class ModelReader:
-    """Reads the XML file of a model, and those that it includes or attaches.
+    """Reads the XML file of a model, and all files that it includes or attaches.
 
     Elements and attributes with a prefix are left out: they belong to other programs.
 
@@ -98,7 +98,7 @@ class ModelReader:
         }
 
     def _read(self, path: Path, folder: Path) -> ElementTree.Element:
-        """Read a file of a model in this folder, and those to which it refers."""
+        """Read a file of a model in this folder, and the files that it refers to."""
         try:
             text = read_regular_file(path, MODEL_BYTES - self._bytes)
             root = parse_xml(text)

@@ -34,11 +34,8 @@ on a loaded machine it is slow, but never idle. Fewer for one that a signal has 
 seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
-RECORDED = (
-    *(".toml", ".jsonl", ".spool", ".parquet", ".rrd", ".checkpoint"),
-    *(".xxh128", "published.json"),
-)
-"""Endings of the names of a recording's files."""
+RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", ".checkpoint", "published.json")
+"""Endings of the names of a recording's files, whose number and size no report changes."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
 """Exit status of a recorder whose files cannot be written, as on a full disk: another one could not

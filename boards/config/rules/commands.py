@@ -30,7 +30,7 @@ def command_mistakes(
         commands: The commands, with their places in a config. A live command has an empty place.
         config: The config of the rack.
         levels: Its levels.
-        broken: Boards with mistakes of their own. Commands for them are not checked.
+        broken: Boards with known mistakes. Commands for them are not checked.
 
     Returns:
         Every mistake.

@@ -34,7 +34,7 @@ def fault_mistakes(
         config: The config of the rack.
         levels: Its levels.
         layout: Its layout. Without it the rules that need one are skipped.
-        unspecified: Boards with mistakes of their own.
+        unspecified: Boards with known mistakes.
 
     Returns:
         Every mistake.
@@ -157,7 +157,7 @@ class FaultRules:
             able = [
                 name
                 for name in self.config.board
-                # What strikes a level whose class is missing is not known.
+                # A level whose class is missing may be struck by any kind.
                 if name not in self.levels or kind.name in self.levels[name].struck_by
             ]
             if board not in able:

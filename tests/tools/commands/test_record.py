@@ -24,6 +24,7 @@ from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
 from rack.tools.network.certificates import make_credentials
+from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.timing.analysis.report import write_report
@@ -62,7 +63,11 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
                 continue
             answer = json.loads(recorder.communicate(timeout=WATCHDOG_S)[0])
     assert recorder.returncode == 0
-    written = sum(path.stat().st_size for path in (tmp_path / "run").rglob("*") if path.is_file())
+    written = sum(
+        path.stat().st_size
+        for path in (tmp_path / "run").rglob("*")
+        if path.is_file() and path.name != CHECKSUMS
+    )
     assert answer.pop("bytes_per_s") > 0
     folder = str(tmp_path / "run")
     assert answer == {"rack": rack_name, "folder": folder, "notes": [], "bytes": written}
@@ -119,7 +124,7 @@ def test_what_a_run_has_recorded_is_saved_while_it_goes_on(
     assert (done.returncode, done.stderr) == (0, "")
     assert re.search(rf"recorded into {run}: [0-9.]+ MB, [0-9.]+ MB/s", status.stdout)
     answer = json.loads(done.stdout)
-    files = [path for path in saved.rglob("*") if path.is_file()]
+    files = [path for path in saved.rglob("*") if path.is_file() and path.name != CHECKSUMS]
     assert answer["bytes"] == sum(path.stat().st_size for path in files)
     part, whole = Recording(saved), Recording(run)
     assert not any(whole.lost.values())
