@@ -20,8 +20,8 @@ run: $(STAMP) ## run the rack CONFIG (default: nasrem); ARGS="--lockstep" and th
 test: $(STAMP) ## run the tests, about five minutes; ARGS="-k segment" and the like are passed on
 	$(BIN)/python -m pytest -m "not thorough" $(ARGS)
 
-thorough: $(STAMP) ## run all tests, as CI does: also whole tasks, all examples, the lab; ARGS as above
-	$(BIN)/python -m pytest $(ARGS)
+thorough: $(STAMP) ## run the tests that `make test` leaves out: whole tasks, all examples, the lab; ARGS as above
+	$(BIN)/python -m pytest -m thorough $(ARGS)
 
 quick: $(STAMP) ## run the quick tests, under a minute: those not marked slow, alone or thorough, of every room; ARGS as above
 	$(BIN)/python -m pytest -m "not slow and not alone and not thorough" $(ARGS)
