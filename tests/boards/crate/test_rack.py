@@ -344,7 +344,8 @@ def test_a_limit_of_the_system_is_one_line_with_its_value(
     done = run_limited(plain, tmp_path, *(sizes.get(word, word) for word in limits))
     assert done.returncode == 1
     assert re.fullmatch(why, done.stderr.strip())
-    assert not done.stdout
+    # Racks of other tests may run beside it: it names them.
+    assert not [line for line in done.stdout.splitlines() if not line.startswith("waiting: core ")]
 
 
 @pytest.mark.slow
