@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
 from math import ceil
 
 import numpy as np
 
-from rack.levels.timing.equations import plan_cycles_tight, residual_deviation_ns
+from rack.levels.timing.equations import plan_cycles_tight
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.trace_times import counts, distribution, gaps_ns, lateness_ns, response_ns
-from rack.levels.timing.verdicts import EquationVerdict
+from rack.levels.timing.trace_times import counts, distribution
 from rack.tools.console.answer import Document
 from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
-from rack.tools.timing.analysis.breaches import Breach, brief_ms
-from rack.tools.timing.analysis.rules import slice_ns
+from rack.tools.timing.analysis.task_times import MS, task_times
 
-MS = 1e-6
 UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "plan", "U": "update"}
 """Unit functions, and the names of their times in `LevelTiming`."""
 
@@ -57,7 +53,6 @@ def document(analysis: Analysis) -> Document:
             ],
         },
         "system_response": analysis.response,
-        "breaches": [_breach(breach, recording.layout.clock_ns) for breach in analysis.breaches],
     }
 
 
@@ -73,41 +68,22 @@ def _level(analysis: Analysis, board: str) -> Document:
 
 
 def _pair(pair: Pair) -> Document:
+    sides = {"predicted": pair.predicted, "measured": pair.measured}
     return {
         "equation": pair.equation,
         "subject": pair.subject,
-        "predicted": None if pair.predicted is None else _without_subject(pair.predicted),
-        "measured": None if pair.measured is None else _without_subject(pair.measured),
+        **{
+            side: None if verdict is None else verdict.document() for side, verdict in sides.items()
+        },
         "disagrees": pair.disagrees,
     }
 
 
-def _without_subject(verdict: EquationVerdict) -> Document:
-    return {
-        name: value
-        for name, value in verdict.document().items()
-        if name not in ("equation", "subject")
-    }
-
-
-def _breach(breach: Breach, clock_ns: int) -> Document:
-    return {
-        "task": breach.task,
-        "tick": breach.tick,
-        "time_s": round(breach.tick * clock_ns * 1e-9, 6),
-        "judged": breach.is_judged,
-        "equations": [asdict(broken) for broken in breach.broken],
-        "core": asdict(breach.sharing) | {"text": breach.sharing.text()},
-    }
-
-
 def task_document(cycles: Cycles, rack: RackTiming) -> Document:
-    """Return the times of the judged cycles of one task, ms; lateness and response are None in
-    lockstep."""
+    """Return the times of the judged cycles of one task, ms, as `task_times` of their processor
+    times."""
     judged = cycles.is_judged
-    is_lockstep = rack.is_lockstep
     rows = cycles.rows[judged]
-    gaps = gaps_ns(rows, cycles.stretches[judged])
     missed, skipped = counts(rows)
     return {
         "role": cycles.task.role,
@@ -119,25 +95,16 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
         "missed": missed,
         "skipped": skipped,
         "used_ms": distribution(cycles.used_ns[judged] * MS),
-        "execution_ms": distribution(cycles.process_ns[judged] * MS),
-        "communication_ms": distribution(cycles.communication_ns[judged] * MS),
-        "deviation_ms": round(deviation_ns(cycles) * MS, 6),
         "beside_ms": round(cycles.overhead_ns * MS, 6),
-        "lateness_ms": None if is_lockstep else distribution(lateness_ns(rows) * MS),
-        "response_ms": None if is_lockstep else distribution(response_ns(rows) * MS),
-        "slice_ms": slice_ns(rack, cycles.task) * MS,
-        "largest_gap_ms": (
-            None if is_lockstep or not len(gaps) else round(float(gaps.max()) * MS, 6)
+        **task_times(
+            cycles.task,
+            rows,
+            rack.tick_ns,
+            rack.is_lockstep,
+            stretches=cycles.stretches[judged],
+            parts_ns=(cycles.process_ns[judged], cycles.communication_ns[judged]),
         ),
     }
-
-
-def deviation_ns(cycles: Cycles) -> float:
-    """Return the standard deviation of the residual from cycle to cycle (eq. 3.6), ns."""
-    judged = cycles.is_judged
-    return residual_deviation_ns(
-        cycles.process_ns[judged].tolist(), cycles.communication_ns[judged].tolist()
-    )
 
 
 def summary(analysis: Analysis, board: str) -> str:
@@ -188,6 +155,12 @@ def _planner(timing: LevelTiming, switch_ns: int) -> str:
         f"{took}: {f'fits into {needed} of its' if fits else f'needs {needed} and has'} {permitted}"
         " cycles"
     )
+
+
+def brief_ms(ns: float) -> str:
+    """Return a time in ms with three digits."""
+    ms = ns * 1e-6
+    return f"{ms:.0f}" if ms >= 100 else f"{ms:.3g}"
 
 
 def _over(timing: LevelTiming, budget: LevelTiming) -> Iterator[str]:
