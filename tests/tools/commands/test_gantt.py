@@ -79,7 +79,7 @@ def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(
 
 @pytest.mark.slow
 def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> None:
-    shown = rack("gantt", "fig3", "--cycles", "0-3", "--out", tmp_path, "--json")
+    shown = rack("gantt", "fig3", "--to-ms", 24, "--out", tmp_path, "--json")
     assert shown.stderr == ""
     found = json.loads(shown.stdout)
     (panel,) = found["panels"]

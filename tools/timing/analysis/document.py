@@ -11,11 +11,13 @@ from rack.levels.timing.equations import plan_cycles_tight
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import counts, distribution
+from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Document
 from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
-from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
+from rack.tools.timing.analysis.analysis import MOSTLY, Analysis
 from rack.tools.timing.analysis.task_times import MS, task_times
 
+_Side = LevelTiming | EquationVerdict | None
 UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "plan", "U": "update"}
 """Unit functions, and the names of their times in `LevelTiming`."""
 
@@ -38,14 +40,28 @@ def document(analysis: Analysis) -> Document:
         "untraced": recording.untraced(),
         "kept": recording.kept_text or None,
         "holds": analysis.holds,
-        "levels": {name: _level(analysis, name) for name in config.board},
+        "levels": {
+            name: {
+                "summary": summary(analysis, name),
+                **_sides(analysis.predicted.levels.get(name), analysis.measured.levels.get(name)),
+            }
+            for name in config.board
+        },
         "tasks": {
             name: task_document(cycles, analysis.predicted)
             for name, cycles in analysis.cycles.items()
         },
         "core_loads": {f"core {core}": load for core, load in analysis.loads.items()},
         "restarts": restarts(recording),
-        "equations": [_pair(pair) for pair in analysis.pairs],
+        "equations": [
+            {
+                "equation": pair.equation,
+                "subject": pair.subject,
+                **_sides(pair.predicted, pair.measured),
+                "disagrees": pair.disagrees,
+            }
+            for pair in analysis.pairs
+        ],
         "mostly": {
             "percentile": MOSTLY,
             "failed": [
@@ -56,27 +72,9 @@ def document(analysis: Analysis) -> Document:
     }
 
 
-def _level(analysis: Analysis, board: str) -> Document:
-    sides = {
-        "predicted": analysis.predicted.levels.get(board),
-        "measured": analysis.measured.levels.get(board),
-    }
-    timings = {
-        side: None if timing is None else timing.document() for side, timing in sides.items()
-    }
-    return {"summary": summary(analysis, board), **timings}
-
-
-def _pair(pair: Pair) -> Document:
-    sides = {"predicted": pair.predicted, "measured": pair.measured}
-    return {
-        "equation": pair.equation,
-        "subject": pair.subject,
-        **{
-            side: None if verdict is None else verdict.document() for side, verdict in sides.items()
-        },
-        "disagrees": pair.disagrees,
-    }
+def _sides(predicted: _Side, measured: _Side) -> Document:
+    sides = {"predicted": predicted, "measured": measured}
+    return {side: None if found is None else found.document() for side, found in sides.items()}
 
 
 def task_document(cycles: Cycles, rack: RackTiming) -> Document:

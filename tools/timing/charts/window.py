@@ -20,12 +20,10 @@ LONGEST = 2000
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """The window that the user asks for, ns; None: not given. `cycles` are the first and the last
-    cycle, of `level`."""
+    """The window that the user asks for, ns, and the level whose cycles count; None: not given."""
 
     from_ns: int | None
     to_ns: int | None
-    cycles: tuple[int, int] | None
     level: str | None
 
     def window(
@@ -38,22 +36,12 @@ class WindowOptions:
         default length: None, two plans of the level. Raises `Failure` for an empty window, one that
         is too long, or one outside the run.
         """
-        if self.cycles is not None:
-            start, end = (
-                level.phase_ns + at * level.every_ns for at in (self.cycles[0], self.cycles[1] + 1)
-            )
-        else:
-            start = start_ns if self.from_ns is None else self.from_ns
-            length_ns = (
-                SLICES * level.period_ns
-                if length_ns is None or self.level is not None
-                else length_ns
-            )
-            end = start + length_ns if self.to_ns is None else self.to_ns
+        start = start_ns if self.from_ns is None else self.from_ns
+        if length_ns is None or self.level is not None:
+            length_ns = SLICES * level.period_ns
+        end = start + length_ns if self.to_ns is None else self.to_ns
         if extent_ns is not None:
-            if start >= extent_ns or (
-                end > extent_ns and (self.to_ns is not None or self.cycles is not None)
-            ):
+            if start >= extent_ns or (end > extent_ns and self.to_ns is not None):
                 raise Failure(
                     f"{_window(start, end)}: outside the run, which lasts from 0 to"
                     f" {ms(extent_ns)} ms",
@@ -98,33 +86,6 @@ class WindowOptions:
             tight or seen or [min(tasks, key=lambda task: task.period_ns)],
             key=lambda task: task.period_ns,
         )
-
-
-def window_options(
-    from_ms: float | None, to_ms: float | None, cycles: str | None, level: str | None
-) -> WindowOptions:
-    """Return the window of the command's options. Raises `Failure` for bad or conflicting
-    options."""
-    if cycles is not None and (from_ms is not None or to_ms is not None):
-        raise Failure("--cycles already gives the window: leave out --from-ms and --to-ms", 2)
-    from_ns, to_ns = (
-        None if value is None else round(value * NS_PER_MS) for value in (from_ms, to_ms)
-    )
-    numbers = None if cycles is None else _cycles(cycles)
-    return WindowOptions(from_ns, to_ns, numbers, level)
-
-
-def _cycles(text: str) -> tuple[int, int]:
-    first, dash, last = text.partition("-")
-    if (
-        not first.isdecimal()
-        or (dash and not last.isdecimal())
-        or (dash and int(last) < int(first))
-    ):
-        raise Failure(
-            f"--cycles {text}: give the first and the last cycle, counted from 0, as in 10-12", 2
-        )
-    return int(first), int(last or first)
 
 
 def times_of(process: Sequence[str]) -> dict[str, list[int]]:
