@@ -91,8 +91,8 @@ def gantt(
     if figure is not None:
         _figure_5(found, figure, as_json)
         return
-    bounds = (None if ms is None else round(ms * NS_PER_MS) for ms in (from_ms, to_ms))
-    window = WindowOptions(*bounds, level)
+    from_ns, to_ns = (None if ms is None else round(ms * NS_PER_MS) for ms in (from_ms, to_ms))
+    window = WindowOptions(from_ns, to_ns, level)
     chart = gantt_of(found, window, times_of(process), reading_progress(silent=as_json))
     if chart.spans > MANY_SPANS and not as_json:
         print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)

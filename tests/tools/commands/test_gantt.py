@@ -171,7 +171,7 @@ def test_without_matplotlib_a_chart_is_printed_alone(
         assert done.returncode == 0
         missing = "no pictures: they need matplotlib: pip install 'nasrem-rack[charts]'"
         assert done.stdout.splitlines()[-1] == missing
-        assert len(done.stdout.splitlines()) > 5
+        assert "level" in done.stdout
     assert not (tmp_path / "out").exists()
     asked = rack("bench", "mailbox", "--plot", tmp_path / "out")
     assert (asked.returncode, asked.stdout) == (2, "")

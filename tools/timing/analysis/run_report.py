@@ -67,7 +67,8 @@ class RunReport:
     @classmethod
     def of(cls, document: Document) -> RunReport:
         """Return a report from its plain data."""
-        return cls(**{field.name: document.get(field.name) for field in fields(cls)})
+        known: Document = {field.name: document.get(field.name) for field in fields(cls)}
+        return cls(**known)
 
     def document(self) -> Document:
         """Return it as plain data."""
