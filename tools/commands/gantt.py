@@ -34,13 +34,6 @@ From = Annotated[
 To = Annotated[
     float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms")
 ]
-Level = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LEVEL",
-        help="level that gives the length; default: the slowest with a tight planner",
-    ),
-]
 Process = Annotated[
     list[str],
     typer.Option(
@@ -64,7 +57,6 @@ def gantt(
     subject: SubjectName,
     from_ms: From = None,
     to_ms: To = None,
-    level: Level = None,
     process: Process = [],  # noqa: B006  typer copies it
     figure: Figure = None,
     settings: Settings = [],  # noqa: B006
@@ -85,14 +77,14 @@ def gantt(
     Examples:
       rack gantt fig2
       rack gantt fig4-overload --from-ms 60 --to-ms 78
-      rack gantt runs/nasrem-20250101-120000 --level servo
+      rack gantt runs/nasrem-20250101-120000 --from-ms 500 --to-ms 540
     """
     found = subject_of(subject, settings, out)
     if figure is not None:
         _figure_5(found, figure, as_json)
         return
     from_ns, to_ns = (None if ms is None else round(ms * NS_PER_MS) for ms in (from_ms, to_ms))
-    window = WindowOptions(from_ns, to_ns, level)
+    window = WindowOptions(from_ns, to_ns)
     chart = gantt_of(found, window, times_of(process), reading_progress(silent=as_json))
     if chart.spans > MANY_SPANS and not as_json:
         print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)

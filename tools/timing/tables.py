@@ -10,7 +10,6 @@ from typing import Any
 
 from rack.levels.timing.chains import spanned
 from rack.levels.timing.forecast import Forecast
-from rack.levels.timing.frames import CoreFrames
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
@@ -51,8 +50,7 @@ def forecast_lines(forecast: Forecast) -> Iterator[str]:
 
 
 def _schedule_lines(forecast: Forecast) -> Iterator[str]:
-    """Yield a line per board of every distinct frame of a static schedule, and those that are late
-    in theirs."""
+    """Yield a line per board of every distinct frame of a static schedule."""
     if forecast.schedule is None:
         return
     minor, major = forecast.schedule
@@ -78,15 +76,6 @@ def _schedule_lines(forecast: Forecast) -> Iterator[str]:
         for place in alike.places
     ]
     yield from fitted(head, rows, ("until",))
-    for alike in forecast.frames:
-        yield from _late_lines(alike)
-
-
-def _late_lines(alike: CoreFrames) -> Iterator[str]:
-    for place in alike.places:
-        if place.slack_ns < 0:
-            where = f"core {alike.core}, frame {alike.frames[0]}"
-            yield f"{where}: '{place.board}' lacks {ms(-place.slack_ns)} ms when {place.limit}"
 
 
 def _numbers(frames: Sequence[int], count: int) -> str:

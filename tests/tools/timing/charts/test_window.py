@@ -6,7 +6,7 @@ import pytest
 
 from rack.levels.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
-from rack.tools.timing.charts.window import WindowOptions, times_of
+from rack.tools.timing.charts.window import WindowOptions, shown_task, times_of
 
 MS = 1_000_000
 
@@ -28,13 +28,10 @@ NASREM = [
 ]
 
 
-ASKED = WindowOptions(None, None, None)
-
-
 def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_still_be_seen() -> None:
-    level = ASKED.task(NASREM)
+    level = shown_task(NASREM)
     assert level.name == "primitive.planner"
-    assert ASKED.window(level, None, 40 * MS) == (40 * MS, 120 * MS)
+    assert WindowOptions().window(level, None, 40 * MS) == (40 * MS, 120 * MS)
 
 
 def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
@@ -44,7 +41,7 @@ def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
         task("b", 10, core=1),
         task("b.planner", 10, 4, core=0),
     ]
-    assert ASKED.task(tasks).name == "a.planner"
+    assert shown_task(tasks).name == "a.planner"
 
 
 @pytest.mark.parametrize(
@@ -64,34 +61,27 @@ def test_begin_and_end_are_as_they_are_asked_for(
     assert (start / MS, end / MS) == seen
 
 
-def asked(from_ms: float | None, to_ms: float | None, level: str | None = None) -> WindowOptions:
+def asked(from_ms: float | None, to_ms: float | None) -> WindowOptions:
     """Return the options of these times."""
-    from_ns, to_ns = (None if ms is None else round(ms * MS) for ms in (from_ms, to_ms))
-    return WindowOptions(from_ns, to_ns, level)
+    return WindowOptions(*(None if ms is None else round(ms * MS) for ms in (from_ms, to_ms)))
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("from_ms", "to_ms", "extent_ms", "message"),
     [
-        ((90.0, 95.0), "90 to 95 ms: outside the run, which lasts from 0 to 80 ms"),
-        ((70.0, 81.0), "70 to 81 ms: outside the run"),
-        ((9.0, 9.0), "9 to 9 ms: --to-ms must be later than --from-ms"),
-        (
-            (None, None, "arm"),
-            "--level arm: no such level in the chart; levels: servo, primitive, task",
-        ),
+        (90.0, 95.0, 80, "90 to 95 ms: outside the run, which lasts from 0 to 80 ms"),
+        (70.0, 81.0, 80, "70 to 81 ms: outside the run"),
+        (9.0, 9.0, 80, "9 to 9 ms: --to-ms must be later than --from-ms"),
+        # Nobody could read that.
+        (0.0, 5000.1, 9000, "a chart shows at most 2000 cycles of 'servo', 5000 ms"),
     ],
 )
-def test_a_bad_window_is_refused(options: tuple[float, float], message: str) -> None:
+def test_a_bad_window_is_refused(
+    from_ms: float, to_ms: float, extent_ms: int, message: str
+) -> None:
     with pytest.raises(Failure, match=message) as failure:
-        asked(*options).window(asked(*options).task(NASREM), 80 * MS, 0)
+        asked(from_ms, to_ms).window(NASREM[0], extent_ms * MS, 0)
     assert failure.value.status == 2
-
-
-def test_a_chart_nobody_could_read_is_refused() -> None:
-    options = asked(0.0, 5000.1, "servo")
-    with pytest.raises(Failure, match="a chart shows at most 2000 cycles of 'servo', 5000 ms"):
-        options.window(options.task(NASREM), None, 0)
 
 
 def test_times_of_x_are_read_by_level() -> None:
