@@ -13,7 +13,7 @@ from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import counts, distribution
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Document
-from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
+from rack.tools.recording.cycles import START_UP_S, Cycles
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis
 from rack.tools.timing.analysis.task_times import MS, task_times
 
@@ -23,7 +23,8 @@ UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "pla
 
 
 def document(analysis: Analysis) -> Document:
-    """Return everything as plain data; infinite numbers are null."""
+    """Return everything as plain data; infinite numbers are null. report.json has restarts and
+    the system's response."""
     recording = analysis.recording
     config = analysis.config
     return {
@@ -52,7 +53,6 @@ def document(analysis: Analysis) -> Document:
             for name, cycles in analysis.cycles.items()
         },
         "core_loads": {f"core {core}": load for core, load in analysis.loads.items()},
-        "restarts": restarts(recording),
         "equations": [
             {
                 "equation": pair.equation,
@@ -68,7 +68,6 @@ def document(analysis: Analysis) -> Document:
                 {"equation": p.equation, "subject": p.subject} for p in analysis.mostly if p.fails
             ],
         },
-        "system_response": analysis.response,
     }
 
 
