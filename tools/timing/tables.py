@@ -97,14 +97,9 @@ def _numbers(frames: Sequence[int], count: int) -> str:
 def _prediction_lines(system: Prediction) -> Iterator[str]:
     if system.levels:
         yield ""
-        yield f"system response, {' > '.join(system.levels)}:"
         yield (
-            f"  eq. 3.3 sum of the cycles {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound"
-            f" {system.bound_eq_3_2_ms:g} ms"
-        )
-        yield (
-            f"  on the clock's grid: a command down {system.command_ms:g} ms, a status up"
-            f" {system.status_ms:g} ms"
+            f"system response, {' > '.join(system.levels)}: eq. 3.3 sum of the cycles"
+            f" {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound {system.bound_eq_3_2_ms:g} ms"
         )
     for level, plan_ms in system.plan_ms.items():
         yield f"plan of {level}: available {plan_ms:g} ms after its planner's release"

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from math import ceil
-
-import numpy as np
-
-from rack.levels.timing.equations import plan_cycles_tight
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import counts, distribution
@@ -18,8 +12,6 @@ from rack.tools.timing.analysis.analysis import MOSTLY, Analysis
 from rack.tools.timing.analysis.task_times import MS, task_times
 
 _Side = LevelTiming | EquationVerdict | None
-UNITS = {"R": "read", "X": "execution", "W": "write", "C": "exchange", "P": "plan", "U": "update"}
-"""Unit functions, and the names of their times in `LevelTiming`."""
 
 
 def document(analysis: Analysis) -> Document:
@@ -42,10 +34,7 @@ def document(analysis: Analysis) -> Document:
         "kept": recording.kept_text or None,
         "holds": analysis.holds,
         "levels": {
-            name: {
-                "summary": summary(analysis, name),
-                **_sides(analysis.predicted.levels.get(name), analysis.measured.levels.get(name)),
-            }
+            name: _sides(analysis.predicted.levels.get(name), analysis.measured.levels.get(name))
             for name in config.board
         },
         "tasks": {
@@ -102,66 +91,3 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
             parts_ns=(cycles.process_ns[judged], cycles.communication_ns[judged]),
         ),
     }
-
-
-def summary(analysis: Analysis, board: str) -> str:
-    """Return in one line the use of a level's cycle, whether its planner fits, and where it exceeds
-    its budget."""
-    timing = analysis.measured.levels.get(board)
-    if timing is None:
-        return "never ran"
-    return "; ".join(_clauses(analysis, timing))
-
-
-def worst_words(percentile: float) -> str:
-    """Return a percentile in words: "in the worst cycle", or "in 99 of 100 cycles"."""
-    return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
-
-
-def _clauses(analysis: Analysis, timing: LevelTiming) -> Iterator[str]:
-    used_ns = timing.execution_ns + timing.communication_ns
-    usual_ns = float(np.median(analysis.cycles[timing.board].used_ns))
-    when = worst_words(analysis.percentile)
-    yield (
-        f"{brief_ms(used_ns)} of {brief_ms(timing.cycle_ns)} ms used {when}, {brief_ms(usual_ns)}"
-        " usually"
-    )
-    if timing.planning_ns is not None:
-        yield _planner(timing, analysis.measured.context_switch_ns)
-    elif timing.coupling != "none":
-        yield "its planner made no plan"
-    budget = analysis.predicted.levels.get(timing.board)
-    if over := [] if budget is None else list(_over(timing, budget)):
-        yield f"over its budget: {', '.join(over)}"
-
-
-def _planner(timing: LevelTiming, switch_ns: int) -> str:
-    planning_ns = timing.planning_ns or 0
-    permitted = timing.within_cycles
-    if timing.coupling == "loose":
-        needed: int | None = max(1, ceil(planning_ns / timing.cycle_ns))
-        place = "on its own processor"
-    else:
-        needed = plan_cycles_tight(planning_ns, timing.residual_ns, switch_ns)
-        place = "on the same processor"
-    took = f"a plan takes {brief_ms(planning_ns)} ms {place}"
-    if needed is None:
-        return f"{took}, and no time is left for it in such a cycle"
-    fits = needed <= (permitted or 0)
-    return (
-        f"{took}: {f'fits into {needed} of its' if fits else f'needs {needed} and has'} {permitted}"
-        " cycles"
-    )
-
-
-def brief_ms(ns: float) -> str:
-    """Return a time in ms with three digits."""
-    ms = ns * 1e-6
-    return f"{ms:.0f}" if ms >= 100 else f"{ms:.3g}"
-
-
-def _over(timing: LevelTiming, budget: LevelTiming) -> Iterator[str]:
-    for unit, name in UNITS.items():
-        took, permitted = (getattr(side, f"{name}_ns") or 0 for side in (timing, budget))
-        if took > permitted:
-            yield f"{unit} {brief_ms(took)} of {brief_ms(permitted)} ms"

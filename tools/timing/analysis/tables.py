@@ -8,7 +8,7 @@ from rack.levels.timing.verdicts import verdicts
 from rack.tools.console.tables import fitted
 from rack.tools.recording.cycles import START_UP_S, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
-from rack.tools.timing.analysis.document import summary, task_document, worst_words
+from rack.tools.timing.analysis.document import task_document
 from rack.tools.timing.analysis.task_times import times_table
 from rack.tools.timing.summary import tightest
 from rack.tools.timing.tables import level_table, verdict_table
@@ -28,7 +28,7 @@ def _lines(analysis: Analysis) -> Iterator[str]:
     yield from _head(analysis)
     yield ""
     yield (
-        f"Levels: processor time in ms, {worst_words(analysis.percentile)}; t_residual is alpha of"
+        f"Levels: processor time in ms, {_worst_words(analysis.percentile)}; t_residual is alpha of"
         " eq. 3.6."
     )
     sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
@@ -36,8 +36,6 @@ def _lines(analysis: Analysis) -> Iterator[str]:
     yield from level_table(
         ((side, of[name]) for name in names for side, of in sides.items() if name in of), "side"
     )
-    yield ""
-    yield from (f"{name}: {summary(analysis, name)}" for name in names)
     yield ""
     yield "Tasks, ms: exec and comm are processor time; R of a planner is its time slice."
     tasks = {
@@ -52,6 +50,10 @@ def _lines(analysis: Analysis) -> Iterator[str]:
         for side, verdict in (("predicted", pair.predicted), ("measured", pair.measured))
         if verdict is not None
     )
+
+
+def _worst_words(percentile: float) -> str:
+    return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
 
 
 def _head(analysis: Analysis) -> Iterator[str]:
@@ -77,9 +79,23 @@ def _head(analysis: Analysis) -> Iterator[str]:
         yield "lockstep: no deadlines, no lateness; processor times are real"
     if restarted := restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
+    yield from _left_out(analysis)
+
+
+def _left_out(analysis: Analysis) -> Iterator[str]:
+    """Yield whatever was not judged."""
+    measured = analysis.measured.levels
+    if silent := ", ".join(name for name in analysis.config.board if name not in measured):
+        yield f"never ran: {silent}"
+    if planless := ", ".join(
+        level.board
+        for level in measured.values()
+        if level.planning_ns is None and level.coupling != "none"
+    ):
+        yield f"made no plan: {planless}"
     yield (
         f"the first {START_UP_S:g} s of each process are not judged; t_cs is"
-        f" {config.timing.context_switch_ms:g} ms"
+        f" {analysis.config.timing.context_switch_ms:g} ms"
     )
     if stalled := ", ".join(
         f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled
