@@ -7,16 +7,17 @@ operator command that it rests on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
 from rack.levels.timing.command_path import CommandPath, command_paths
+from rack.levels.timing.trace_times import distribution
 from rack.tools.console.answer import Document, Failure, print_json, write_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
 from rack.tools.console.tables import decimal, fitted, print_wrapped
@@ -119,14 +120,15 @@ class OperatorResponse:
     def _row(self, level: str, path: CommandPath) -> Document:
         own = [c for c in self.measured if c.level == level]
         ms = np.array([self.ticks(c) for c in own]) * self.tick_ms
-        reading_ms = np.array([self.ticks(c) + c.given - c.sampled for c in own]) * self.tick_ms
+        waits_ms = np.array([c.sampled - c.given for c in own]) * self.tick_ms
+        given = distribution(ms) or {}
         return {
             "level": level,
             "commands": len(own),
-            "min_ms": _figure(ms, np.min),
-            "median_ms": _figure(ms, np.median),
-            "max_ms": _figure(ms, np.max),
-            "max_from_reading_ms": _figure(reading_ms, np.max),
+            "min_ms": given.get("min"),
+            "median_ms": given.get("p50"),
+            "max_ms": given.get("max"),
+            "max_from_reading_ms": (distribution(ms - waits_ms) or {}).get("max"),
             "longest_ms": path.longest * self.tick_ms,
             "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
             "bound_eq_3_2_ms": path.bound_eq_3_2 * self.tick_ms,
@@ -241,10 +243,6 @@ def _answered(
             fate=fate,
             wall_ms=None if lockstep else wall_ms,
         )
-
-
-def _figure(values: np.ndarray, of: Callable[[np.ndarray], Any]) -> float | None:
-    return float(of(values)) if len(values) else None
 
 
 def show(recording: Recording, folder: Path, as_json: bool) -> bool:
