@@ -10,7 +10,6 @@ import typer
 
 from rack.tools.console.answer import print_json, write_json
 from rack.tools.console.parameters import Json, RunFolder
-from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
 from rack.tools.console.tables import print_wrapped
 from rack.tools.recording.recording import Recording
@@ -41,7 +40,7 @@ OnlyResponse = Annotated[
 ]
 Verbose = Annotated[
     bool,
-    typer.Option("--verbose", help="add the tables, and the cycles that broke an equation"),
+    typer.Option("--verbose", help="add the tables of levels, tasks and equations"),
 ]
 
 
@@ -61,8 +60,8 @@ def analyze(
     every one is seen; --percentile 99 leaves out whatever happens less than once in 100 cycles.
 
     It says how the run ended, what held, what was tightest, and what to do. --verbose adds every
-    level, task and equation, and the cycles that broke one, with the tasks that had their core
-    meanwhile. It writes analysis.json and, with matplotlib, residuals.png and residuals.svg.
+    level, task and equation. It writes analysis.json. `rack gantt RUN` shows which tasks had a
+    core.
 
     Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
 
@@ -82,17 +81,10 @@ def analyze(
     progress(0.9)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "analysis.json", found)
-    files = f"{folder}/analysis.json, residuals.png, residuals.svg"
-    if can_draw():
-        from rack.tools.timing.analysis.residuals import plot
-
-        plot(analysis, folder / "residuals")
-    else:
-        files = f"{folder}/analysis.json; {NO_PICTURES}"
     if as_json:
         print_json(found)
     else:
         shown = text(analysis) if verbose else brief(analysis)
-        print_wrapped(f"{shown}\n\n{files}")
+        print_wrapped(f"{shown}\n\n{folder}/analysis.json")
     if not analysis.holds:
         sys.exit(1)

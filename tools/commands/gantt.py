@@ -14,7 +14,8 @@ from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
 from rack.tools.timing.charts import figure5
 from rack.tools.timing.charts.gantt import Subject, gantt_of, subject_of
-from rack.tools.timing.charts.window import times_of, window_options
+from rack.tools.timing.charts.panel import NS_PER_MS
+from rack.tools.timing.charts.window import WindowOptions, times_of
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000
@@ -32,16 +33,6 @@ From = Annotated[
 ]
 To = Annotated[
     float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms")
-]
-Cycles = Annotated[
-    str | None,
-    typer.Option(metavar="A-B", help="instead: the cycles to show, counted from 0, as in 10-12"),
-]
-Level = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LEVEL", help="level whose cycles count; default: the slowest with a tight planner"
-    ),
 ]
 Process = Annotated[
     list[str],
@@ -66,8 +57,6 @@ def gantt(
     subject: SubjectName,
     from_ms: From = None,
     to_ms: To = None,
-    cycles: Cycles = None,
-    level: Level = None,
     process: Process = [],  # noqa: B006  typer copies it
     figure: Figure = None,
     settings: Settings = [],  # noqa: B006
@@ -87,14 +76,15 @@ def gantt(
     \b
     Examples:
       rack gantt fig2
-      rack gantt fig4-overload --cycles 10-12
-      rack gantt runs/nasrem-20250101-120000 --level servo
+      rack gantt fig4-overload --from-ms 60 --to-ms 78
+      rack gantt runs/nasrem-20250101-120000 --from-ms 500 --to-ms 540
     """
     found = subject_of(subject, settings, out)
     if figure is not None:
         _figure_5(found, figure, as_json)
         return
-    window = window_options(from_ms, to_ms, cycles, level)
+    from_ns, to_ns = (None if ms is None else round(ms * NS_PER_MS) for ms in (from_ms, to_ms))
+    window = WindowOptions(from_ns, to_ns)
     chart = gantt_of(found, window, times_of(process), reading_progress(silent=as_json))
     if chart.spans > MANY_SPANS and not as_json:
         print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)

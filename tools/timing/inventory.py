@@ -143,22 +143,11 @@ def _network(config: RackConfig) -> Document | None:
     table = config.adapter.lan
     if table is None:
         return None
-    entries = [
-        *(
-            {"entry": f"{LAN}.{port}", "way": "out", "mailbox": e.source, "rate_hz": e.rate_hz}
-            for port, e in table.exports.items()
-        ),
-        *(
-            {
-                "entry": f"{LAN}.{port}",
-                "way": "in",
-                "mailbox": e.source,
-                "rate_hz": e.rate_hz,
-                "max_age_ms": e.max_age_ms,
-            }
-            for port, e in table.imports.items()
-        ),
-    ]
+    entries: list[Document] = []
+    for way, ports in (("out", table.exports), ("in", table.imports)):
+        for port, entry in ports.items():
+            place = {"entry": f"{LAN}.{port}", "way": way, "mailbox": entry.source}
+            entries.append(place | entry.model_dump(include={"rate_hz", "max_age_ms"}))
     keys = ("listen", "connect", "lease_ms", "on_peer_loss")
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 

@@ -7,16 +7,17 @@ operator command that it rests on.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from rack.boards.config import rack_timing
 from rack.levels.operator import Answer, Operation
 from rack.levels.timing.command_path import CommandPath, command_paths
+from rack.levels.timing.trace_times import distribution
 from rack.tools.console.answer import Document, Failure, print_json, write_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
 from rack.tools.console.tables import decimal, fitted, print_wrapped
@@ -31,6 +32,16 @@ GRID = "#009e73"
 SUM = "#e69f00"
 BOUND = "#d55e00"
 """Colours of Okabe and Ito's palette, distinguishable to colour-blind readers."""
+FIGURES = {
+    "min": "min_ms",
+    "median": "median_ms",
+    "max": "max_ms",
+    "longest on the grid": "longest_ms",
+    "max from reading": "max_from_reading_ms",
+    "sum, eq. 3.3": "sum_eq_3_3_ms",
+    "bound, eq. 3.2": "bound_eq_3_2_ms",
+}
+"""Columns of the table, and the figure of a level that each shows."""
 BINS = 20
 """Bars of a histogram up to the longest response on the grid."""
 ROUNDING = 1e-9
@@ -109,14 +120,15 @@ class OperatorResponse:
     def _row(self, level: str, path: CommandPath) -> Document:
         own = [c for c in self.measured if c.level == level]
         ms = np.array([self.ticks(c) for c in own]) * self.tick_ms
-        reading_ms = np.array([self.ticks(c) + c.given - c.sampled for c in own]) * self.tick_ms
+        waits_ms = np.array([c.sampled - c.given for c in own]) * self.tick_ms
+        given = distribution(ms) or {}
         return {
             "level": level,
             "commands": len(own),
-            "min_ms": _figure(ms, np.min),
-            "median_ms": _figure(ms, np.median),
-            "max_ms": _figure(ms, np.max),
-            "max_from_reading_ms": _figure(reading_ms, np.max),
+            "min_ms": given.get("min"),
+            "median_ms": given.get("p50"),
+            "max_ms": given.get("max"),
+            "max_from_reading_ms": (distribution(ms - waits_ms) or {}).get("max"),
             "longest_ms": path.longest * self.tick_ms,
             "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
             "bound_eq_3_2_ms": path.bound_eq_3_2 * self.tick_ms,
@@ -148,27 +160,17 @@ class OperatorResponse:
             " a command, and"
         )
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
-        head = ["given to", "commands", "min", "median", "max", "longest on the grid"]
-        head += ["max from reading", "sum, eq. 3.3", "bound, eq. 3.2", "beyond", "off prediction"]
-        names = [
-            "min",
-            "median",
-            "max",
-            "longest",
-            "max_from_reading",
-            "sum_eq_3_3",
-            "bound_eq_3_2",
-        ]
         rows = [
             [
                 row["level"],
                 str(row["commands"]),
-                *(decimal(row[f"{name}_ms"], 1) for name in names),
+                *(decimal(row[key], 1) for key in FIGURES.values()),
                 str(row["beyond"]),
                 str(row["off_prediction"]),
             ]
             for row in self.rows()
         ]
+        head = ["given to", "commands", *FIGURES, "beyond", "off prediction"]
         yield from fitted(head, rows, ("min", "sum, eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
             yield (
@@ -192,77 +194,55 @@ def response_of(recording: Recording) -> OperatorResponse | None:
     }
     if not paths:
         return None
-    answered = [
-        _follow(command, given_ns, _statuses(recording, path.levels[-1]))
-        for level, path in paths.items()
-        for command, given_ns in _commands(recording, level, path)
-    ]
     lockstep = config.clock.mode == "lockstep"
-    if lockstep:
-        answered = [replace(command, wall_ms=None) for command in answered]
+    answered = [
+        command
+        for level, path in paths.items()
+        for command in _answered(recording, level, path, lockstep)
+    ]
     answered.sort(key=lambda command: command.serial)
     return OperatorResponse(layout.clock_ns * 1e-6, lockstep, paths, tuple(answered))
 
 
-def _commands(
-    recording: Recording, level: str, path: CommandPath
-) -> Iterator[tuple[AnsweredCommand, int]]:
-    """Yield the commands given to a level, each with its time stamp, ns."""
+def _answered(
+    recording: Recording, level: str, path: CommandPath, lockstep: bool
+) -> Iterator[AnsweredCommand]:
+    """Yield the commands given to a level, each with the first cycle of the lowest level that rests
+    on it, if any."""
     box = f"{level}.operator"
-    status = f"{level}.status"
     # A clock that died while giving a command has given it twice: the first one counts.
     serials, at = np.unique(recording.signal(box, "id"), return_index=True)
     whats, given, visible, stamps = (
         recording.signal(box, n)[at] for n in ("what", "tick", "visible_at", "stamp_ns")
     )
-    orders = recording.signal(status, "order")
-    answers = recording.signal(status, "answer")
+    orders, answers = (recording.signal(f"{level}.status", n) for n in ("order", "answer"))
     refused = set(orders[answers == Answer.REFUSED].tolist())
+    basis, ticks, written = (
+        recording.signal(f"{path.levels[-1]}.status", n) for n in ("operator", "tick", "stamp_ns")
+    )
     for serial, what, tick, seen, stamp in zip(serials, whats, given, visible, stamps, strict=True):
-        fate: Fate = "refused" if int(serial) in refused else "run over"
-        command = AnsweredCommand(
+        reached = np.flatnonzero(basis >= serial)
+        fate: Fate = "run over"
+        acts = wall_ms = None
+        if int(serial) in refused:
+            fate = "refused"
+        elif len(reached) and basis[reached[0]] != serial:
+            fate = "superseded"
+        elif len(reached):
+            fate = "acted on"
+            acts = int(ticks[reached[0]])
+            wall_ms = round((int(written[reached[0]]) - int(stamp)) * 1e-6, 6)
+        yield AnsweredCommand(
             serial=int(serial),
             level=level,
             what=Operation(int(what)).name.lower(),
             given=int(tick),
             sampled=path.samples_at(int(seen)),
             predicted=path.acts_at(int(seen)),
-            acts=None,
+            acts=acts,
             fate=fate,
+            wall_ms=None if lockstep else wall_ms,
         )
-        yield command, int(stamp)
-
-
-class _Statuses(NamedTuple):
-    """Statuses of the lowest level, each array of shape (n,): the command that each rests on, its
-    tick, its stamp."""
-
-    serial: np.ndarray
-    tick: np.ndarray
-    stamp_ns: np.ndarray
-
-
-def _statuses(recording: Recording, lowest: str) -> _Statuses:
-    return _Statuses(
-        *(recording.signal(f"{lowest}.status", name) for name in ("operator", "tick", "stamp_ns"))
-    )
-
-
-def _follow(command: AnsweredCommand, given_ns: int, statuses: _Statuses) -> AnsweredCommand:
-    """Return the command with the first cycle of the lowest level that rests on it, or on a newer
-    one."""
-    serial = statuses.serial
-    if command.fate == "refused" or not len(serial) or serial.max() < command.serial:
-        return command
-    first = int(np.argmax(serial >= command.serial))
-    if serial[first] != command.serial:
-        return replace(command, fate="superseded")
-    wall_ms = round((int(statuses.stamp_ns[first]) - given_ns) * 1e-6, 6)
-    return replace(command, acts=int(statuses.tick[first]), fate="acted on", wall_ms=wall_ms)
-
-
-def _figure(values: np.ndarray, of: Callable[[np.ndarray], Any]) -> float | None:
-    return float(of(values)) if len(values) else None
 
 
 def show(recording: Recording, folder: Path, as_json: bool) -> bool:

@@ -109,21 +109,41 @@ def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
     older plans and longer cycles, of the board or of one that shares its core, by their factor. If
     none of these helps alone, moving the planner and lengthening the cycle together may.
     """
-    kinds = (_other_priority, _board_elsewhere, _planner_elsewhere, _more_cycles, _longer_cycle)
-    found = [change for kind in kinds if (change := kind(rack, board)) is not None]
-    found += _changes_of_others(rack, board)
+    found = [*_own_changes(rack, board), *_changes_of_others(rack, board)]
     if not found:
-        both = (_longer_cycle(rack, board, place) for place in _places(rack, board))
+        both = (
+            _first(rack, board, _longer_cycles(rack, board, place))
+            for place in _places(rack, board)
+        )
         found = [change for change in both if change is not None][:1]
     return sorted(found, key=lambda change: change.cost)
 
 
-def _other_priority(rack: JudgedConfig, board: str) -> Change | None:
-    """Put the board's executor, or its planner, above another task on its core; the smallest rise
-    that helps."""
+def _own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
+    """Yield the smallest change of each kind of a board that helps."""
+    older = [{"within_cycles": d} for d in _cycles(rack.timing.level(board))]
+    cores = [{"core": core} for core in _other_cores(rack, rack.config.board[board].core)]
+    places = list(_places(rack, board))
+    planner = _any(rack, board, places)
+    if planner is None:
+        # Another place is not enough: with more cycles for a plan it may be.
+        moved = (_first(rack, board, [{**place, **d} for d in older]) for place in places)
+        planner = _cheapest(moved)
+    kinds = (
+        _any(rack, board, _priorities(rack, board)),
+        _any(rack, board, cores),
+        planner,
+        _first(rack, board, older),
+        _first(rack, board, _longer_cycles(rack, board)),
+    )
+    yield from (change for change in kinds if change is not None)
+
+
+def _priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
+    """Yield the priorities of a board's executor, or its planner, above other tasks on its core,
+    the smallest rise first."""
     table = rack.config.board[board]
     limit = rack.config.clock.priority or HIGHEST + 1
-    tried: list[Settings] = []
     for key, task in (("priority", board), ("planner_priority", f"{board}.planner")):
         core = rack.timing.cores.get(task)
         own = getattr(table, key)
@@ -132,77 +152,40 @@ def _other_priority(rack: JudgedConfig, board: str) -> Change | None:
             for other in rack.timing.tasks
             if other.core == core and other.name != task
         }
-        tried += [{key: priority} for priority in sorted(above) if own < priority < limit]
-    return _any(rack, board, tried)
+        yield from ({key: priority} for priority in sorted(above) if own < priority < limit)
 
 
-def _changes_of_others(rack: JudgedConfig, board: str) -> list[Change]:
-    """Return the cheapest change of each board that shares a core with this one: another core, or a
-    longer cycle."""
+def _changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
+    """Yield the cheapest change of each board that shares a core with this one: another core, of
+    the board or of its loose planner alone, or a longer cycle."""
     timing = rack.timing
     cores = timing.cores_of(board)
     loads = {task.board: 0.0 for task in timing.tasks}
     for task in timing.tasks:
         loads[task.board] += task.cost_ns / task.period_ns if task.core in cores else 0.0
     others = [name for name in timing.boards if loads.get(name) and name != board]
-    found = []
     for other in sorted(others, key=lambda name: -loads[name])[:MAX_OTHERS]:
-        changes = (_task_elsewhere(rack, other, board), _longer_cycle(rack, other, cures=board))
-        found += sorted(
-            (change for change in changes if change is not None), key=lambda change: change.cost
-        )[:1]
-    return found
+        table = rack.config.board[other]
+        keys = ["core"] if table.planner_core is None else ["planner_core", "core"]
+        moves = ({key: core} for key in keys for core in _other_cores(rack, getattr(table, key)))
+        change = _cheapest(
+            (
+                _any(rack, other, moves, board),
+                _first(rack, other, _longer_cycles(rack, other), board),
+            )
+        )
+        if change is not None:
+            yield change
 
 
-def _more_cycles(rack: JudgedConfig, board: str) -> Change | None:
-    level = rack.timing.level(board)
-    if level.within_cycles is None:
-        return None
-    return _first(
-        rack, board, [{"within_cycles": d} for d in _cycles(level, level.within_cycles + 1)]
-    )
+def _cheapest(changes: Iterable[Change | None]) -> Change | None:
+    found = (change for change in changes if change is not None)
+    return min(found, key=lambda change: change.cost, default=None)
 
 
-def _planner_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
-    """Couple a planner loosely, or move a loose one to another core; if that is not enough, with
-    more cycles."""
-    level = rack.timing.level(board)
-    places = list(_places(rack, board))
-    if (change := _any(rack, board, places)) is not None:
-        return change
-    older = _cycles(level, (level.within_cycles or 0) + 1)
-    found = [
-        _first(rack, board, [{**place, "within_cycles": d} for d in older]) for place in places
-    ]
-    return min(
-        (change for change in found if change is not None),
-        key=lambda change: change.cost,
-        default=None,
-    )
-
-
-def _board_elsewhere(rack: JudgedConfig, board: str) -> Change | None:
-    return _any(
-        rack, board, ({"core": core} for core in _other_cores(rack, rack.config.board[board].core))
-    )
-
-
-def _task_elsewhere(rack: JudgedConfig, board: str, cures: str) -> Change | None:
-    """Move a board, or its loose planner alone, to another used core so that another board fits."""
-    table = rack.config.board[board]
-    keys = ["core"] if table.planner_core is None else ["planner_core", "core"]
-    return _any(
-        rack,
-        board,
-        ({key: core} for key in keys for core in _other_cores(rack, getattr(table, key))),
-        cures,
-    )
-
-
-def _longer_cycle(
-    rack: JudgedConfig, board: str, place: Settings | None = None, cures: str | None = None
-) -> Change | None:
-    """Lengthen a cycle; with a limit on the age of plans, a plan may then get fewer cycles."""
+def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None) -> list[Settings]:
+    """Return longer cycles of a board, its planner in another place if one is given; with a limit
+    on the age of plans, a plan may then get fewer cycles."""
     every = rack.timing.boards[board].every
     timing = rack.timing if place is None else rack.timing.changed(board, coupling="loose")
     step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
@@ -212,12 +195,11 @@ def _longer_cycle(
     )
     # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the other
     # levels less well, or leave plans too few cycles.
-    sound = [
+    return [
         {**(place or {}), **settings}
         for changed, settings in tried
         if rack.is_sound(changed, board)
     ]
-    return _first(rack, board, sound, cures)
 
 
 def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
@@ -230,12 +212,15 @@ def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
             yield {"coupling": "loose", "planner_slot": slot, "planner_core": other}
 
 
-def _cycles(level: LevelTiming, least: int) -> range:
-    """Return the cycles that a plan of a level may take, from `least` on."""
-    longest = min((level.within_cycles or 1) * MAX_FACTOR, MAX_CYCLES)
+def _cycles(level: LevelTiming) -> range:
+    """Return the longer times, in cycles, that a plan of a level may take; none without a
+    planner."""
+    if level.within_cycles is None:
+        return range(0)
+    longest = min(level.within_cycles * MAX_FACTOR, MAX_CYCLES)
     if level.plan_within_ns is not None:
         longest = min(level.plan_within_ns // level.cycle_ns, longest)
-    return range(least, longest + 1)
+    return range(level.within_cycles + 1, longest + 1)
 
 
 def _lengthened(timing: RackTiming, board: str, every: int) -> tuple[RackTiming, Settings]:

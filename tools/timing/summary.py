@@ -50,7 +50,7 @@ def summary_lines(
         )
     if failing:
         yield ""
-        yield from verdict_table(failing)
+        yield from verdict_table(("", verdict) for verdict in failing)
         yield ""
         yield from fitting.lines()
     elif not forecast.uncounted:

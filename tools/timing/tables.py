@@ -10,7 +10,6 @@ from typing import Any
 
 from rack.levels.timing.chains import spanned
 from rack.levels.timing.forecast import Forecast
-from rack.levels.timing.frames import CoreFrames
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.response_time import TaskResponse
 from rack.levels.timing.system_response import Prediction
@@ -30,10 +29,10 @@ def forecast_lines(forecast: Forecast) -> Iterator[str]:
             f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:",
             "",
         )
-        yield from _levels(forecast.levels)
+        yield from level_table(((level.coupling, level) for level in forecast.levels), "coupling")
     if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
-        yield from verdict_table(paper)
+        yield from verdict_table(("", verdict) for verdict in paper)
     if forecast.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
         yield from _responses(forecast.responses)
@@ -51,8 +50,7 @@ def forecast_lines(forecast: Forecast) -> Iterator[str]:
 
 
 def _schedule_lines(forecast: Forecast) -> Iterator[str]:
-    """Yield a line per board of every distinct frame of a static schedule, and those that are late
-    in theirs."""
+    """Yield a line per board of every distinct frame of a static schedule."""
     if forecast.schedule is None:
         return
     minor, major = forecast.schedule
@@ -78,15 +76,6 @@ def _schedule_lines(forecast: Forecast) -> Iterator[str]:
         for place in alike.places
     ]
     yield from fitted(head, rows, ("until",))
-    for alike in forecast.frames:
-        yield from _late_lines(alike)
-
-
-def _late_lines(alike: CoreFrames) -> Iterator[str]:
-    for place in alike.places:
-        if place.slack_ns < 0:
-            where = f"core {alike.core}, frame {alike.frames[0]}"
-            yield f"{where}: '{place.board}' lacks {ms(-place.slack_ns)} ms when {place.limit}"
 
 
 def _numbers(frames: Sequence[int], count: int) -> str:
@@ -108,44 +97,34 @@ def _numbers(frames: Sequence[int], count: int) -> str:
 def _prediction_lines(system: Prediction) -> Iterator[str]:
     if system.levels:
         yield ""
-        yield f"system response, {' > '.join(system.levels)}:"
         yield (
-            f"  eq. 3.3 sum of the cycles {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound"
-            f" {system.bound_eq_3_2_ms:g} ms"
-        )
-        yield (
-            f"  on the clock's grid: a command down {system.command_ms:g} ms, a status up"
-            f" {system.status_ms:g} ms"
+            f"system response, {' > '.join(system.levels)}: eq. 3.3 sum of the cycles"
+            f" {system.sum_eq_3_3_ms:g} ms, eq. 3.2 bound {system.bound_eq_3_2_ms:g} ms"
         )
     for level, plan_ms in system.plan_ms.items():
         yield f"plan of {level}: available {plan_ms:g} ms after its planner's release"
 
 
-def _levels(levels: Iterable[LevelTiming]) -> Iterator[str]:
-    """Yield a line per level: its cycle, its parts, and the residual for its planner."""
-    head = [
-        "level",
-        "coupling",
-        "R_i",
-        "t_exec",
-        "t_comm",
-        "R",
-        "W",
-        "C",
-        "t_residual",
-        "t_plan",
-        "P",
-        "U",
-        "d",
-    ]
-    rows = _merged([_level_row(level) for level in levels], 0)
-    yield from fitted([*head, "d R_i"], rows, ("C", "R", "W", "U", "P", "d"))
+def level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> Iterator[str]:
+    """Yield a line per level: its cycle, its parts, and the residual for its planner; times in ms.
+
+    Args:
+        levels: Levels, each with a word about it.
+        about: Head of the column of these words.
+    """
+    head = ["level", about, "R_i", "t_exec", "t_comm", "R", "W", "C", "t_residual", "t_plan", "P"]
+    rows = _merged([_level_row(word, level) for word, level in levels], 0)
+    yield from fitted([*head, "U", "d", "d R_i"], rows, ("C", "R", "W", "U", "P", "d"))
 
 
-def verdict_table(verdicts: Iterable[EquationVerdict]) -> Iterator[str]:
-    """Yield a line per verdict: both sides, the margin, whether it holds."""
-    head = ["eq.", "of", "left", "", "right", "margin", "", "meaning"]
-    rows = _merged([_verdict_row(verdict) for verdict in verdicts], 1)
+def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> Iterator[str]:
+    """Yield a line per verdict: both sides, the margin, whether it holds. Each comes with the side
+    that it is of, predicted or measured; "": the table needs none."""
+    head = ["eq.", "of", "side", "left", "", "right", "margin", "", "meaning"]
+    rows = _merged([_verdict_row(side, verdict) for side, verdict in verdicts], 1)
+    if not any(row[2] for row in rows):
+        for row in (head, *rows):
+            del row[2]
     yield from fitted(head, rows, ("meaning", "margin"))
 
 
@@ -186,7 +165,7 @@ def _merged(rows: Sequence[Sequence[str]], named: int) -> list[list[str]]:
     return [[*rest[:named], spanned(found), *rest[named:]] for rest, found in names.items()]
 
 
-def _level_row(level: LevelTiming) -> list[str]:
+def _level_row(word: str, level: LevelTiming) -> list[str]:
     own = (
         level.cycle_ns,
         level.execution_ns,
@@ -199,14 +178,15 @@ def _level_row(level: LevelTiming) -> list[str]:
     plan = (level.planning_ns, level.plan_ns, update_ns)
     cycles = "-" if level.within_cycles is None else str(level.within_cycles)
     times = [ms(time) for time in (*own, level.residual_ns, *plan)]
-    return [level.board, level.coupling, *times, cycles, ms(level.slice_ns)]
+    return [level.board, word, *times, cycles, ms(level.slice_ns)]
 
 
-def _verdict_row(verdict: EquationVerdict) -> list[str]:
+def _verdict_row(side: str, verdict: EquationVerdict) -> list[str]:
     unit = verdict.unit
     return [
         verdict.equation,
         verdict.subject,
+        side,
         side_text(verdict.left, unit),
         verdict.sign,
         side_text(verdict.right, unit),

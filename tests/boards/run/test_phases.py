@@ -136,7 +136,7 @@ def test_gantt_draws_the_cyclic_schedule_without_preemption(
     found = config(text=cyclic())
     gantt = gantt_of(
         Subject(found, wire(found), None, tmp_path),
-        WindowOptions(None, None, None, None),
+        WindowOptions(),
         {},
         lambda part: None,
     )

@@ -71,7 +71,8 @@ def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_m
 def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(
     start_ms: int, tmp_path: Path
 ) -> None:
-    rack("gantt", "nasrem", "--level", "servo", "--from-ms", start_ms, "--out", tmp_path)
+    window = ("--from-ms", start_ms, "--to-ms", start_ms + 40)
+    rack("gantt", "nasrem", *window, "--out", tmp_path)
     # matplotlib draws letters as shapes, and names each text in a comment.
     labels = re.findall(r"<!-- ([\d.+e]+) -->", (tmp_path / "gantt.svg").read_text())
     assert labels == [str(start_ms + ms) for ms in (0, 20, 40)]
@@ -79,7 +80,7 @@ def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(
 
 @pytest.mark.slow
 def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> None:
-    shown = rack("gantt", "fig3", "--cycles", "0-3", "--out", tmp_path, "--json")
+    shown = rack("gantt", "fig3", "--to-ms", 24, "--out", tmp_path, "--json")
     assert shown.stderr == ""
     found = json.loads(shown.stdout)
     (panel,) = found["panels"]
@@ -171,7 +172,7 @@ def test_without_matplotlib_a_chart_is_printed_alone(
         assert done.returncode == 0
         missing = "no pictures: they need matplotlib: pip install 'nasrem-rack[charts]'"
         assert done.stdout.splitlines()[-1] == missing
-        assert len(done.stdout.splitlines()) > 5
+        assert "level" in done.stdout
     assert not (tmp_path / "out").exists()
     asked = rack("bench", "mailbox", "--plot", tmp_path / "out")
     assert (asked.returncode, asked.stdout) == (2, "")
@@ -185,18 +186,6 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
     assert "task, 1 s: multitasking: coupled tightly, as in the figure" in shown.stdout
     assert (tmp_path / "figure5.png").read_bytes().startswith(b"\x89PNG")
     assert ElementTree.parse(tmp_path / "figure5.svg").getroot().tag.endswith("svg")
-
-
-def test_a_level_that_the_chart_lacks_is_refused_with_the_reason(small: Path) -> None:
-    budget = ("--set", "board.lower.budget.process_ms=1", "--level")
-    lacking = rack("gantt", small, *budget, "upper")
-    assert (lacking.returncode, lacking.stderr) == (
-        2,
-        "--level upper: it has no budget, from which its schedule follows, as in rack gantt CONFIG"
-        " --set board.upper.budget.process_ms=1; levels: lower\n",
-    )
-    unknown = rack("gantt", small, *budget, "uper")
-    assert unknown.stderr == "--level uper: no such level in the chart; levels: lower\n"
 
 
 @pytest.mark.parametrize(

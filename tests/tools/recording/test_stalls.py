@@ -310,7 +310,6 @@ def test_a_cycle_with_a_stall_in_it_enters_no_budget(config: RackConfig, tmp_pat
             0,
             1,
         )
-        assert [breach.tick for breach in analysis.breaches if not breach.is_judged] == [50]
         # The report's own times are of all cycles.
         assert report_of(recording)["tasks"]["lower"]["execution_ms"]["max"] == 6.3
 

@@ -8,12 +8,12 @@ from dataclasses import asdict
 
 from rack.backplane.address_map import CLOCK
 from rack.tools.console.answer import Document, Failure
-from rack.tools.live.cycle_again import Repetition, repeated
 from rack.tools.live.signals import cell
 from rack.tools.recording.causes import Clue, Divergence, InBoth, UnlikeCycle
 from rack.tools.recording.divergence import Difference
 from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.cycle_again import Repetition, repeated
 from rack.tools.timing.analysis.report import OtherRun
 
 SHOWN = 4
@@ -28,15 +28,13 @@ def compared(recording: Recording, asked: OtherRun) -> Document:
     missed = min((miss["tick"] for run in found.runs for miss in misses(run)), default=None)
     first = next(iter(found.unlike.values()), None)
     chain = found.chain(asked.of)
-    repetition = None
-    why_not = ""
-    if chain and _is_open(chain[-1]):
-        repetition, why_not = _repeated(found, chain[-1], asked.repeats)
+    repetition = _repeated(found, chain[-1], asked.repeats) if chain else ""
     there = str(asked.folder)
     lines = [line for cycle in chain for line in _cycle_lines(cycle, there)]
-    if repetition is not None:
+    why_not = ""
+    if isinstance(repetition, Repetition):
         lines += _repetition_lines(repetition, chain[-1], there)
-    elif why_not:
+    elif why_not := repetition:
         lines.append(f"not repeated: {why_not}")
     if asked.of and not chain:
         lines.append(f"{asked.of} is equal in both")
@@ -46,28 +44,24 @@ def compared(recording: Recording, asked: OtherRun) -> Document:
         "first_miss_tick": missed,
         "explained": first is None or (missed is not None and missed <= first.tick),
         "chain": [asdict(cycle) for cycle in chain],
-        "repetition": None if repetition is None else asdict(repetition),
+        "repetition": asdict(repetition) if isinstance(repetition, Repetition) else None,
         "not_repeated": why_not,
         "why": lines,
     }
 
 
-def _is_open(last: UnlikeCycle) -> bool:
-    """Say whether the recordings leave open if it was the level's state or code."""
-    return not last.unequal and all(clue.kind in OF_CONFIG for clue in last.clues)
-
-
-def _repeated(
-    found: Divergence, cycle: UnlikeCycle, is_wanted: bool
-) -> tuple[Repetition | None, str]:
-    """Return what repeating a cycle shows, or why it is not repeated."""
+def _repeated(found: Divergence, last: UnlikeCycle, is_wanted: bool) -> Repetition | str:
+    """Return what repeating a cycle shows, or why it is not repeated: "" if the recordings say
+    already that it was not the level's state or code."""
+    if last.unequal or any(clue.kind not in OF_CONFIG for clue in last.clues):
+        return ""
     if not is_wanted:
-        return None, "--repeat runs both racks again, to that cycle"
-    print(f"repeating tick {cycle.tick} in both runs", file=sys.stderr)
+        return "--repeat runs both racks again, to that cycle"
+    print(f"repeating tick {last.tick} in both runs", file=sys.stderr)
     try:
-        return repeated(found, cycle), ""
+        return repeated(found, last)
     except Failure as failure:
-        return None, str(failure)
+        return str(failure)
 
 
 def _cycle_lines(cycle: UnlikeCycle, there: str) -> Iterator[str]:

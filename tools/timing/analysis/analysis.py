@@ -8,16 +8,18 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
+import numpy as np
+
+from rack.backplane.layout import TaskSpec
 from rack.boards.config import RackConfig, rack_timing
 from rack.boards.config.timing import without_interrupts
+from rack.levels.timing import trace_times
 from rack.levels.timing.equations import Relation
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, verdicts
 from rack.tools.console.answer import Failure
 from rack.tools.recording.cycles import WORST, Cycles, budgets_of, cycles_of, worst_of
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.breaches import Breach, breaches
-from rack.tools.timing.analysis.rules import cycle_ns, response_ns, slice_ns, steps_ns
 from rack.tools.timing.measured_response import system_response
 
 MOSTLY = 99.0
@@ -72,7 +74,6 @@ class Analysis:
     measured: RackTiming
     pairs: tuple[Pair, ...]
     mostly: tuple[Pair, ...]
-    breaches: tuple[Breach, ...]
 
     @classmethod
     def of(
@@ -119,18 +120,12 @@ class Analysis:
             measured=measured(percentile),
             pairs=found,
             mostly=pairs(min(percentile, MOSTLY)),
-            breaches=tuple(breaches(cycles, predicted)),
         )
 
     @property
     def holds(self) -> bool:
         """Whether every equation held in the run."""
         return not any(pair.fails for pair in self.pairs)
-
-    @property
-    def judged_breaches(self) -> tuple[Breach, ...]:
-        """The breaches of cycles that are judged, the worst first."""
-        return tuple(breach for breach in self.breaches if breach.is_judged)
 
 
 def _paired(
@@ -184,11 +179,11 @@ def _tasks(
 ) -> Iterator[EquationVerdict]:
     for name, cycles in found.items():
         if cycles.task.role == "executor":
-            step = worst_of(steps_ns(cycles, rack)[cycles.is_judged], percentile)
+            step = worst_of(_steps_ns(cycles, rack)[cycles.is_judged], percentile)
             relation = Relation(step, "=", cycle_ns(rack, cycles.task))
             yield EquationVerdict.of("3.7", name, relation, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
-            worst = worst_of(response_ns(cycles, rack)[cycles.is_judged], percentile)
+            worst = worst_of(_response_ns(cycles, rack)[cycles.is_judged], percentile)
             relation = Relation(worst, "<=", slice_ns(rack, cycles.task))
             yield EquationVerdict.of(RESPONSE_TIME, name, relation, "measured response <= deadline")
 
@@ -228,3 +223,33 @@ def task_loads(
         else:
             loads[name] = int(used_ns.sum()) / lasted_ns
     return loads
+
+
+def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
+    """Return R_i of a task's level."""
+    return rack.boards[task.board].every * rack.tick_ns
+
+
+def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
+    """Return the time available to one cycle of a task; d R_i, the time slice, of a planner."""
+    return task.slice * rack.tick_ns
+
+
+def _response_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
+    """Return the time from the release to the end of each cycle, shape (n,).
+
+    A cycle whose message came too late, as its trace says, has missed its deadline whenever it
+    ended.
+    """
+    least = np.where(trace_times.is_missed(cycles.rows), slice_ns(rack, cycles.task) + 1, 0)
+    return np.asarray(np.maximum(trace_times.response_ns(cycles.rows), least))
+
+
+def _steps_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
+    """Return the time from the previous release to that of each cycle, t_(k+1) - t_k of eq. 3.7,
+    shape (n,).
+
+    It follows from the releases skipped as traced: a restart, or a row lost by the recorder, is not
+    a skipped release.
+    """
+    return np.asarray((1 + trace_times.skipped(cycles.rows)) * cycle_ns(rack, cycles.task))

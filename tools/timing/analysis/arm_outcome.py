@@ -3,7 +3,7 @@ its text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,10 @@ import numpy as np
 from rack.backplane.message import state_name
 from rack.boards.config import RackConfig
 from rack.levels.messages import ARM_STATE, SCENE, TASK_STATUS
+from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
+from rack.tools.timing.analysis.run_report import RunReport
 
-Report = dict[str, Any]
 DRIVING = ("servo_status", "arm_status")
 HAND_STATUS = "hand_status"
 WRENCH = "wrench"
@@ -32,7 +33,7 @@ LEAST_M = 0.005
 along."""
 
 
-def task_outcome(recording: Recording) -> Report | None:
+def task_outcome(recording: Recording) -> Document | None:
     """Return the last status of the level that reports on the whole task."""
     mailbox = _mailbox_of(recording, TASK_STATUS.name)
     if mailbox is None:
@@ -51,14 +52,14 @@ def task_outcome(recording: Recording) -> Report | None:
     }
 
 
-def objects(recording: Recording, config: RackConfig) -> Iterator[Report]:
+def objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
     """Yield where each object that has a goal ended, and its falls."""
     for end in recording.ended.get("outcome", {}).get("objects", ()):
         row = config.scene.objects.index(end["object"])
         yield {**end, "drops": list(_drops(recording, row))}
 
 
-def _drops(recording: Recording, row: int) -> Iterator[Report]:
+def _drops(recording: Recording, row: int) -> Iterator[Document]:
     """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the
     tool."""
     mailbox = _mailbox_of(recording, SCENE.name)
@@ -78,7 +79,7 @@ def _drops(recording: Recording, row: int) -> Iterator[Report]:
             yield {"tick": int(ticks[begin]), "mm": rounded(fallen * 1e3)}
 
 
-def motion(recording: Recording) -> Report | None:
+def motion(recording: Recording) -> Document | None:
     """Return tracking error, mrad, where a status tells it, and the counts of touches, exceeded
     limits and refused or cut commands, or None."""
     mailbox = _mailbox_of(recording, *DRIVING)
@@ -95,7 +96,7 @@ def motion(recording: Recording) -> Report | None:
     }
 
 
-def _counts(recording: Recording, status: str | None) -> Report:
+def _counts(recording: Recording, status: str | None) -> Document:
     """Return what an arm or a hand has counted, by its state, and what the board that drives it has
     cut besides, by the mailbox of its status; nothing without either."""
     names = {name: name for name in ("touches", "violations", "pushed")} | {
@@ -119,7 +120,7 @@ def rounded(value: float) -> float:
     return round(float(value), 6)
 
 
-def hand(recording: Recording, config: RackConfig) -> Report | None:
+def hand(recording: Recording, config: RackConfig) -> Document | None:
     """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or
     None."""
     mailbox = _mailbox_of(recording, HAND_STATUS)
@@ -143,7 +144,7 @@ def hand(recording: Recording, config: RackConfig) -> Report | None:
     }
 
 
-def force(recording: Recording) -> Report | None:
+def force(recording: Recording) -> Document | None:
     """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N,
     or None."""
     wrench = _mailbox_of(recording, WRENCH)
@@ -172,45 +173,42 @@ def _mailbox_of(recording: Recording, *messages: str) -> str | None:
     return name if name in recording.mailboxes else None
 
 
-def task_text(task: Report | None) -> Iterator[str]:
-    """Yield how far the task came; nothing without one."""
-    if task is not None:
+def outcome_text(report: RunReport) -> Iterator[str]:
+    """Yield how far the task came, where its objects ended, and what the arm or hand did."""
+    if (task := report.task) is not None:
         done = (
             f"{task['action']} of {task['actions']} actions, {task['moves_done']} of"
             f" {task['moves']} elemental moves"
         )
-        yield from (
-            "",
-            f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}.",
-        )
-
-
-def objects_text(objects: Sequence[Report]) -> Iterator[str]:
-    """Yield how far each object ended from its goal, and its falls."""
-    for entry in objects:
-        off = f"{entry['off_mm']:.1f} mm from its goal (tolerance {entry['tolerance_mm']:g} mm)"
-        yield f"Object {entry['object']} ended {off}."
-        for drop in entry.get("drops", ()):
+        yield ""
+        yield f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}."
+    for end in report.objects:
+        off = f"{end['off_mm']:.1f} mm from its goal (tolerance {end['tolerance_mm']:g} mm)"
+        yield f"Object {end['object']} ended {off}."
+        for drop in end.get("drops", ()):
             yield (
-                f"Object {entry['object']} was let go {drop['mm']:.0f} mm above what it landed on, "
+                f"Object {end['object']} was let go {drop['mm']:.0f} mm above what it landed on, "
                 f"at tick {drop['tick']}."
             )
+    if report.motion is not None:
+        yield _motion_text(report.motion)
+    if report.hand is not None:
+        yield from _hand_text(report.hand)
+    if report.force is not None:
+        yield _force_text(report.force)
 
 
-def motion_text(motion: Report | None) -> Iterator[str]:
-    """Yield how the arm followed, what it touched, and whether it kept its limits."""
-    if motion is None:
-        return
+def _motion_text(motion: Document) -> str:
     tracking = ""
     if motion["tracking_rms_mrad"] is not None:
         tracking = (
             f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS,"
             f" {motion['tracking_peak_mrad']:.3f} peak; "
         )
-    yield f"{tracking}{_counts_text(motion)}"
+    return f"{tracking}{_counts_text(motion)}"
 
 
-def _counts_text(report: Report) -> str:
+def _counts_text(report: Document) -> str:
     return (
         f"{report['touches']} touches; commands refused or cut in {report['clipped_cycles']}"
         f" cycles; limits exceeded in {report['violations']} substeps, by a push from outside in"
@@ -218,10 +216,7 @@ def _counts_text(report: Report) -> str:
     )
 
 
-def hand_text(hand: Report | None) -> Iterator[str]:
-    """Yield how tendons followed, and the largest force on each fingertip."""
-    if hand is None:
-        return
+def _hand_text(hand: Document) -> Iterator[str]:
     yield (
         f"Tensions {hand['tension_rms_n']:.2f} N RMS off their commands,"
         f" {hand['tension_peak_n']:.2f} peak; {hand['least_tension_n']:.2f} to"
@@ -232,16 +227,10 @@ def hand_text(hand: Report | None) -> Iterator[str]:
     yield f"Largest force on each tip, N: {forces}."
 
 
-def force_text(force: Report | None) -> Iterator[str]:
-    """Yield the largest force and torque of contacts, and how well axes of force followed."""
-    if force is None:
-        return
-    off = (
-        ""
-        if force["force_rms_n"] is None
-        else f"; axes of force {force['force_rms_n']:.2f} N RMS off"
-    )
-    yield (
+def _force_text(force: Document) -> str:
+    rms_n = force["force_rms_n"]
+    off = "" if rms_n is None else f"; axes of force {rms_n:.2f} N RMS off"
+    return (
         f"Contact: at most {force['largest_force_n']:.1f} N and {force['largest_torque_nm']:.2f} N"
         f" m, beyond the arm's limits in {force['exceeded_cycles']} cycles{off}."
     )

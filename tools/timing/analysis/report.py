@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,8 @@ import numpy as np
 from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config import RackConfig, wire
 from rack.levels.peer import Presence, peer_port
-from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
-from rack.levels.timing.trace_times import (
-    communication_ns,
-    distribution,
-    execution_ns,
-    gaps_ns,
-    lateness_ns,
-    plan_ages,
-    residual_ns,
-)
-from rack.tools.console.answer import write_file, write_json
+from rack.levels.timing.trace_times import distribution, plan_ages
+from rack.tools.console.answer import Document, write_file, write_json
 from rack.tools.faults.judge import faults
 from rack.tools.live.host_side import ENTRY_COUNTS, entries_of
 from rack.tools.live.interrupts import interrupts
@@ -44,11 +35,11 @@ from rack.tools.recording.recorder_process import sizes
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
 from rack.tools.timing.analysis import arm_outcome
-from rack.tools.timing.analysis.arm_outcome import rounded
 from rack.tools.timing.analysis.report_markdown import markdown
+from rack.tools.timing.analysis.run_report import RunReport
+from rack.tools.timing.analysis.task_times import task_times
 from rack.tools.timing.measured_response import system_response
 
-Report = dict[str, Any]
 COMPARISON = "rack.tools.timing.analysis.against"
 """What compares two runs, by name: it brings what repeats them, which no report on one needs."""
 
@@ -63,7 +54,7 @@ class OtherRun:
     repeats: bool
 
 
-def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Report, str]:
+def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Document, str]:
     """Write the report of the run in `folder` into it, and return it as data and as text.
 
     With another run, `against`, it says where the two diverge, and why.
@@ -80,7 +71,7 @@ def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Report,
     return report, text
 
 
-def report_of(recording: Recording) -> Report:
+def report_of(recording: Recording) -> Document:
     """Return the report of a recorded run as plain data."""
     config = recording.rack_config
     layout = recording.layout
@@ -93,115 +84,86 @@ def report_of(recording: Recording) -> Report:
     report = _head(config, ended, last + 1, response)
     if not ended:
         # Without the end of the run in the recording, the trace has to do.
-        report["missed"], report["skipped"] = counted(found)
-    return {
-        **report,
-        "folder": str(recording.folder),
-        "continues": None if origin is None else origin.document(layout.clock_ns),
-        "misses": found,
-        "steal": steal(recording),
-        "stalls": asdict(stalls_of(recording)[0]),
-        "frequency_mhz": frequency(recording),
-        "notes": [event["text"] for event in recording.events if event["kind"] == "ready"],
-        "holds": holds(recording),
-        "state_tables": fired_rows(recording),
+        missed, skipped = counted(found)
+        report = replace(report, missed=missed, skipped=skipped)
+    return replace(
+        report,
+        folder=str(recording.folder),
+        continues=None if origin is None else origin.document(layout.clock_ns),
+        misses=found,
+        steal=steal(recording),
+        stalls=asdict(stalls_of(recording)[0]),
+        frequency_mhz=frequency(recording),
+        notes=[event["text"] for event in recording.events if event["kind"] == "ready"],
+        holds=holds(recording),
+        state_tables=fired_rows(recording),
         **faults(recording.events, layout),
-        "tasks": {task.name: _task(recording, config, task) for task in layout.tasks},
-        "system_response": response,
-        "entries": _entries(recording),
-        "network": network(recording),
-        "task": arm_outcome.task_outcome(recording),
-        "objects": list(arm_outcome.objects(recording, config)),
-        "motion": arm_outcome.motion(recording),
-        "hand": arm_outcome.hand(recording, config),
-        "force": arm_outcome.force(recording),
-        "queues": queues(recording),
-        "interrupts": interrupts(recording),
-        "recording": ended.get("recording", "without the end of the run"),
-        "rows_lost": {name: count for name, count in recording.lost.items() if count},
-        "gaps": [gap._asdict() for gap in recording.gaps()],
-        "untraced": recording.untraced(),
-        "kept": recording.kept_text or None,
-    }
+        tasks={task.name: _task(recording, config, task) for task in layout.tasks},
+        system_response=response,
+        entries=_entries(recording),
+        network=network(recording),
+        task=arm_outcome.task_outcome(recording),
+        objects=list(arm_outcome.objects(recording, config)),
+        motion=arm_outcome.motion(recording),
+        hand=arm_outcome.hand(recording, config),
+        force=arm_outcome.force(recording),
+        queues=queues(recording),
+        interrupts=interrupts(recording),
+        recording=ended.get("recording", "without the end of the run"),
+        rows_lost={name: count for name, count in recording.lost.items() if count},
+        gaps=[gap._asdict() for gap in recording.gaps()],
+        untraced=recording.untraced(),
+        kept=recording.kept_text or None,
+    ).document()
 
 
-def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Report:
+def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Document:
     """Return the report of a run that was not recorded: the same keys, null where only a recording
     could tell."""
-    unknown = (
-        "misses",
-        "steal",
-        "stalls",
-        "frequency_mhz",
-        "notes",
-        "holds",
-        "state_tables",
-        "faults",
-        "unexplained",
-        "restarts",
-        "system_response",
-        "entries",
-        "network",
-        "task",
-        "motion",
-        "hand",
-        "force",
-        "queues",
-        "interrupts",
-        "continues",
-        "rows_lost",
-        "gaps",
-        "untraced",
-        "kept",
-        "bytes",
-        "bytes_per_s",
-    )
     layout = wire(config)
-    tasks = {
-        task.name: {**_about(task, layout), **ended["tasks"][task.name]} for task in layout.tasks
-    }
     head = _head(config, ended, 0, None)
-    return {
-        **head,
-        "unjudged": [*head["unjudged"], UNRECORDED],
-        **dict.fromkeys(unknown),
-        "tasks": tasks,
-        "recording": ended["recording"],
-    }
+    return replace(
+        head,
+        unjudged=[*head.unjudged, UNRECORDED],
+        tasks={
+            task.name: {**_about(task, layout), **ended["tasks"][task.name]}
+            for task in layout.tasks
+        },
+        recording=ended["recording"],
+    ).document()
 
 
 def _head(
-    config: RackConfig, ended: Mapping[str, Any], ticks: int, response: Report | None
-) -> Report:
+    config: RackConfig, ended: Mapping[str, Any], ticks: int, response: Document | None
+) -> RunReport:
     """Return the part that needs no recording; `ticks` is the length of a run whose end is not
     known."""
     outcome = ended.get("outcome", {})
     counters = ended.get("tasks", {}).values()
-    return {
-        "rack": config.name,
-        "folder": None,
-        "mode": config.clock.mode,
-        "speed": config.clock.speed,
-        "clock_ms": config.clock.period_ms,
+    return RunReport(
+        rack=config.name,
+        mode=config.clock.mode,
+        speed=config.clock.speed,
+        clock_ms=config.clock.period_ms,
         **judge_run(ended, response),
-        "outcome": outcome or None,
-        "digest": outcome.get("digest"),
-        "objects": outcome.get("objects", []),
-        "simulated_s": round(outcome.get("ticks", ticks) * config.clock_ns * 1e-9, 6),
-        "wall_s": round(ended.get("wall_s", 0.0), 6),
-        "clock_skipped": ended.get("clock_skipped", 0),
-        "missed": sum(task["missed"] for task in counters),
-        "skipped": sum(task["skipped"] for task in counters),
-    }
+        outcome=outcome or None,
+        digest=outcome.get("digest"),
+        objects=outcome.get("objects", []),
+        simulated_s=round(outcome.get("ticks", ticks) * config.clock_ns * 1e-9, 6),
+        wall_s=round(ended.get("wall_s", 0.0), 6),
+        clock_skipped=ended.get("clock_skipped", 0),
+        missed=sum(task["missed"] for task in counters),
+        skipped=sum(task["skipped"] for task in counters),
+    )
 
 
-def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Report:
+def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
     is_lockstep = config.clock.mode == "lockstep"
     layout = recording.layout
     cycles = recording.trace(task.name)
     stretches = recording.stretch_of(cycles["tick"])
     period_ns = layout.clock_ns if is_lockstep else config.tick_ns
-    entry: Report = {
+    entry = {
         **_about(task, layout),
         **recording.ended.get("tasks", {}).get(task.name, {}),
         **task_times(task, cycles, period_ns, is_lockstep, stretches=stretches),
@@ -227,50 +189,11 @@ def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
     return np.concatenate(found) * (recording.layout.clock_ns * 1e-6)
 
 
-def _about(task: TaskSpec, layout: Layout) -> Report:
+def _about(task: TaskSpec, layout: Layout) -> Document:
     return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
 
 
-def task_times(
-    task: TaskSpec,
-    cycles: np.ndarray,
-    period_ns: int,
-    is_lockstep: bool,
-    *,
-    stretches: np.ndarray,
-) -> Report:
-    """Return the times of a task's traced cycles, ms of the wall clock (eq. 3.5: R = t_exec +
-    t_comm + t_residual).
-
-    `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and
-    preemption. `period_ns` is one tick of the wall clock. A planner's cycles are its plans, and its
-    R is their time slice. In lockstep a tick lasts as long as its tasks take: everything relative
-    to a release or a time slice is None. `stretches` are as in `gaps_ns`.
-    """
-    slice_ns = task.slice * period_ns
-    gaps = gaps_ns(cycles, stretches)
-    by_the_clock: Report = {
-        "lateness_ms": distribution(lateness_ns(cycles) * 1e-6),
-        "residual_ms": distribution(residual_ns(cycles, slice_ns) * 1e-6),
-        "largest_gap_ms": rounded(gaps.max() * 1e-6) if len(gaps) else None,
-        "alpha_ms": None,
-        "deviation_ms": None,
-    }
-    if len(cycles):
-        times = execution_ns(cycles).tolist(), communication_ns(cycles).tolist()
-        by_the_clock["alpha_ms"] = rounded(residual_bound_ns(slice_ns, *times) * 1e-6)
-        by_the_clock["deviation_ms"] = rounded(residual_deviation_ns(*times) * 1e-6)
-    return {
-        "traced": len(cycles),
-        "slice_ms": slice_ns * 1e-6,
-        "execution_ms": distribution(execution_ns(cycles) * 1e-6),
-        "communication_ms": distribution(communication_ns(cycles) * 1e-6),
-        "processor_ms": distribution(cycles["processor_ns"] * 1e-6),
-        **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
-    }
-
-
-def _entries(recording: Recording) -> list[Report]:
+def _entries(recording: Recording) -> list[Document]:
     """Return the entries of all bus adapters: their counts at the end, and the ages of what passed,
     ms."""
     found = []
@@ -287,7 +210,7 @@ def _entries(recording: Recording) -> list[Report]:
     return found
 
 
-def network(recording: Recording) -> Report | None:
+def network(recording: Recording) -> Document | None:
     """Return counts and ages, ms, of what passed, and losses of other racks; None: no adapter, or
     nothing recorded."""
     entries = exchanged(recording.config)
@@ -315,7 +238,7 @@ def network(recording: Recording) -> Report | None:
     }
 
 
-def _peer(recording: Recording, rack: str) -> Report:
+def _peer(recording: Recording, rack: str) -> Document:
     mailbox = f"{BOARD}.{peer_port(rack)}"
     presence = recording.signal(mailbox, "presence")
     cycle_s = recording.layout.task(BOARD).every * recording.layout.clock_ns * 1e-9

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 from rich.console import Console
 
 from rack.boards.events import Braking, braked_text
+from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks, TextTable, figure, table
 from rack.tools.live.holds import resume_command
 from rack.tools.live.verdict import headline
 from rack.tools.recording.recording import Gap
-from rack.tools.timing.analysis.arm_outcome import (
-    force_text,
-    hand_text,
-    motion_text,
-    objects_text,
-    task_text,
-)
+from rack.tools.timing.analysis.arm_outcome import outcome_text
 from rack.tools.timing.analysis.report_timing import (
     SHOWN,
     misses_text,
@@ -26,8 +20,7 @@ from rack.tools.timing.analysis.report_timing import (
     the_most,
     times_text,
 )
-
-Report = dict[str, Any]
+from rack.tools.timing.analysis.run_report import RunReport
 
 CHANGED = 1.05
 """Ratio of a core's highest to its lowest frequency from which the text mentions it."""
@@ -44,7 +37,7 @@ FAULTS = (
 )
 
 
-def markdown(report: Report) -> str:
+def markdown(report: Document) -> str:
     """Return report.md of a report."""
     blocks = (
         block.markdown() if isinstance(block, TextTable) else (block,) for block in _blocks(report)
@@ -52,72 +45,80 @@ def markdown(report: Report) -> str:
     return "\n".join(line for lines in blocks for line in lines) + "\n"
 
 
-def show(report: Report, terminal: Console) -> None:
+def show(report: Document, terminal: Console) -> None:
     """Print as much of a report as the terminal's width permits."""
-    for block in _blocks(report):
-        if isinstance(block, TextTable):
-            for line in table(block.head, block.rows, terminal.width, block.dropped):
-                terminal.print(line, highlight=False, markup=False)
-        else:
-            style = "bold" if block.startswith("#") else ""
-            terminal.print(block.lstrip("# "), style=style, highlight=False, markup=False)
-    terminal.print(
-        f"\nall columns: {report['folder']}/report.md; all data: report.json",
-        highlight=False,
-        markup=False,
-    )
+    for block in (*_blocks(report), "", _files(report)):
+        is_title = isinstance(block, str) and block.startswith("#")
+        lines = (
+            table(block.head, block.rows, terminal.width, block.dropped)
+            if isinstance(block, TextTable)
+            else (block.lstrip("# "),)
+        )
+        for line in lines:
+            terminal.print(line, style="bold" if is_title else "", highlight=False, markup=False)
 
 
-def summary(report: Report) -> Iterator[str]:
+def _files(report: Document) -> str:
+    return f"all columns: {report['folder']}/report.md; all data: report.json"
+
+
+def summary(document: Document) -> Iterator[str]:
     """Yield the verdict, and what is known of a run that was not recorded, too."""
-    outcome = report["outcome"]
-    yield f"# {headline(report['rack'], outcome, report['failures'])}"
+    report = RunReport.of(document)
+    yield f"# {headline(report.rack, report.outcome, report.failures)}"
     yield ""
     yield (
-        f"{report['simulated_s']:.2f} s simulated in {report['wall_s']:.2f} s, {report['mode']}, "
-        f"{report['missed']} missed, {report['skipped']} skipped cycles."
-        f"{' Digest `' + report['digest'] + '`.' if report['digest'] else ''}"
+        f"{report.simulated_s:.2f} s simulated in {report.wall_s:.2f} s, {report.mode}, "
+        f"{report.missed} missed, {report.skipped} skipped cycles."
+        f"{f' Digest `{report.digest}`.' if report.digest else ''}"
     )
-    yield from (f"- not judged: {line}" for line in report["unjudged"])
-    if found := (outcome or {}).get("brakings"):
+    yield from (f"- not judged: {line}" for line in report.unjudged)
+    if found := (report.outcome or {}).get("brakings"):
         yield f"- {braked_text([Braking(**one) for one in found])}"
 
 
-def _blocks(report: Report) -> Blocks:
-    yield from summary(report)
-    if found := report["continues"]:
-        yield f"- continues {found['folder'] or 'another run'} from {found['time_s']:g} s"
-    yield from (f"- {note}" for note in report["notes"])
-    yield from _machine(report)
-    if report["recording"] != "complete":
-        yield f"- recording: {report['recording']}"
-    if report["kept"]:
-        yield f"- {report['kept']}"
-    if lost := ", ".join(f"{name} {count}" for name, count in report["rows_lost"].items()):
-        yield f"- the recorder lost rows: {lost}"
-        yield from (f"- {Gap(**gap)}" for gap in report["gaps"])
-    yield from _against(report.get("against"))
-    yield from task_text(report["task"])
-    yield from objects_text(report["objects"])
-    yield from motion_text(report["motion"])
-    yield from hand_text(report["hand"])
-    yield from force_text(report["force"])
-    yield from _queues(report["queues"])
-    yield from _interrupts(report["interrupts"])
-    yield from _holds(report)
-    yield from _state_tables(report["state_tables"])
+def _blocks(document: Document) -> Blocks:
+    report = RunReport.of(document)
+    yield from summary(document)
+    yield from _notes(report)
+    yield from outcome_text(report)
+    yield from _queues(report.queues)
+    yield from _interrupts(report.interrupts)
+    if report.holds:
+        yield from _holds(report)
+    if report.state_tables:
+        yield from _state_tables(report.state_tables)
     yield from times_text(report)
     yield from _faults(report)
-    yield from misses_text(report)
-    yield from response_text(report["system_response"])
-    yield from _entries(report["entries"])
-    yield from _network(report["network"])
+    if report.misses:
+        yield from misses_text(report)
+    if report.system_response:
+        yield from response_text(report.system_response)
+    if report.entries:
+        yield from ("", "## Bus adapters, ages in ms of simulated time", "")
+        yield _passed(report.entries, ("superseded", "waiting", "source"))
+    yield from _network(report.network)
 
 
-def _holds(report: Report) -> Blocks:
-    holds = report["holds"]
-    if not holds:
-        return
+def _notes(report: RunReport) -> Iterator[str]:
+    """Yield what the run began from and ran on, and what the recording lacks."""
+    if found := report.continues:
+        yield f"- continues {found['folder'] or 'another run'} from {found['time_s']:g} s"
+    yield from (f"- {note}" for note in report.notes)
+    yield from _machine(report)
+    if report.recording != "complete":
+        yield f"- recording: {report.recording}"
+    if report.kept:
+        yield f"- {report.kept}"
+    if lost := ", ".join(f"{name} {count}" for name, count in report.rows_lost.items()):
+        yield f"- the recorder lost rows: {lost}"
+        yield from (f"- {Gap(**gap)}" for gap in report.gaps)
+    if report.against:
+        yield from _against(report.against)
+
+
+def _holds(report: RunReport) -> Blocks:
+    holds = report.holds
     yield from ("", f"## Holds: {len(holds)}{the_most(holds, 'longest')}", "")
     longest = sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
     rows = [
@@ -137,17 +138,15 @@ def _holds(report: Report) -> Blocks:
         yield from (
             "",
             (
-                f"Still held at the end: {level}; `{resume_command(report['rack'], level)}`"
+                f"Still held at the end: {level}; `{resume_command(report.rack, level)}`"
                 " releases it."
             ),
         )
 
 
-def _state_tables(levels: dict[str, list[Report]]) -> Blocks:
+def _state_tables(levels: dict[str, list[Document]]) -> Blocks:
     """Yield one line a level: the table, how many rows fired, and those that fired first and
     last."""
-    if not levels:
-        return
     yield from ("", "## State tables", "")
     rows = []
     for level, fired in levels.items():
@@ -162,12 +161,12 @@ def _state_tables(levels: dict[str, list[Report]]) -> Blocks:
     )
 
 
-def _machine(report: Report) -> Iterator[str]:
+def _machine(report: RunReport) -> Iterator[str]:
     """Yield what the machine did to its cores: when they were away, by whom if that is known;
     changes of frequency."""
-    steal = report["steal"]
-    stalls = report["stalls"]
-    frequency = report["frequency_mhz"] or {}
+    steal = report.steal
+    stalls = report.stalls
+    frequency = report.frequency_mhz or {}
     lost = f"of {stalls['lost']} lost cycles were due meanwhile"
     if steal["ms"]:
         cores = ", ".join(f"core {core} for {steal['percent'][core]:.2f} %" for core in steal["ms"])
@@ -190,9 +189,7 @@ def _machine(report: Report) -> Iterator[str]:
         yield f"- the processor changed its frequency: {cores}"
 
 
-def _against(against: Report | None) -> Iterator[str]:
-    if against is None:
-        return
+def _against(against: Document) -> Iterator[str]:
     difference = against["first_difference"]
     if difference is None:
         yield f"- every message equals that of {against['folder']}"
@@ -206,19 +203,13 @@ def _against(against: Report | None) -> Iterator[str]:
     yield from (f"  - {line}" for line in against["why"])
 
 
-def _faults(report: Report) -> Blocks:
-    faults = report["faults"]
-    unexplained = report["unexplained"]
-    restarts = report["restarts"]
-    if faults:
+def _faults(report: RunReport) -> Blocks:
+    if faults := report.faults:
         yield from ("", f"## Faults: {len(faults)}", "")
         yield TextTable(FAULTS, [_fault_row(fault) for fault in faults])
-    if restarts:
-        yield from (
-            "",
-            f"Restarts: {', '.join(f'{task} {count}' for task, count in restarts.items())}.",
-        )
-    if unexplained:
+    if restarts := ", ".join(f"{task} {count}" for task, count in report.restarts.items()):
+        yield from ("", f"Restarts: {restarts}.")
+    if unexplained := report.unexplained:
         yield from ("", f"## Unexplained detections: {len(unexplained)}", "")
         rows = [
             [str(found["tick"]), found["board"], found["code"], found["text"]]
@@ -227,7 +218,7 @@ def _faults(report: Report) -> Blocks:
         yield TextTable(("tick", "found by", "as", "what"), rows)
 
 
-def _fault_row(fault: Report) -> list[str]:
+def _fault_row(fault: Document) -> list[str]:
     subject = fault["mailbox"] or fault["joint"]
     is_struck = fault["seen"] != "not struck"
     found = (
@@ -251,7 +242,7 @@ def _fault_row(fault: Report) -> list[str]:
     ]
 
 
-def _queues(queues: Sequence[Report]) -> Iterator[str]:
+def _queues(queues: Sequence[Document]) -> Iterator[str]:
     for queue in queues:
         refused = f", {queue['refused']} refused" if queue["refused"] else ""
         yield (
@@ -260,7 +251,7 @@ def _queues(queues: Sequence[Report]) -> Iterator[str]:
         )
 
 
-def _interrupts(boards: Sequence[Report]) -> Iterator[str]:
+def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
     for board in boards:
         lost = f", {board['lost']} lost" if board["lost"] else ""
         latency = board["latency_us"]
@@ -276,15 +267,7 @@ def _interrupts(boards: Sequence[Report]) -> Iterator[str]:
         )
 
 
-def _entries(entries: list[Report]) -> Blocks:
-    """Yield what passed between the two sides; nothing for a rack without bus adapters."""
-    if not entries:
-        return
-    yield from ("", "## Bus adapters, ages in ms of simulated time", "")
-    yield _passed(entries, ("superseded", "waiting", "source"))
-
-
-def _passed(rows: Sequence[Report], dropped: Sequence[str]) -> TextTable:
+def _passed(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
     """Return what passed from side to side, and its ages."""
     counts = [name for name in rows[0] if name != "age_ms"]
     ages = ("p50", "p99", "max")
@@ -295,9 +278,8 @@ def _passed(rows: Sequence[Report], dropped: Sequence[str]) -> TextTable:
     return TextTable([*counts, *(f"age {key}" for key in ages)], cells, dropped)
 
 
-def _network(network: Report | None) -> Blocks:
-    """Yield what passed over the network, and how often other racks were lost; nothing without a
-    network adapter."""
+def _network(network: Document | None) -> Blocks:
+    """Yield what passed over the network, and how often other racks were lost."""
     if network is None:
         return
     yield from ("", "## Network, ages in ms of simulated time", "")

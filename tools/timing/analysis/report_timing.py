@@ -1,37 +1,20 @@
-"""Times of cycles, misses and system responses, as a report's text."""
+"""Times of cycles, misses and system responses, as a report shows them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks, TextTable, decimal, figure
 from rack.tools.recording.history import counted
-
-Report = dict[str, Any]
+from rack.tools.timing.analysis.run_report import RunReport
+from rack.tools.timing.analysis.task_times import times_table
 
 SHOWN = 10
 """Most misses, holds and long responses in the text; report.json has them all."""
 
-COUNTS = ("task", "R", "cycles", "missed", "skipped")
-BY_THE_CLOCK = ("late p50", "late p99", "late max", "residual min", "deviation", "alpha")
-"""Times relative to a release or a time slice: they mean nothing in lockstep."""
-USED = ("exec p50", "exec p99", "exec max", "comm p99", "proc p99", "plan age max")
 JUDGED = {True: "ok", False: "beyond", None: "-"}
-DROPPED = (
-    "deviation",
-    "comm p99",
-    "proc p99",
-    "late p50",
-    "exec p50",
-    "alpha",
-    "late p99",
-    "exec p99",
-    "plan age max",
-    "R",
-    "cycles",
-)
-"""Columns that a narrow terminal leaves out, the first of them first."""
 
 
 def the_most(rows: Sequence[Any], which: str) -> str:
@@ -39,9 +22,9 @@ def the_most(rows: Sequence[Any], which: str) -> str:
     return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
 
 
-def times_text(report: Report) -> Blocks:
-    """Yield the table of cycles, without what means nothing in lockstep."""
-    is_lockstep = report["mode"] == "lockstep"
+def times_text(report: RunReport) -> Blocks:
+    """Yield the table of cycles."""
+    is_lockstep = report.mode == "lockstep"
     yield from ("", "## Cycles, ms", "")
     if is_lockstep:
         yield (
@@ -49,46 +32,25 @@ def times_text(report: Report) -> Blocks:
             " lateness, no residuals."
         )
         yield ""
-    for name, (traced, ran) in report["untraced"].items():
+    for name, (traced, ran) in report.untraced.items():
         yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
-    head = (*COUNTS, *(() if is_lockstep else BY_THE_CLOCK), *USED)
-    cells = [_times_row(name, task) for name, task in report["tasks"].items()]
-    yield TextTable(head, [[row[name] for name in head] for row in cells], DROPPED)
+    yield times_table(report.tasks, is_lockstep)
 
 
-def _times_row(name: str, task: Report) -> dict[str, str]:
-    row = {"task": name, "R": f"{task['slice_ms']:g}"}
-    row |= {key: str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")}
-    for title, key in (("late", "lateness_ms"), ("exec", "execution_ms")):
-        row |= {f"{title} {part}": figure(task[key], part) for part in ("p50", "p99", "max")}
-    row |= {key: decimal(task[f"{key}_ms"]) for key in ("deviation", "alpha")}
-    row |= {
-        "comm p99": figure(task["communication_ms"], "p99"),
-        "proc p99": figure(task["processor_ms"], "p99"),
-    }
-    row |= {
-        "residual min": figure(task["residual_ms"], "min"),
-        "plan age max": figure(task.get("plan_age_ms"), "max"),
-    }
-    return row
-
-
-def misses_text(report: Report) -> Blocks:
+def misses_text(report: RunReport) -> Blocks:
     """Yield the first missed and skipped cycles, and why they are fewer than tasks counted."""
-    misses = report["misses"]
-    if not misses:
-        return
+    misses = report.misses
     late, skipped = counted(misses)
     yield from (
         "",
         f"## Missed and skipped cycles: {late} and {skipped}{the_most(misses, 'first')}",
         "",
     )
-    if (late, skipped) != (report["missed"], report["skipped"]):
-        of_all = f"{report['missed']} and {report['skipped']}"
+    if (late, skipped) != (report.missed, report.skipped):
+        of_all = f"{report.missed} and {report.skipped}"
         why = (
             "the recorder lost rows"
-            if report["rows_lost"]
+            if report.rows_lost
             else "the recording does not hold all of it"
         )
         yield from (f"The tasks counted {of_all}; {why}.", "")
@@ -104,16 +66,14 @@ def misses_text(report: Report) -> Blocks:
     yield TextTable(("tick", "task", "what", "started late, ms", "took, ms"), rows)
 
 
-def response_text(response: Report | None) -> Blocks:
+def response_text(response: Document) -> Blocks:
     """Yield the responses of all chains of levels against their bounds, and what is beyond."""
-    if response is None:
-        return
     yield from ("", "## System response, ms of simulated time")
     for found in (response, *response["others"]):
         yield from _response_along(found)
 
 
-def _response_along(response: Report) -> Blocks:
+def _response_along(response: Document) -> Blocks:
     yield ""
     bounds = (
         f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"

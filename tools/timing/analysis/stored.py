@@ -34,7 +34,9 @@ def stored_report(folder: Path) -> tuple[Document, str] | None:
     except (OSError, ValueError, Failure):
         return None
     # A comparison with another run is no report of this one, and the folder may have been moved.
-    is_own = isinstance(data, dict) and "against" not in data and data.get("folder") == str(folder)
+    is_own = (
+        isinstance(data, dict) and not data.get("against") and data.get("folder") == str(folder)
+    )
     return (data, text) if is_own else None
 
 

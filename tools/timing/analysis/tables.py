@@ -1,46 +1,17 @@
-"""An analysis as text: tables of levels, tasks and equations, and the cycles that broke one."""
+"""An analysis as text: tables of levels, tasks and equations."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 
-from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.verdicts import EquationVerdict, verdicts
-from rack.tools.console.tables import decimal, figure, fitted, ms
-from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
+from rack.levels.timing.verdicts import verdicts
+from rack.tools.console.tables import fitted
+from rack.tools.recording.cycles import START_UP_S, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
-from rack.tools.timing.analysis.breaches import Breach, Broken
-from rack.tools.timing.analysis.document import summary, task_document, worst_words
+from rack.tools.timing.analysis.document import task_document
+from rack.tools.timing.analysis.task_times import times_table
 from rack.tools.timing.summary import tightest
-
-SHOWN = 10
-"""Most cycles in the list of those that broke an equation; the document has them all."""
-LEVELS = ["level", "", "R_i", "t_exec", "C", "R", "W", "t_comm", "t_residual", "t_plan", "d"]
-BY_THE_CLOCK = [
-    "late p50",
-    "late p99",
-    "late p99.9",
-    "late max",
-    "response p99",
-    "response max",
-    "of",
-    "largest gap",
-]
-TASKS = ["task", "cycles", "missed", "skipped", "deviation", "overhead", *BY_THE_CLOCK]
-TASKS_DROPPED = (
-    "late p99.9",
-    "overhead",
-    "late p50",
-    "deviation",
-    "largest gap",
-    "cycles",
-    "response p99",
-    "late p99",
-)
-"""Columns that a narrow terminal leaves out, the first of them first."""
-EQUATIONS = ["eq.", "of", "predicted", "holds", "measured", "margin", "held", "", "meaning"]
-EQUATIONS_DROPPED = ("meaning", "margin", "predicted", "holds")
+from rack.tools.timing.tables import level_table, verdict_table
 
 
 def text(analysis: Analysis) -> str:
@@ -57,32 +28,32 @@ def _lines(analysis: Analysis) -> Iterator[str]:
     yield from _head(analysis)
     yield ""
     yield (
-        f"Levels: processor time in ms, {worst_words(analysis.percentile)}; t_residual is alpha of"
+        f"Levels: processor time in ms, {_worst_words(analysis.percentile)}; t_residual is alpha of"
         " eq. 3.6."
     )
     sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
-    levels = [
-        _level_row(n, side, of[n])
-        for n in analysis.config.board
-        for side, of in sides.items()
-        if n in of
-    ]
-    yield from fitted(LEVELS, levels, ("C", "R", "W", "d"))
-    yield ""
-    yield from (f"{name}: {summary(analysis, name)}" for name in analysis.config.board)
-    yield ""
-    yield (
-        "Tasks: wall clock in ms. Deviation: standard deviation of the residual from cycle to"
-        " cycle. Overhead: processor time of a cycle outside its parts, for waking up and closing"
-        " it; the equations use 2 t_cs for it."
+    names = analysis.config.board
+    yield from level_table(
+        ((side, of[name]) for name in names for side, of in sides.items() if name in of), "side"
     )
-    rows = [_task_row(name, cycles, analysis) for name, cycles in analysis.cycles.items()]
-    # In lockstep there is no lateness and no deadline.
-    shown = len(TASKS) - len(BY_THE_CLOCK) if analysis.predicted.is_lockstep else len(TASKS)
-    yield from fitted(TASKS[:shown], [row[:shown] for row in rows], TASKS_DROPPED)
+    yield ""
+    yield "Tasks, ms: exec and comm are processor time; R of a planner is its time slice."
+    tasks = {
+        name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()
+    }
+    times = times_table(tasks, analysis.predicted.is_lockstep)
+    yield from fitted(times.head, times.rows, times.dropped)
     yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
-    yield from fitted(EQUATIONS, list(map(_pair_row, analysis.pairs)), EQUATIONS_DROPPED)
-    yield from _broken_cycles(analysis)
+    yield from verdict_table(
+        (side, verdict)
+        for pair in analysis.pairs
+        for side, verdict in (("predicted", pair.predicted), ("measured", pair.measured))
+        if verdict is not None
+    )
+
+
+def _worst_words(percentile: float) -> str:
+    return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
 
 
 def _head(analysis: Analysis) -> Iterator[str]:
@@ -108,9 +79,23 @@ def _head(analysis: Analysis) -> Iterator[str]:
         yield "lockstep: no deadlines, no lateness; processor times are real"
     if restarted := restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
+    yield from _left_out(analysis)
+
+
+def _left_out(analysis: Analysis) -> Iterator[str]:
+    """Yield whatever was not judged."""
+    measured = analysis.measured.levels
+    if silent := ", ".join(name for name in analysis.config.board if name not in measured):
+        yield f"never ran: {silent}"
+    if planless := ", ".join(
+        level.board
+        for level in measured.values()
+        if level.planning_ns is None and level.coupling != "none"
+    ):
+        yield f"made no plan: {planless}"
     yield (
         f"the first {START_UP_S:g} s of each process are not judged; t_cs is"
-        f" {config.timing.context_switch_ms:g} ms"
+        f" {analysis.config.timing.context_switch_ms:g} ms"
     )
     if stalled := ", ".join(
         f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled
@@ -157,7 +142,7 @@ def _advice(analysis: Analysis, failing: list[Pair]) -> str:
         )
     return (
         "to do: nothing about the config: it failed in single cycles; --percentile 99 leaves them"
-        " out, --verbose says what had their core"
+        " out"
     )
 
 
@@ -169,104 +154,3 @@ def _named(pairs: list[Pair]) -> str:
         for name in subjects
     }
     return "; ".join(f"{name} {equations}" for name, equations in named.items())
-
-
-def _level_row(name: str, side: str, timing: LevelTiming) -> list[str]:
-    parts = (
-        timing.execution_ns,
-        timing.exchange_ns,
-        timing.read_ns,
-        timing.write_ns,
-        timing.communication_ns,
-    )
-    times = [decimal(ns * 1e-6) for ns in (*parts, timing.residual_ns)]
-    plan = "-" if timing.planning_ns is None else decimal(timing.planning_ns * 1e-6)
-    d = "-" if timing.within_cycles is None else str(timing.within_cycles)
-    return [name, side, f"{timing.cycle_ns * 1e-6:g}", *times, plan, d]
-
-
-def _task_row(name: str, cycles: Cycles, analysis: Analysis) -> list[str]:
-    found = task_document(cycles, analysis.predicted)
-    late = found["lateness_ms"]
-    response = found["response_ms"]
-    gap = found["largest_gap_ms"]
-    return [
-        name,
-        *(str(found[key]) for key in ("cycles", "missed", "skipped")),
-        *(decimal(found[key]) for key in ("deviation_ms", "beside_ms")),
-        *(figure(late, key) for key in ("p50", "p99", "p99_9", "max")),
-        *(figure(response, key) for key in ("p99", "max")),
-        f"{found['slice_ms']:g}",
-        decimal(gap),
-    ]
-
-
-def _pair_row(pair: Pair) -> list[str]:
-    predicted = pair.predicted
-    measured = pair.measured
-    verdict = measured or predicted
-    meaning = "" if verdict is None else verdict.meaning
-    differs = "not as predicted" if pair.disagrees else ""
-    margin = "-" if measured is None else _number(measured.margin, measured.unit)
-    sides, result = _sides(measured)
-    return [
-        pair.equation,
-        pair.subject,
-        *_sides(predicted),
-        sides,
-        margin,
-        result,
-        differs,
-        meaning,
-    ]
-
-
-def _sides(verdict: EquationVerdict | None) -> tuple[str, str]:
-    if verdict is None:
-        return "-", ""
-    result = "ok" if verdict.holds else "FAILS"
-    return _relation(verdict), result
-
-
-def _relation(relation: EquationVerdict | Broken) -> str:
-    return (
-        f"{_number(relation.left, relation.unit)} {relation.sign}"
-        f" {_number(relation.right, relation.unit)}"
-    )
-
-
-def _broken_cycles(analysis: Analysis) -> Iterator[str]:
-    judged = analysis.judged_breaches
-    tick_s = analysis.recording.layout.clock_ns * 1e-9
-    others = len(analysis.breaches) - len(judged)
-    yield ""
-    if not judged:
-        yield (
-            f"No cycle broke an equation by its own numbers, except {others} in start-ups and"
-            " stalls."
-        )
-        return
-    yield "Cycles that broke an equation by their own numbers:"
-    for task in dict.fromkeys(breach.task for breach in judged):
-        yield f"  {_counted(task, judged, int(analysis.cycles[task].is_judged.sum()))}"
-    yield f"  in start-ups and stalls: {others}"
-    shown = judged[:SHOWN]
-    yield ""
-    yield f"The worst {len(shown)}, with the use of their core:"
-    for breach in shown:
-        broken = "; ".join(f"{each.equation} {_relation(each)}" for each in breach.broken)
-        yield f"  {breach.task} at tick {breach.tick}, {breach.tick * tick_s:.3f} s: {broken}"
-        yield f"    {breach.sharing.text()}"
-    if len(judged) > SHOWN:
-        yield f"  and {len(judged) - SHOWN} more: --json has them all"
-
-
-def _counted(task: str, judged: tuple[Breach, ...], of_all: int) -> str:
-    mine = [breach for breach in judged if breach.task == task]
-    counts = Counter(broken.equation for breach in mine for broken in breach.broken)
-    by_equation = ", ".join(f"{equation} {count}" for equation, count in counts.items())
-    return f"{task}: {len(mine)} of {of_all} ({100 * len(mine) / of_all:.3g} %): {by_equation}"
-
-
-def _number(value: float, unit: str) -> str:
-    return decimal(value) if unit == "1" else ms(value)

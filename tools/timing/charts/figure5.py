@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from math import log10
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,12 +12,10 @@ from rack.boards.config import RackConfig
 from rack.levels.timing.chains import spanned
 from rack.tools.console.answer import Document
 from rack.tools.console.pictures import paths_of, picture
-from rack.tools.timing.charts.letters import label_row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-WIDTH = 84
 SHORTEST_S = 3e-5
 LONGEST_S = 1e3
 """Range of the axis."""
@@ -120,22 +117,15 @@ def region_of(cycle_s: float) -> Region:
 
 
 def lines(config: RackConfig) -> Iterator[str]:
-    """Yield the figure as text."""
-    found = together(placed(config))
-    margin = max(len(level.level) for level in found) + 2
+    """Yield the figure as text: every level with the kind of concurrency that suits it."""
     yield (
         f"figure 5: the levels of {config.name} among the regions of implementation, by their cycle"
     )
     yield ""
-    starts = [0, *(bound + 2 for bound in BOUNDS)]
-    yield " " * margin + label_row(
-        (start, region.name) for start, region in zip(starts, REGIONS, strict=True)
+    yield from (
+        f"{level.level}, {duration(level.cycle_s)}: {level.remark}"
+        for level in together(placed(config))
     )
-    for level in found:
-        yield f"{level.level:{margin}}{_row(level.cycle_s)}"
-    yield " " * margin + label_row((_column(at), label) for at, label in TICKS.items())
-    yield ""
-    yield from (f"{level.level}, {duration(level.cycle_s)}: {level.remark}" for level in found)
 
 
 def document(config: RackConfig) -> Document:
@@ -219,20 +209,3 @@ def _remark(region: Region, coupling: str) -> str:
     if region.name == "multitasking":
         return f"{asked}; here it is {here}, at the cost of another processor"
     return f"{asked}; here it is {here}"
-
-
-def _column(cycle_s: float) -> int:
-    part = log10(min(max(cycle_s, SHORTEST_S), LONGEST_S) / SHORTEST_S) / log10(
-        LONGEST_S / SHORTEST_S
-    )
-    return round(part * (WIDTH - 1))
-
-
-BOUNDS = [_column(region.to_s) for region in REGIONS[:-1]]
-"""Columns of the bounds between regions."""
-
-
-def _row(cycle_s: float) -> str:
-    row = ["|" if at in BOUNDS else " " for at in range(WIDTH)]
-    row[_column(cycle_s)] = "o"
-    return "".join(row).rstrip()

@@ -15,7 +15,7 @@ from rack.tools.timing.charts.letters import column_for, lines
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.scheduled import Schedule
-from rack.tools.timing.charts.window import WindowOptions
+from rack.tools.timing.charts.window import WindowOptions, shown_task
 
 NO_BUDGET = (
     "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"
@@ -101,7 +101,7 @@ def gantt_of(
         Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
     )
     if run is not None and not run.is_lockstep:
-        task = options.task(run.tasks, subject.config.board)
+        task = shown_task(run.tasks)
         start, end = options.window(task, run.end_ns, run.middle_ns(task))
         measured = run.panel(start, end, progress)
         if schedule is None:
@@ -115,9 +115,7 @@ def gantt_of(
     if schedule is None:
         why = f"{name}:" if run is None else f"{still};"
         raise Failure(f"{why} {NO_BUDGET}", 2)
-    start, end = options.window(
-        options.task(schedule.tasks, subject.config.board), None, 0, schedule.shown_ns
-    )
+    start, end = options.window(shown_task(schedule.tasks), None, 0, schedule.shown_ns)
     notes = () if run is None else (f"{still}; only the schedule is shown",)
     return Gantt(
         name, (schedule.panel(start, end),), notes, column_for(end - start, schedule.shortest_ns)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import lcm
-from typing import TypeVar
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.timing.frames import core_frames
-from rack.levels.timing.schedule import Chart, Job, Span, simulate
+from rack.levels.timing.schedule import Chart, simulate
 from rack.levels.timing.tasks import Part, Unit
 from rack.tools.console.answer import Failure
 from rack.tools.timing.charts.panel import Count, Panel
@@ -22,7 +21,6 @@ MOST_FRAMES = 24
 """Most minor frames of a static schedule in a default chart."""
 MOST_CYCLES = 1_000_000
 """Most cycles of all tasks that are simulated: a minute of work."""
-T = TypeVar("T", Span, Job)
 
 
 class Schedule:
@@ -102,14 +100,22 @@ class Schedule:
 
 def _later(chart: Chart, by_ns: int) -> Chart:
     """Return a chart moved to a later time."""
-
-    def moved(entry: T, *names: str) -> T:
-        times = {name: getattr(entry, name) for name in names}
-        return replace(
-            entry,
-            **{name: time_ns + by_ns for name, time_ns in times.items() if time_ns is not None},
+    spans = (
+        replace(
+            span,
+            start_ns=span.start_ns + by_ns,
+            end_ns=span.end_ns + by_ns,
+            release_ns=span.release_ns + by_ns,
         )
-
-    spans = tuple(moved(span, "start_ns", "end_ns", "release_ns") for span in chart.spans)
-    jobs = tuple(moved(job, "release_ns", "deadline_ns", "end_ns") for job in chart.jobs)
-    return Chart(chart.start_ns + by_ns, chart.end_ns + by_ns, spans, jobs)
+        for span in chart.spans
+    )
+    jobs = (
+        replace(
+            job,
+            release_ns=job.release_ns + by_ns,
+            deadline_ns=job.deadline_ns + by_ns,
+            end_ns=None if job.end_ns is None else job.end_ns + by_ns,
+        )
+        for job in chart.jobs
+    )
+    return Chart(chart.start_ns + by_ns, chart.end_ns + by_ns, tuple(spans), tuple(jobs))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rack.levels.timing.tasks import TimedTask
@@ -20,40 +20,29 @@ LONGEST = 2000
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """The window that the user asks for, ns; None: not given. `cycles` are the first and the last
-    cycle, of `level`."""
+    """The window that the user asks for, ns; None: not given."""
 
-    from_ns: int | None
-    to_ns: int | None
-    cycles: tuple[int, int] | None
-    level: str | None
+    from_ns: int | None = None
+    to_ns: int | None = None
 
     def window(
-        self, level: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None
+        self, task: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None
     ) -> tuple[int, int]:
-        """Return start and end of the window, ns, in a run of `extent_ns`, or, with None, in an
-        endless schedule.
+        """Return start and end of the window, ns.
 
-        `level` is the task whose cycles count, `start_ns` the default start, `length_ns` the
-        default length: None, two plans of the level. Raises `Failure` for an empty window, one that
-        is too long, or one outside the run.
+        Args:
+            task: Task whose cycles count; the default window shows two of its plans.
+            extent_ns: Length of the run; None: an endless schedule.
+            start_ns: Default start.
+            length_ns: Another default length.
+
+        Raises:
+            Failure: The window is empty, too long, or outside the run.
         """
-        if self.cycles is not None:
-            start, end = (
-                level.phase_ns + at * level.every_ns for at in (self.cycles[0], self.cycles[1] + 1)
-            )
-        else:
-            start = start_ns if self.from_ns is None else self.from_ns
-            length_ns = (
-                SLICES * level.period_ns
-                if length_ns is None or self.level is not None
-                else length_ns
-            )
-            end = start + length_ns if self.to_ns is None else self.to_ns
+        start = start_ns if self.from_ns is None else self.from_ns
+        end = start + (length_ns or SLICES * task.period_ns) if self.to_ns is None else self.to_ns
         if extent_ns is not None:
-            if start >= extent_ns or (
-                end > extent_ns and (self.to_ns is not None or self.cycles is not None)
-            ):
+            if start >= extent_ns or (end > extent_ns and self.to_ns is not None):
                 raise Failure(
                     f"{_window(start, end)}: outside the run, which lasts from 0 to"
                     f" {ms(extent_ns)} ms",
@@ -62,69 +51,24 @@ class WindowOptions:
             end = min(end, extent_ns)
         if start >= end:
             raise Failure(f"{_window(start, end)}: --to-ms must be later than --from-ms", 2)
-        if end - start > LONGEST * level.every_ns:
-            most = (
-                f"a chart shows at most {LONGEST} cycles of '{level.board}',"
-                f" {ms(LONGEST * level.every_ns)} ms"
-            )
+        if end - start > (longest_ns := LONGEST * task.every_ns):
+            most = f"a chart shows at most {LONGEST} cycles of '{task.board}', {ms(longest_ns)} ms"
             raise Failure(f"{_window(start, end)}: {most}", 2)
         return start, end
 
-    def task(self, tasks: Sequence[TimedTask], known: Container[str] = ()) -> TimedTask:
-        """Return the task whose cycles count: of the level asked for, else the slowest that fits
-        into a chart.
 
-        Raises `Failure` for a level that is not in the chart, with the reason if it is one of the
-        rack's, `known`.
-        """
-        tasks = [task for task in tasks if task.role != "clock"]
-        if self.level is not None:
-            named = [task for task in tasks if task.board == self.level]
-            if not named:
-                why = "no such level in the chart"
-                if self.level in known:
-                    give = f"rack gantt CONFIG --set board.{self.level}.budget.process_ms=1"
-                    why = f"it has no budget, from which its schedule follows, as in {give}"
-                boards = ", ".join(dict.fromkeys(task.board for task in tasks))
-                raise Failure(f"--level {self.level}: {why}; levels: {boards}", 2)
-            return max(named, key=lambda task: task.period_ns)
-        fastest = min(task.every_ns for task in tasks)
-        cores = {(task.board, task.core) for task in tasks if task.role == "executor"}
-        seen = [task for task in tasks if SLICES * task.period_ns <= MOST_CYCLES * fastest]
-        tight = [
-            task for task in seen if task.role == "planner" and (task.board, task.core) in cores
-        ]
-        return max(
-            tight or seen or [min(tasks, key=lambda task: task.period_ns)],
-            key=lambda task: task.period_ns,
-        )
-
-
-def window_options(
-    from_ms: float | None, to_ms: float | None, cycles: str | None, level: str | None
-) -> WindowOptions:
-    """Return the window of the command's options. Raises `Failure` for bad or conflicting
-    options."""
-    if cycles is not None and (from_ms is not None or to_ms is not None):
-        raise Failure("--cycles already gives the window: leave out --from-ms and --to-ms", 2)
-    from_ns, to_ns = (
-        None if value is None else round(value * NS_PER_MS) for value in (from_ms, to_ms)
+def shown_task(tasks: Sequence[TimedTask]) -> TimedTask:
+    """Return the task whose cycles count: the slowest that fits into a chart, if possible a tightly
+    coupled planner."""
+    tasks = [task for task in tasks if task.role != "clock"]
+    fastest = min(task.every_ns for task in tasks)
+    cores = {(task.board, task.core) for task in tasks if task.role == "executor"}
+    seen = [task for task in tasks if SLICES * task.period_ns <= MOST_CYCLES * fastest]
+    tight = [task for task in seen if task.role == "planner" and (task.board, task.core) in cores]
+    return max(
+        tight or seen or [min(tasks, key=lambda task: task.period_ns)],
+        key=lambda task: task.period_ns,
     )
-    numbers = None if cycles is None else _cycles(cycles)
-    return WindowOptions(from_ns, to_ns, numbers, level)
-
-
-def _cycles(text: str) -> tuple[int, int]:
-    first, dash, last = text.partition("-")
-    if (
-        not first.isdecimal()
-        or (dash and not last.isdecimal())
-        or (dash and int(last) < int(first))
-    ):
-        raise Failure(
-            f"--cycles {text}: give the first and the last cycle, counted from 0, as in 10-12", 2
-        )
-    return int(first), int(last or first)
 
 
 def times_of(process: Sequence[str]) -> dict[str, list[int]]:

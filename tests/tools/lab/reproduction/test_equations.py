@@ -25,9 +25,9 @@ from rack.tools.lab.reproduction.sections.page import Columns, Listing, Ruling
 EQUATIONS = [one for one in vars(timing).values() if isinstance(one, PaperEquation)]
 WAY = WayResponse(4.0, Percentiles(1.0, 2.0, 3.0), ())
 RUN = NasremRun(
-    *("task done", 800, {}, (), {}, {}),
+    *("task done", 800, {}, (), {}),
     SystemResponse(("task", "servo"), 4.0, 4.0, WAY, WAY),
-    *((), {}, {}),
+    *((), {}),
 )
 NOWHERE = Workshop(Path("nowhere"), share=True)
 

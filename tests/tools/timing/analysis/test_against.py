@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -74,21 +75,32 @@ executor = "{module}:Passing"
 Run = Callable[..., Recording]
 
 
-@pytest.fixture
-def ran(rack_name: str, tmp_path: Path) -> Run:
-    """Run a rack for a second, and record it."""
+def run_in(folder: Path, rack_name: str) -> Run:
+    """Return a function that runs a rack for a second, and records it."""
 
     def run(name: str, text: str, *settings: str, faults: str = "") -> Recording:
-        file = tmp_path / f"{name}.toml"
+        file = folder / f"{name}.toml"
         file.write_text(text)
-        script = tmp_path / f"{name}-faults.toml"
+        script = folder / f"{name}-faults.toml"
         script.write_text(faults)
         given = str(script) if faults else None
         config = load(file, [f"name={rack_name}", CHECKPOINTS, *settings], given)
-        run_rack(config, SECONDS, tmp_path / name, Display())
-        return Recording(tmp_path / name)
+        run_rack(config, SECONDS, folder / name, Display())
+        return Recording(folder / name)
 
     return run
+
+
+@pytest.fixture
+def ran(rack_name: str, tmp_path: Path) -> Run:
+    return run_in(tmp_path, rack_name)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Recording, Recording]:
+    """What runs the same rack again, a run, and one with another parameter of its level."""
+    run = run_in(tmp_path_factory.mktemp("against"), f"test-against-{os.getpid()}")
+    return run, run("one", REMEMBERING), run("two", REMEMBERING, "board.wave.params.factor=2")
 
 
 def why(one: Recording, other: Recording, *, of: str = "", repeats: bool = True) -> dict[str, Any]:
@@ -108,15 +120,17 @@ def _losing(run: Recording) -> Path:
     return folder
 
 
-def test_equal_runs_have_no_chain(ran: Run) -> None:
-    found = why(ran("one", REMEMBERING), ran("two", REMEMBERING))
+def test_equal_runs_have_no_chain(runs: tuple[Run, Recording, Recording]) -> None:
+    again, one, _ = runs
+    found = why(one, again("again", REMEMBERING))
     assert (found["first_difference"], found["chain"], found["repetition"]) == (None, [], None)
     assert found["explained"]
 
 
-def test_a_parameter_is_named_with_the_attributes_that_it_changed(ran: Run) -> None:
-    one = ran("one", REMEMBERING)
-    two = ran("two", REMEMBERING, "board.wave.params.factor=2")
+def test_a_parameter_is_named_with_the_attributes_that_it_changed(
+    runs: tuple[Run, Recording, Recording],
+) -> None:
+    _, one, two = runs
     found = why(two, one)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (0, "wave.status", "wave")
@@ -130,9 +144,9 @@ def test_a_parameter_is_named_with_the_attributes_that_it_changed(ran: Run) -> N
 
 
 def test_of_a_branch_the_level_is_shown_at_the_tick_where_it_branches_off(
-    ran: Run, rack_name: str, tmp_path: Path
+    runs: tuple[Run, Recording, Recording], tmp_path: Path
 ) -> None:
-    one = ran("one", REMEMBERING)
+    _, one, _ = runs
     config = branched(one, ["board.wave.params.factor=2"], None)
     with state_at(one, 150) as state:
         run_rack(config, SECONDS, tmp_path / "two", Display(), begins=state.begins)
@@ -147,20 +161,21 @@ def test_of_a_branch_the_level_is_shown_at_the_tick_where_it_branches_off(
 
 
 @pytest.mark.parametrize(
-    ("fault", "field", "kinds"),
+    ("kind", "more", "field", "kinds"),
     [
-        ('kind = "kill"\nboard = "wave"\ntick = 130', "tick", {"fault", "died", "skipped"}),
-        ('kind = "mute"\nboard = "wave"\ntick = 130\ncycles = 4', "tick", {"fault"}),
-        ('kind = "corrupt"\nboard = "wave"\ntick = 130\ncycles = 4', "tick", {"fault"}),
-        ('kind = "drop"\nboard = "wave"\ntick = 130\nprobability = 1.0', "tick", {"fault"}),
-        ('kind = "delay"\nboard = "wave"\ntick = 130\ncycles = 4', "visible_at", {"fault"}),
+        ("kill", "", "tick", {"fault", "died", "skipped"}),
+        ("mute", "cycles = 4", "tick", {"fault"}),
+        ("corrupt", "cycles = 4", "tick", {"fault"}),
+        ("drop", "probability = 1.0", "tick", {"fault"}),
+        ("delay", "cycles = 4", "visible_at", {"fault"}),
     ],
 )
 def test_a_fault_is_the_cause_and_nothing_is_repeated(
-    ran: Run, fault: str, field: str, kinds: set[str]
+    runs: tuple[Run, Recording, Recording], kind: str, more: str, field: str, kinds: set[str]
 ) -> None:
-    one = ran("one", REMEMBERING)
-    two = ran("two", REMEMBERING, faults=f"[[fault]]\n{fault}\n")
+    again, one, _ = runs
+    fault = f"[[fault]]\nkind = '{kind}'\nboard = 'wave'\ntick = 130\n{more}\n"
+    two = again(kind, REMEMBERING, faults=fault)
     found = why(one, two)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"]) == (130, "wave.status")
@@ -239,10 +254,9 @@ def test_a_run_in_real_time_is_not_repeated(ran: Run) -> None:
 
 
 def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
-    ran: Run, tmp_path: Path
+    runs: tuple[Run, Recording, Recording], ran: Run, tmp_path: Path
 ) -> None:
-    one = ran("one", REMEMBERING)
-    two = ran("two", REMEMBERING, "board.wave.params.factor=2")
+    _, one, two = runs
     done = rack("report", two.folder, "--against", one.folder)
     assert done.returncode == 1
     assert "  - not repeated: --repeat runs both racks again, to that cycle" in done.stdout

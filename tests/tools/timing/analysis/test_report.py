@@ -23,8 +23,9 @@ from rack.tools.live.launch import run_rack
 from rack.tools.live.verdict import ACROSS_RACKS, judge_run
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis import arm_outcome
-from rack.tools.timing.analysis.report import report_of, task_times, write_report
+from rack.tools.timing.analysis.report import report_of, write_report
 from rack.tools.timing.analysis.report_markdown import markdown, show
+from rack.tools.timing.analysis.task_times import task_times
 from rack.tools.timing.measured_response import system_response
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.shared_runs import slow_run

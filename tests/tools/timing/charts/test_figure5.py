@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import load
-from rack.tools.timing.charts.figure5 import document, lines, placed, region_of
+from rack.tools.timing.charts.figure5 import document, placed, region_of
 
 
 @pytest.mark.parametrize(
@@ -45,18 +45,6 @@ def test_a_rack_that_runs_faster_than_real_time_asks_for_more() -> None:
         0.000625,
         "fine-grained multiprocessing or dedicated hardware",
     )
-
-
-def test_every_level_stands_in_its_region_on_the_axis() -> None:
-    text = list(lines(load("nasrem")))
-    names = next(line for line in text if "fine-grained" in line)
-    starts = [
-        names.index(name)
-        for name in ("fine-grained", "asynchronous", "multitasking", "distributed")
-    ]
-    for level, region in (("servo", 1), ("primitive", 1), ("elemental_move", 1), ("task", 2)):
-        row = next(line for line in text if line.startswith(level))
-        assert starts[region] <= row.rindex("o") < starts[region + 1]
 
 
 def test_the_figure_as_data_has_every_level_and_region() -> None:

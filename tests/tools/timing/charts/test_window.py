@@ -6,7 +6,7 @@ import pytest
 
 from rack.levels.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
-from rack.tools.timing.charts.window import WindowOptions, times_of, window_options
+from rack.tools.timing.charts.window import WindowOptions, shown_task, times_of
 
 MS = 1_000_000
 
@@ -29,10 +29,9 @@ NASREM = [
 
 
 def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_still_be_seen() -> None:
-    none = window_options(None, None, None, None)
-    level = none.task(NASREM)
+    level = shown_task(NASREM)
     assert level.name == "primitive.planner"
-    assert none.window(level, None, 40 * MS) == (40 * MS, 120 * MS)
+    assert WindowOptions().window(level, None, 40 * MS) == (40 * MS, 120 * MS)
 
 
 def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
@@ -42,66 +41,47 @@ def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
         task("b", 10, core=1),
         task("b.planner", 10, 4, core=0),
     ]
-    assert window_options(None, None, None, None).task(tasks).name == "a.planner"
-
-
-def test_cycles_are_those_of_the_level_that_is_named() -> None:
-    asked = window_options(None, None, "3-5", "servo")
-    assert asked.window(asked.task(NASREM), None, 0) == (7_500_000, 15 * MS)
-    assert window_options(None, None, "7", None).window(asked.task(NASREM), None, 0) == (
-        17_500_000,
-        20 * MS,
-    )
-
-
-def test_begin_and_end_are_as_they_are_asked_for() -> None:
-    assert window_options(3.5, 9.25, None, None).window(NASREM[0], None, 0) == (
-        3_500_000,
-        9_250_000,
-    )
-    assert window_options(3, None, None, None).window(NASREM[0], None, 0) == (3 * MS, 8 * MS)
-    # A default end is cut at the end of the run.
-    assert window_options(3, None, None, None).window(NASREM[0], 5 * MS, 0) == (3 * MS, 5 * MS)
-
-
-def seen(asked: WindowOptions) -> tuple[int, int]:
-    return asked.window(asked.task(NASREM), 80 * MS, 0)
+    assert shown_task(tasks).name == "a.planner"
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("from_ms", "to_ms", "extent_ms", "seen"),
     [
-        ((90.0, 95.0, None, None), "90 to 95 ms: outside the run, which lasts from 0 to 80 ms"),
-        ((70.0, 81.0, None, None), "70 to 81 ms: outside the run"),
-        ((None, None, "31-32", "servo"), "77.5 to 82.5 ms: outside the run"),
-        ((9.0, 9.0, None, None), "9 to 9 ms: --to-ms must be later than --from-ms"),
-        (
-            (None, None, None, "arm"),
-            "--level arm: no such level in the chart; levels: servo, primitive, task",
-        ),
+        (3.5, 9.25, None, (3.5, 9.25)),
+        (3, None, None, (3, 8)),
+        # A default end is cut at the end of the run.
+        (3, None, 5, (3, 5)),
     ],
 )
-def test_a_bad_window_is_refused(asked: tuple[float, float, str, str], message: str) -> None:
+def test_begin_and_end_are_as_they_are_asked_for(
+    from_ms: float, to_ms: float | None, extent_ms: int | None, seen: tuple[float, float]
+) -> None:
+    extent = None if extent_ms is None else extent_ms * MS
+    start, end = asked(from_ms, to_ms).window(NASREM[0], extent, 0)
+    assert (start / MS, end / MS) == seen
+
+
+def asked(from_ms: float | None, to_ms: float | None) -> WindowOptions:
+    """Return the options of these times."""
+    return WindowOptions(*(None if ms is None else round(ms * MS) for ms in (from_ms, to_ms)))
+
+
+@pytest.mark.parametrize(
+    ("from_ms", "to_ms", "extent_ms", "message"),
+    [
+        (90.0, 95.0, 80, "90 to 95 ms: outside the run, which lasts from 0 to 80 ms"),
+        (70.0, 81.0, 80, "70 to 81 ms: outside the run"),
+        (9.0, 9.0, 80, "9 to 9 ms: --to-ms must be later than --from-ms"),
+        # Nobody could read that.
+        (0.0, 5000.1, 9000, "a chart shows at most 2000 cycles of 'servo', 5000 ms"),
+    ],
+)
+def test_a_bad_window_is_refused(
+    from_ms: float, to_ms: float, extent_ms: int, message: str
+) -> None:
     with pytest.raises(Failure, match=message) as failure:
-        seen(window_options(*asked))
+        asked(from_ms, to_ms).window(NASREM[0], extent_ms * MS, 0)
     assert failure.value.status == 2
-
-
-def test_a_chart_nobody_could_read_is_refused() -> None:
-    asked = window_options(0.0, 5000.1, None, "servo")
-    with pytest.raises(Failure, match="a chart shows at most 2000 cycles of 'servo', 5000 ms"):
-        asked.window(asked.task(NASREM), None, 0)
-
-
-@pytest.mark.parametrize("cycles", ["x", "5-3", "-3", "3-", "1.5", ""])
-def test_bad_cycles_are_refused(cycles: str) -> None:
-    with pytest.raises(Failure, match="give the first and the last cycle"):
-        window_options(None, None, cycles, None)
-
-
-def test_cycles_and_times_do_not_go_together() -> None:
-    with pytest.raises(Failure, match="--cycles already gives the window"):
-        window_options(1.0, None, "3", None)
 
 
 def test_times_of_x_are_read_by_level() -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -13,7 +11,6 @@ from pydantic import TypeAdapter
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import distribution, gaps_ns
 from rack.levels.timing.verdicts import EquationVerdict
-from rack.tools.console.pictures import paths_of
 from rack.tools.lab.reproduction.experiments.experiment import (
     Document,
     Experiment,
@@ -119,43 +116,29 @@ class SystemResponse:
 
 @dataclass(frozen=True)
 class NasremRun:
-    """What a run in real time left: `steal` is the hypervisor's part of a core, percent;
-    `breaches` are the cycles that broke an equation by their own numbers."""
+    """What a run in real time left: `steal` is the hypervisor's part of a core, percent."""
 
     ended: str
     ticks: int
     steal: dict[str, float]
     verdicts: tuple[MeasuredVerdict, ...]
-    breaches: dict[str, int]
     executors: dict[str, ExecutorCycles]
     response: SystemResponse
     mailboxes: tuple[MailboxTraffic, ...]
     bus: dict[str, BusAccesses]
-    pictures: dict[str, Path]
 
 
 def _run(workshop: Workshop) -> NasremRun:
-    # It imports matplotlib.
-    from rack.tools.timing.analysis.residuals import plot
-
     need_real_time()
     result, recording = workshop.run(NAME, workshop.config(NAME))
     analysis = Analysis.of(recording)
     analysis = replace(analysis, config=analysis.config.model_copy(update={"name": NAME}))
-    stem = workshop.picture("residuals")
-    plot(analysis, stem)
-    breaches = Counter(
-        equation
-        for breach in analysis.judged_breaches
-        for equation in {one.equation for one in breach.broken}
-    )
     ticks = result.outcome.ticks
     return NasremRun(
         ended=result.outcome.cause,
         ticks=ticks,
         steal=steal(recording)["percent"],
         verdicts=tuple(_verdicts(analysis)),
-        breaches=dict(breaches),
         executors={
             name: _executor(cycles, analysis.predicted)
             for name, cycles in analysis.cycles.items()
@@ -164,7 +147,6 @@ def _run(workshop: Workshop) -> NasremRun:
         response=TypeAdapter(SystemResponse).validate_python(analysis.response),
         mailboxes=tuple(_mailbox(recording, name, ticks) for name in recording.mailboxes),
         bus=TypeAdapter(dict[str, BusAccesses]).validate_python(result.tasks),
-        pictures={"residuals": workshop.shown(paths_of(stem))},
     )
 
 

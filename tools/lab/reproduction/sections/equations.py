@@ -139,8 +139,7 @@ def _measured(
     lasted = found.ticks * load(NAME).clock_ns * 1e-9
     words = (
         f"A run of {lasted:.1f} s in real time; each time is the longest of all cycles, without"
-        f" those of the start-up. {found.breaches.get(equation.number, 0)} cycles broke it by their"
-        f" own numbers. {stolen(found)}"
+        f" those of the start-up. {stolen(found)}"
     )
     return [words, table_of(measured_of(equation.number, found)), *further(found)]
 

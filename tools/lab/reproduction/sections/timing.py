@@ -24,7 +24,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Plate,
     Requirement,
     Row,
     Side,
@@ -172,11 +171,7 @@ def _residuals(found: NasremRun) -> Side:
         "used, longest",
         "standard deviation of the residual",
     )
-    plate = Plate(
-        found.pictures["residuals"],
-        "What the cycles of each level used of R<sub>i</sub>, and &alpha;.",
-    )
-    return [Columns(head, rows), plate]
+    return [Columns(head, rows)]
 
 
 SOFT = Chapter(

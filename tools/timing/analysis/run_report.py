@@ -1,0 +1,75 @@
+"""The report of a run, as data: report.json has its fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+from rack.tools.console.answer import Document
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """The report of one run: how it ended, times of its tasks, and what happened in it.
+
+    None: only a recording could tell, or the rack has nothing of the kind. `worked` and `failures`
+    are the verdict, `unjudged` names what it leaves out. `tasks` are times by task, as from
+    `task_times`; `system_response` is that of `measured_response`. `against` compares the run with
+    another one.
+    """
+
+    rack: str
+    mode: str
+    speed: float
+    clock_ms: float
+    worked: bool
+    failures: list[str]
+    unjudged: list[str]
+    outcome: Any
+    digest: str | None
+    objects: list[Document]
+    simulated_s: float
+    wall_s: float
+    clock_skipped: int
+    missed: int
+    skipped: int
+    folder: str | None = None
+    continues: Any = None
+    misses: Any = None
+    steal: Any = None
+    stalls: Any = None
+    frequency_mhz: Any = None
+    notes: Any = None
+    holds: Any = None
+    state_tables: Any = None
+    faults: Any = None
+    unexplained: Any = None
+    restarts: Any = None
+    tasks: Any = None
+    system_response: Any = None
+    entries: Any = None
+    network: Any = None
+    task: Any = None
+    motion: Any = None
+    hand: Any = None
+    force: Any = None
+    queues: Any = None
+    interrupts: Any = None
+    recording: str = ""
+    rows_lost: Any = None
+    gaps: Any = None
+    untraced: Any = None
+    kept: Any = None
+    bytes: Any = None
+    bytes_per_s: Any = None
+    against: Any = None
+
+    @classmethod
+    def of(cls, document: Document) -> RunReport:
+        """Return a report from its plain data."""
+        known: Document = {field.name: document.get(field.name) for field in fields(cls)}
+        return cls(**known)
+
+    def document(self) -> Document:
+        """Return it as plain data."""
+        return dict(vars(self))
