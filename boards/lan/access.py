@@ -10,15 +10,14 @@ too.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from rack.boards.lan.config import LanTable, Right
+from rack.boards.lan.config import LanTable
 from rack.boards.lan.keys import (
     ALL_ALIVE,
-    ASKED,
     any_alive,
-    ask_keys,
+    estop_key,
     out_key,
     ping_key,
     pong_key,
@@ -43,21 +42,23 @@ class Permission(NamedTuple):
     keys: Sequence[str]
 
 
-def access_control(own: str, table: LanTable, asks: bool) -> dict[str, Any]:
-    """Return zenoh's `access_control` for rack `own`; `asks`: it asks racks, and they may
-    answer."""
+def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, Any]:
+    """Return zenoh's `access_control` for rack `own`, or for an operator of that name, who sets the
+    emergency stop of other racks."""
     by_subject: dict[str, list[Permission]] = {}
-    if asks:
-        by_subject[ANYONE] = list(_asking(own))
+    if is_operator:
+        by_subject[ANYONE] = list(_operator(own))
     if not table.has_tls:
         exported = [out_key(own, entry.source) for entry in table.exports.values()]
         by_subject.setdefault(ANYONE, []).extend([*_shown(own, exported), *_compared(own)])
-    for peer in dict.fromkeys([*table.racks, *table.permit]):
+    for peer in dict.fromkeys([*table.racks, *table.estop_from]):
         subject = peer if table.has_tls else ANYONE
         rules = by_subject.setdefault(subject, [])
-        rules += [*_visible(own), *_answering(own, peer, table.permit.get(peer, ()))]
+        rules += _visible(own)
         if peer in table.racks:
             rules += _exchange(own, peer, table)
+        if peer in table.estop_from:
+            rules += _stopped_by(own, peer)
     return _configured(by_subject)
 
 
@@ -100,21 +101,20 @@ def _visible(own: str) -> Iterator[Permission]:
     yield Permission(OUT, TOKEN, [any_alive(own)])
 
 
-def _answering(own: str, peer: str, rights: Iterable[Right]) -> Iterator[Permission]:
-    """Yield the rules for questions of a peer."""
-    keys = [ask_keys(own, ASKED[right], peer) for right in rights]
-    if keys:
-        yield Permission(OUT, ("declare_queryable",), [ask_keys(own)])
-        yield Permission(IN, ("query",), keys)
-        yield Permission(OUT, ("reply",), keys)
+def _stopped_by(own: str, peer: str) -> Iterator[Permission]:
+    """Yield the rules for a peer that may set the emergency stop."""
+    key = [estop_key(peer, own)]
+    yield Permission(OUT, ("declare_queryable",), [estop_key("*", own)])
+    yield Permission(IN, ("query",), key)
+    yield Permission(OUT, ("reply",), key)
 
 
-def _asking(own: str) -> Iterator[Permission]:
-    """Yield the rules for questions to any rack."""
-    asked = [ask_keys("*", "*", own)]
-    yield Permission(IN, ("declare_queryable",), [ask_keys("*")])
-    yield Permission(OUT, ("query",), asked)
-    yield Permission(IN, ("reply",), asked)
+def _operator(own: str) -> Iterator[Permission]:
+    """Yield the rules for setting the emergency stop of any rack."""
+    keys = [estop_key(own, "*")]
+    yield Permission(IN, ("declare_queryable",), [estop_key("*", "*")])
+    yield Permission(OUT, ("query",), keys)
+    yield Permission(IN, ("reply",), keys)
     yield Permission(OUT, WATCH_TOKENS, [ALL_ALIVE])
     yield Permission(IN, TOKEN, [ALL_ALIVE])
 

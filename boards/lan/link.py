@@ -37,8 +37,8 @@ KEEP_ALIVES = 4
 """Signs of life within a lease."""
 HANDSHAKE_MS = 3000
 """Longest time to open a connection."""
-MOST_ANSWER = 65_536 + 1024
-"""Length of the longest answer to a question: 64 KiB, and what says what they are."""
+MOST_STEP = 65_536
+"""Length of the longest step in lockstep, bytes."""
 ZENOH_BYTES = 1024
 """What zenoh adds to the content of a message, at most: key expression, lengths, options."""
 SOCKET = "unixsock-stream"
@@ -71,10 +71,9 @@ class Carrier(Protocol):
 
 
 class Question(NamedTuple):
-    """A question that has come. `reply` sends one answer, a payload and its envelope.
+    """A query that has come. `reply` sends an answer, a payload and its envelope.
 
-    Several answers reach only those who ask with `ConsolidationMode.NONE`. The asker is done when
-    the next question is taken, or none is left.
+    The asker is done when the next question is taken, or none is left.
     """
 
     key: str
@@ -84,21 +83,20 @@ class Question(NamedTuple):
 
 
 class LanLink:
-    """One open session of `rack`, or of a tool that `asks` racks and is known by that name.
+    """One open session of `rack`, or of an operator of that name.
 
     Raises `LevelError` if an endpoint cannot be opened, or the credentials cannot be used.
     """
 
-    def __init__(self, rack: str, table: LanTable, asks: bool = False) -> None:
+    def __init__(self, rack: str, table: LanTable, is_operator: bool = False) -> None:
         self.rack = rack
         credentials = (
             None if table.certificates is None else Credentials(Path(table.certificates), rack)
         )
         try:
-            most = MOST_ANSWER if asks else table.most_bytes
-            self.sealer = Sealer(credentials, most)
+            self.sealer = Sealer(credentials, table.most_bytes)
             """Seals and opens what this rack sends and receives."""
-            self.session = zenoh.open(_settings(rack, table, credentials, asks))
+            self.session = zenoh.open(_settings(rack, table, credentials, is_operator))
         except zenoh.ZError as error:
             why = " ".join(str(error).split())
             raise LevelError(
@@ -206,7 +204,7 @@ def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
 
 
 def _settings(
-    rack: str, table: LanTable, credentials: Credentials | None, asks: bool
+    rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
     shortest, longest = RETRY_MS
@@ -232,13 +230,13 @@ def _settings(
             "period_max_ms": longest,
             "period_increase_factor": 1,
         },
-        "access_control": access_control(rack, table, asks),
+        "access_control": access_control(rack, table, is_operator),
         "transport/link/protocols": sorted(protocols) or ["tcp"],
         # Whoever opens a connection and says no more is forgotten; these many at once are borne.
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/link/rx/max_message_size": (
-            max(table.most_bytes, MOST_ANSWER) + MOST_ENVELOPE + ZENOH_BYTES
+            max(table.most_bytes, MOST_STEP) + MOST_ENVELOPE + ZENOH_BYTES
         ),
         "transport/link/tx/lease": round(table.lease_ms),
         "transport/link/tx/keep_alive": KEEP_ALIVES,

@@ -13,8 +13,6 @@ from xxhash import xxh3_64_intdigest as xxh3
 from rack.boards.lan.envelope import Envelope
 from rack.boards.lan.link import Arrived
 
-MOST_STEP = 65_536
-"""Length of the longest step, as of an answer."""
 STEP_KIND = xxh3(b"rack step 1")
 _HEAD = struct.Struct("<qHH")
 _PART = struct.Struct("<HHI")

@@ -199,15 +199,14 @@ def network(wiring: Wiring) -> Iterator[Mistake]:
     for key, endpoint in table.endpoints:
         if why := _why_not(endpoint, table, connects=key.startswith("connect")):
             yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
-    known = [name for name, rights in table.permit.items() if rights]
-    if known and (at := _open(table)):
+    if table.estop_from and (at := _open(table)):
         could = "pass for any of them"
         if table.certificates is not None:
             could = "repeat what one of them has asked"
         why = f"whoever reaches {at[0]} could {could}; permitted: tls/ or quic/ with"
         yield Mistake(
-            f"{PLACE}.permit",
-            ", ".join(known),
+            f"{PLACE}.estop_from",
+            ", ".join(table.estop_from),
             f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
         )
     if table.has_tls and table.certificates is None:
