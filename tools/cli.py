@@ -43,7 +43,7 @@ COMMANDS = (
     (
         "list",
         "rack.tools.commands.list:list_racks",
-        "List the racks on this machine, or on others.",
+        "List the racks on this machine.",
     ),
     ("status", "rack.tools.commands.status:status", "Show a running rack once."),
     ("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),

@@ -16,18 +16,20 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 
 import zenoh
 
 from rack.backplane.json_text import encode_json
 from rack.boards.lan.access import access_control
 from rack.boards.lan.config import LanTable
-from rack.boards.lan.credentials import OTHERS, Credential, Credentials
 from rack.boards.lan.endpoint import Endpoint
-from rack.boards.lan.envelope import MOST_ENVELOPE, Sealer
+from rack.boards.lan.envelope import MOST_ENVELOPE, Credential, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
+
+if TYPE_CHECKING:
+    from rack.boards.lan.credentials import Credentials
 
 UNREAD = 32
 """Messages of one import that wait for a cycle, at most; a newer one overwrites the oldest."""
@@ -90,9 +92,12 @@ class LanLink:
 
     def __init__(self, rack: str, table: LanTable, is_operator: bool = False) -> None:
         self.rack = rack
-        credentials = (
-            None if table.certificates is None else Credentials(Path(table.certificates), rack)
-        )
+        credentials = None
+        if table.certificates is not None:
+            # Only here: a rack without certificates does without the package for them.
+            from rack.boards.lan.credentials import Credentials
+
+            credentials = Credentials(Path(table.certificates), rack)
         try:
             self.sealer = Sealer(credentials, table.most_bytes)
             """Seals and opens what this rack sends and receives."""
@@ -270,7 +275,11 @@ def _locator(text: str) -> str:
     except OSError as error:
         raise LevelError(f"adapter.lan: {folder}: {error.strerror}") from None
     is_folder = stat.S_ISDIR(about.st_mode)
-    if not is_folder or about.st_uid != os.getuid() or about.st_mode & OTHERS:
+    if (
+        not is_folder
+        or about.st_uid != os.getuid()
+        or about.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+    ):
         raise LevelError(
             f"adapter.lan: {folder}: others may enter it; permitted: a folder of this user, mode"
             " 0700"

@@ -7,14 +7,11 @@ answered or `PATIENCE_S` is over: a rack that gets many drops some.
 from __future__ import annotations
 
 import ipaddress
-import os
 import secrets
 import socket
-import ssl
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -40,8 +37,6 @@ PATIENCE_S = 4.0
 """Time without an answer after which a rack counts as gone."""
 PAUSE_S = 0.02
 """Time until a request is repeated that was dropped."""
-REFUSAL_S = 0.2
-"""Longest wait for the refusal of a certificate."""
 DENIED_S = 1.0
 """Time for which all requests come back at once without an answer until that counts as not
 permitted: the way to a rack that has just shown itself may not be there yet."""
@@ -101,8 +96,10 @@ class EstopSession:
             if rack in self._launches:
                 return self._launches[rack]
             there = ", ".join(sorted(self._launches))
-        hint = "" if self._operator.certificates else "; one with TLS needs --certificates"
-        nobody = f"none that knows '{self._operator.name}'{hint}"
+        with_tls = "one with TLS needs --certificates"
+        if self._operator.certificates:
+            with_tls = "its certificate and yours must be of one authority"
+        nobody = f"none that knows '{self._operator.name}'; {with_tls}"
         raise Failure(f"no rack '{rack}' at {self._address.at}; racks there: {there or nobody}")
 
     def set_stop(self, launch: int, flags: int = 0) -> int:
@@ -214,42 +211,18 @@ def stop_when(
 
 
 def check_reach(rack: RackAddress, operator: Operator) -> None:
-    """Raise `Failure` when nobody listens there, it refuses this operator's certificate, or there
-    is none to show."""
-    host, at = rack.host.strip("[]"), rack.at
+    """Raise `Failure` when nobody listens there, or this operator has no certificate to show."""
+    at = rack.at
     try:
-        with socket.create_connection((host, rack.port), CONNECT_S) as connection:
+        with socket.create_connection((rack.host.strip("[]"), rack.port), CONNECT_S) as connection:
             address = ipaddress.ip_address(connection.getpeername()[0].partition("%")[0])
-            if operator.certificates:
-                _shake_hands(connection, host, operator)
-    except ssl.SSLCertVerificationError as error:
-        raise Failure(f"{at}: its certificate is refused here: {error.verify_message}") from None
-    except (ssl.SSLError, ConnectionResetError) as error:
-        why = (getattr(error, "reason", None) or "connection closed").replace("_", " ").lower()
-        raise Failure(f"{at}: TLS refused: {why}") from None
     except TimeoutError:
         raise Failure(f"{at}: no answer at port {rack.port} within {CONNECT_S:g} s") from None
     except OSError as error:
-        why = error.strerror or str(error)
-        # The resolver's errors have negative numbers, and a text of their own.
-        if error.errno is not None and error.errno > 0:
-            why = os.strerror(error.errno)
-        raise Failure(f"{at}: cannot connect to port {rack.port}: {why}") from None
-    if not operator.certificates and not address.is_loopback:
+        raise Failure(f"{at}: cannot connect to port {rack.port}: {error.strerror}") from None
+    if operator.certificates:
+        credentials = Credentials(Path(operator.certificates), operator.name)
+        if (flaw := next(credentials.flaws(), None)) is not None:
+            raise Failure(str(flaw))
+    elif not address.is_loopback:
         raise Failure(f"{at}: not this machine, so it needs certificates; see --certificates", 2)
-
-
-def _shake_hands(connection: socket.socket, host: str, operator: Operator) -> None:
-    """Show the certificate and look at the other one, as the session will: it would only try again
-    and again."""
-    credentials = Credentials(Path(operator.certificates), operator.name)
-    if (flaw := next(credentials.flaws(), None)) is not None:
-        raise Failure(str(flaw))
-    context = ssl.create_default_context(cafile=credentials.authority)
-    context.load_cert_chain(credentials.certificate, credentials.key)
-    with context.wrap_socket(connection, server_hostname=host) as secure:
-        # The other side judges our certificate after its own part is done: a refusal comes as the
-        # first thing to read.
-        secure.settimeout(REFUSAL_S)
-        with suppress(TimeoutError):
-            secure.recv(1)

@@ -22,7 +22,6 @@ from rack.boards.config.wiring import Wiring, is_taken
 from rack.boards.errors import Mistake
 from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
-from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.endpoint import Endpoint
 from rack.levels.peer import peer_port
 
@@ -261,6 +260,12 @@ def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
     table = config.adapter.lan
     if table is None or table.certificates is None:
         return
+    try:
+        from rack.boards.lan.credentials import Credentials
+    except ImportError:
+        why = "cannot be checked without 'cryptography': install nasrem-rack[lan]"
+        yield Mistake(f"{PLACE}.certificates", table.certificates, why)
+        return
     heard = [Endpoint.of(text) for text in table.listen]
     addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
@@ -282,6 +287,8 @@ def network_notes(config: RackConfig) -> list[str]:
         may = "read what is exchanged, and feign that racks come and go"
     notes = [f"without TLS: whoever reaches {', '.join(far)} may {may}"] if far else []
     if table.certificates is not None and table.has_tls:
+        from rack.boards.lan.credentials import Credentials
+
         expires = Credentials(Path(table.certificates), config.name).expires
         if expires - datetime.now(UTC) < SOON:
             notes.append(
