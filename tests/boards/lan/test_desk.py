@@ -179,8 +179,10 @@ def test_a_cycle_looks_at_a_bounded_number_of_requests(bench: Bench) -> None:
 
 def test_a_desk_that_nobody_may_ask_takes_no_requests(bench: Bench) -> None:
     desk = Desk(bench.segment, OwnGrid(bench.segment, 8), {}, [])
-    desk.open(None, LAUNCH)  # type: ignore[arg-type]
+    bench.line.most = 0
+    desk.open(bench.line, LAUNCH)  # type: ignore[arg-type]
     desk.answer(48)
+    assert bench.line.most == 0
 
 
 def test_a_desk_counts_on_from_its_predecessor_and_in_lockstep_shows_nothing(
