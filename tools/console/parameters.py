@@ -47,10 +47,9 @@ def named_here(rack: str | None) -> str | None:
     """Return the name of a rack on this machine. Raises `Failure` for one on another, where this
     command is needed."""
     if rack is not None and "/" in rack:
-        host, _, name = rack.partition("/")
         raise Failure(
-            f"RACK = {rack}: this command works on the rack's own machine alone: ssh {host} rack"
-            f" ... {name}; from afar only: rack estop",
+            f"RACK = {rack}: this command works on the rack's own machine alone, as in: ssh HOST"
+            " rack status; from another machine only: rack estop",
             2,
         )
     return named(rack)

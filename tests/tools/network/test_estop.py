@@ -215,8 +215,8 @@ def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> Non
         (
             2,
             [
-                f"RACK = {far.address}: this command works on the rack's own machine alone: ssh"
-                f" {far.port} rack ... {far.name}; from afar only: rack estop"
+                f"RACK = {far.address}: this command works on the rack's own machine alone, as in:"
+                " ssh HOST rack status; from another machine only: rack estop"
             ],
         ),
     ]
