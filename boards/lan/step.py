@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from enum import IntFlag
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from xxhash import xxh3_64_intdigest as xxh3
 from zenoh import ZBytes
@@ -15,7 +15,7 @@ from rack.boards.lan.envelope import Envelope
 from rack.boards.lan.link import Arrived
 
 STEP_KIND = xxh3(b"rack step 2")
-_CONTENT = tuple[Int64, list[str], list[tuple[str, bytes, bytes]]]
+_CONTENT: Any = tuple[Int64, list[str], list[tuple[str, bytes, bytes]]]
 """Length of the cycle, racks, and of each export the key, the envelope and the payload."""
 
 
