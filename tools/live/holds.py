@@ -108,8 +108,7 @@ class Holds:
             since = (
                 self._segment.block(self._arm)[Block.LEVEL_SINCE] if self._arm is not None else 0
             )
-            where = ", on its own machine" if self._segment.is_mirror else ""
-            release = f"rack estop {self._segment.layout.rack} --reset{where}"
+            release = f"rack estop {self._segment.layout.rack} --reset"
             what, how = self._stop
             yield self._hold(what, since, f"{how}: emergency stop", release)
 

@@ -30,8 +30,6 @@ LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
 DEAD = "dead"
 """State of a run whose launcher is gone: 'rack clean' removes it."""
-GONE = "gone"
-"""State of a run on another machine that does not answer any more."""
 HELD = "HELD: 'rack step {}' lets it go on"
 """Line of a rack in lockstep that is single-stepped."""
 """Names of the states of levels."""
@@ -148,7 +146,7 @@ class RackMonitor:
         """Return the rack as it is now."""
         words = self._segment.words
         layout = self._segment.layout
-        run = GONE if self._segment.is_mirror else DEAD
+        run = DEAD
         if self._segment.launcher_is_alive:
             run = as_named(Run, words[System.STATE]).name.lower()
         tick = words[System.TICK]
