@@ -9,18 +9,16 @@ time.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from rack.backplane.process import set_priority
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import decimal
-from rack.tools.lab.benches.chart import BASELINE, Series
 from rack.tools.lab.benches.harness import Absent, absent_program, finished
 
 CYCLICTEST = "cyclictest"
@@ -63,12 +61,6 @@ def absent_cyclictest() -> tuple[Absent, ...]:
     return (Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)"),)
 
 
-def misses_count(absent: Sequence[Absent]) -> Iterator[str]:
-    """Yield what the absence of `cyclictest` means."""
-    for each in absent:
-        yield f"{each.line}; every miss counts against the rack"
-
-
 def permits_fifo() -> bool:
     """Say whether this process may take a real-time priority."""
     return set_priority(1) and set_priority(0)
@@ -104,46 +96,7 @@ def _lateness_us(thread: dict[str, Any]) -> np.ndarray:
     return np.repeat([*map(float, counts), float(thread["max"])], [*counts.values(), beyond])
 
 
-BEYOND = 0.001
-"""Share of missed cycles, beyond those of the machine, up to which a rate counts as held."""
-
-
-class MissesBeyond:
-    """Base of figures whose misses are judged by those of `cyclictest` in the same minutes; all are
-    shares."""
-
-    DERIVED: ClassVar[tuple[str, ...]] = ("beyond", "held")
-
-    missed: float
-    late: float | None  # of cyclictest's wakes, by a cycle or more; None: it is absent
-
-    @property
-    def beyond(self) -> float:
-        """Share missed beyond what the machine itself breaks."""
-        return self.missed - (self.late or 0.0)
-
-    @property
-    def held(self) -> bool:
-        """Whether the rate is held."""
-        return self.beyond <= BEYOND
-
-    def cells(self, digits: int = 3) -> list[str]:
-        """Return cells of a table: shares missed, late, and missed beyond, %."""
-        late = None if self.late is None else 100 * self.late
-        return [decimal(part, digits) for part in (100 * self.missed, late, 100 * self.beyond)]
-
-
-def missed_by(places: Sequence[float], figures: Sequence[MissesBeyond]) -> list[Series]:
-    """Return the series of what was missed, and late of `cyclictest`, by rate or number."""
-    missed = [100 * one.missed for one in figures]
-    late = [100 * one.late for one in figures if one.late is not None]
-    series = [Series("rack: missed", places, missed, "o-")]
-    if late:
-        series.append(Series("cyclictest: late by a cycle", places, late, "s-", BASELINE))
-    return series
-
-
-def overdue(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
+def late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
     """Return the share of grid points at which a sleeper was late by a cycle or more, those it
     skipped included; `runs` have the lateness of its wakes, us. None without any run."""
     if not runs:

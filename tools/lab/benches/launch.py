@@ -7,10 +7,9 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -21,7 +20,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.checkout import RackCommand, rack_commands
 from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
-from rack.tools.lab.benches.kill import KILL_S, Killing
+from rack.tools.lab.benches.kill import KILL_S, measure_kills
 
 BOUND_S = 60.0
 """Longest time that a command may take."""
@@ -32,79 +31,53 @@ INTERPRETER = "python, numpy"
 ROUND_S = 8.0
 """Expected time of a round of launches and commands."""
 
-Key = tuple[str, str]
-"""Case and contestant."""
-
-
-class LaunchCounts(NamedTuple):
-    """Rounds of launches and commands, and kills of each board."""
-
-    rounds: int
-    kills: int
-
 
 def measure(
-    name: str, counts: LaunchCounts, against: Path | None, share: bool, progress: Progress
+    name: str, rounds: int, kills: int, against: Path | None, share: bool, progress: Progress
 ) -> Comparison:
-    """Return how long launches, commands and reactions to kills take; `against` is another
-    checkout, launched by turns.
+    """Return how long launches, commands and reactions to kills take.
 
-    With `share`, racks run even on cores that another one holds. Raises `Failure` if a command
-    fails, or a kill has no reaction.
+    Args:
+        name: Config of the rack, by name or path.
+        rounds: Rounds of launches and commands.
+        kills: Kills of each of two boards.
+        against: Another checkout, launched by turns.
+        share: Run racks even on cores that another one holds.
+        progress: Told of each part.
+
+    Raises:
+        Failure: If a command fails, or a kill has no reaction.
     """
-    rounds, kills = counts
     progress.total(rounds * ROUND_S + 2 * kills * KILL_S)
     trees = rack_commands(against)
     with tempfile.TemporaryDirectory() as folder:
         progress.begin("launches and commands")
-        samples = list(_samples(name, trees, ShortRuns(Path(folder), share), rounds))
+        samples = _measure_commands(name, trees, Path(folder), rounds, share)
         progress.end(rounds * ROUND_S)
-    killing = Killing(name, kills, progress)
-    samples += [sample for board in killing.boards for sample in killing.samples(board)]
-    cases = dict.fromkeys(sample.case for sample in samples if sample.who == INTERPRETER)
+    samples += measure_kills(name, kills, progress)
+    cases = [sample.case for sample in samples if sample.who == INTERPRETER]
     baselines = dict.fromkeys(cases, INTERPRETER)
     if against is not None:
         baselines[LAUNCH] = trees[-1].name
-    return Comparison(
-        "launch", "launches, short commands, and reactions to a kill", tuple(samples), baselines
-    )
+    title = "launches, short commands, and reactions to a kill"
+    return Comparison("launch", title, tuple(samples), baselines)
 
 
-class ShortRuns(NamedTuple):
-    """Runs of a config of which only the beginning counts: in subfolders of `folder`; on the cores
-    of others if so."""
-
-    folder: Path
-    share: bool = False
-
-    def launch_s(self, rack: RackCommand, config: str) -> float:
-        """Return the time from a `rack run` to the first cycle of its fastest level, s."""
-        with tempfile.TemporaryDirectory(dir=self.folder) as place:
-            began_ns = time.monotonic_ns()
-            run = self.run(rack, config, Path(place) / "run")
-            return (first_cycle_ns(run, fastest(load(config))) - began_ns) * 1e-9
-
-    def run(self, rack: RackCommand, config: str, out: Path) -> Path:
-        """Make a run; return its folder."""
-        options = ["--share"] if self.share else []
-        options += ["--set", f"name=bench-run-{os.getpid()}", "--seconds", f"{RUN_S}", "--json"]
-        rack.run("run", config, *options, "--out", out, bound_s=BOUND_S)
-        return out
-
-
-def _samples(name: str, trees: list[RackCommand], runs: ShortRuns, rounds: int) -> Iterator[Sample]:
-    """Yield the times of launches and commands, all measured by turns."""
+def _measure_commands(
+    name: str, trees: list[RackCommand], folder: Path, rounds: int, share: bool
+) -> list[Sample]:
+    """Return the times of launches and commands, all measured by turns."""
     own = trees[0]
-    run = runs.run(own, name, runs.folder / "run")
+    run = run_briefly(own, name, folder / "run", share)
     idle = load(name, [f"name=bench-{os.getpid()}", "clock.mode=lockstep"])
-    commands: Mapping[str, tuple[object, ...]] = {
+    commands: dict[str, tuple[object, ...]] = {
         "rack --help": ("--help",),
         "rack list": ("list",),
         "rack status": ("status", idle.name),
         "rack report": ("report", run),
     }
-    contestants: dict[Key, Callable[[], float]] = {
-        (LAUNCH, tree.name): partial(runs.launch_s, tree, name) for tree in trees
+    contestants: dict[tuple[str, str], Callable[[], float]] = {
+        (LAUNCH, tree.name): partial(launch_s, tree, name, folder, share) for tree in trees
     }
     python = RackCommand(INTERPRETER, (sys.executable, "-c", "import numpy"))
     for case, arguments in commands.items():
@@ -114,9 +87,26 @@ def _samples(name: str, trees: list[RackCommand], runs: ShortRuns, rounds: int) 
     # no core.
     with Rack(idle):
         times = interleaved(contestants, rounds)
-    for (case, who), found in times.items():
-        # A launch takes seconds, all else milliseconds.
-        yield Sample(case, who, tuple(1e3 * seconds for seconds in found), "ms")
+    return [
+        Sample(case, who, tuple(1e3 * seconds for seconds in found), "ms")
+        for (case, who), found in times.items()
+    ]
+
+
+def launch_s(rack: RackCommand, config: str, folder: Path, share: bool) -> float:
+    """Return the time from a `rack run` to the first cycle of its fastest level, s."""
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        began_ns = time.monotonic_ns()
+        run = run_briefly(rack, config, Path(place) / "run", share)
+        return (first_cycle_ns(run, fastest(load(config))) - began_ns) * 1e-9
+
+
+def run_briefly(rack: RackCommand, config: str, out: Path, share: bool) -> Path:
+    """Make a run of which only the beginning counts; return its folder."""
+    options = ["--set", f"name=bench-run-{os.getpid()}", "--seconds", f"{RUN_S}", "--json"]
+    options += ["--share"] * share
+    rack.run("run", config, *options, "--out", out, bound_s=BOUND_S)
+    return out
 
 
 def fastest(config: RackConfig) -> str:

@@ -8,10 +8,8 @@ them. The replay must end in the recorded state, bit for bit: otherwise it was o
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,19 +18,9 @@ from rack.boards.config.cell import built_cell
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.state import restore_state, sleeping
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import pinned
 from rack.tools.recording.recording import Recording
 
 SERVO = "servo"
-
-
-class ReplayPace(NamedTuple):
-    """How a replay runs: a tick every `period_ns` on `core` at a real-time `priority`; all 0: tick
-    after tick."""
-
-    period_ns: int = 0
-    core: int = 0
-    priority: int = 0
 
 
 @dataclass(frozen=True)
@@ -77,28 +65,23 @@ class Replay:
         substeps = round(config.clock_ns * 1e-9 / cell.model.opt.timestep)
         return cls(cell, substeps, config.clock_ns, first, states[first], states[last], controls)
 
-    def run(self, pace: ReplayPace, ticks: int) -> list[float]:
+    def run(self, ticks: int) -> list[float]:
         """Replay at most so many ticks; return the processor time of each, us.
 
-        Raises `Failure` if the whole stretch is replayed and does not end as recorded.
+        Raises:
+            Failure: If the whole stretch is replayed and does not end as recorded.
         """
         model = self.cell.model
-        data = mujoco.MjData(self.cell.model)
+        data = mujoco.MjData(model)
         restore_state(model, data, self.start)
         found: list[float] = []
-        alone = pinned(pace.core, pace.priority) if pace.priority else nullcontext()
-        with alone:
-            due_ns = time.monotonic_ns()
-            for number, control in enumerate(self.controls[:ticks], self.first_tick + 1):
-                due_ns += pace.period_ns
-                if pace.period_ns:
-                    time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
-                data.ctrl[:] = control
-                start_ns = time.thread_time_ns()
-                for _ in range(self.substeps):
-                    mujoco.mj_step(model, data)
-                found.append((time.thread_time_ns() - start_ns) * 1e-3)
-                data.time = number * self.clock_ns * 1e-9
+        for number, control in enumerate(self.controls[:ticks], self.first_tick + 1):
+            data.ctrl[:] = control
+            start_ns = time.thread_time_ns()
+            for _ in range(self.substeps):
+                mujoco.mj_step(model, data)
+            found.append((time.thread_time_ns() - start_ns) * 1e-3)
+            data.time = number * self.clock_ns * 1e-9
         if len(found) == len(self.controls):
             self._check(data)
         return found
@@ -115,13 +98,13 @@ class Replay:
             )
 
 
-def replay(folder: Path, pace: ReplayPace, ticks: int) -> list[float]:
+def replay(folder: Path, ticks: int) -> list[float]:
     """Replay at most so many ticks of a recorded run; return the processor time of each, us.
 
     To be called by `apart`: only in the environment of boards are the physics theirs. Raises
     `Failure` as `Replay`.
     """
-    return Replay.of(Recording(folder)).run(pace, ticks)
+    return Replay.of(Recording(folder)).run(ticks)
 
 
 def _stretch(recording: Recording) -> tuple[int, int]:

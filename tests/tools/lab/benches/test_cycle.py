@@ -4,9 +4,7 @@ recorded run."""
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +13,8 @@ from rack.backplane.trace import RECORD
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.cycle import PACED, PARTS, ROW, Found, Trace, costs, measure, parts_of
-from rack.tools.lab.benches.physics import Replay, ReplayPace, replay
+from rack.tools.lab.benches.cycle import PARTS, PHYSICS, Trace, costs, measure, parts_of
+from rack.tools.lab.benches.physics import Replay, replay
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
@@ -54,69 +52,45 @@ def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
     assert [times[0] for times in parts_of(one).values()] == [2.0, 3.0, 30.0, 4.0, 11.0]
 
 
-def given(**others: Trace) -> Found:
-    found = Found(defaultdict(list), defaultdict(list))
-    found.traces["servo, real time", "this tree"] = [trace(50), trace(50), trace(200)]
-    for who, one in others.items():
-        found.traces["servo, real time", who] = [one]
-    found.physics_us[ROW], found.physics_us[PACED] = [np.array([20.0])], [np.array([25.0])]
-    return found
+THIS_TREE = {("servo, lockstep", "this tree"): [trace(50), trace(50), trace(200)]}
 
 
-def test_a_board_is_compared_with_another_checkout_and_the_servo_with_its_physics() -> None:
-    found = costs(given(base=trace(100)), "base").comparison
-    own = found.sample("servo, real time", "this tree")
-    physics = found.sample("servo and its physics, real time", "this tree")
-    assert own is not None
-    assert physics is not None
-    assert (own.median, own.count, found.ratio(own), found.ratio(physics)) == (50.0, 15, 0.5, 2.0)
-    bare = found.sample("servo and its physics, real time", ROW)
-    assert bare is not None
-    assert found.ratio(bare) == 0.8
+def test_a_board_is_compared_with_another_checkout_or_the_servo_with_its_physics() -> None:
+    both = costs({**THIS_TREE, ("servo, lockstep", "base"): [trace(100)]}, [20.0], "base")
+    alone = costs(THIS_TREE, [20.0], None)
+    for found, ratio in ((both, 0.5), (alone, 2.5)):
+        own = found.sample("servo, lockstep", "this tree")
+        assert own is not None
+        assert (own.median, own.count, found.ratio(own)) == (50.0, 15, ratio)
+        assert found.sample("servo, lockstep", PHYSICS) is not None
 
 
-def test_without_another_checkout_only_physics_give_a_ratio() -> None:
-    found = costs(given(), None).comparison
-    assert {sample.case for sample in found.samples if found.ratio(sample)} == {
-        "servo and its physics, real time"
-    }
-
-
-def test_a_single_cycle_has_no_parts_and_is_not_drawn(tmp_path: Path) -> None:
-    found = given()
-    found.traces["task, real time", "this tree"] = [trace(50, cycles=1)]
-    bench = costs(found, None)
-    assert [one.case for one in bench.parts] == ["servo, real time"]
-    assert bench.comparison.sample("task, real time", "this tree") is not None
-    assert all(path.stat().st_size for path in bench.plot(tmp_path))
+def test_a_single_cycle_has_no_parts() -> None:
+    found = costs({**THIS_TREE, ("task, lockstep", "this tree"): [trace(50, cycles=1)]}, [], None)
+    assert list(found.parts) == [("servo, lockstep", "this tree")]
+    assert found.sample("task, lockstep", "this tree") is not None
 
 
 @pytest.mark.slow
-def test_a_short_bench_measures_every_board_of_real_racks(tmp_path: Path) -> None:
+def test_a_short_bench_measures_every_board_of_real_racks() -> None:
     found = measure(None, 0.6, 1, Progress(), share=True)
     document = found.document()
     assert json.loads(json.dumps(document)) == document
-    boards = ("empty", "servo", "primitive", "elemental_move", "task", "world")
     # In so short a run the task level has no cycle beyond those that a new process spends warming
     # up.
-    seen = {one.case for one in found.parts}
-    assert seen == {
-        f"{board}, {mode}"
-        for board in boards
-        if board != "task"
-        for mode in ("real time", "lockstep")
+    boards = ("empty", "servo", "primitive", "elemental_move", "world")
+    modes = ("real time", "lockstep")
+    assert {case for case, _ in found.parts} == {
+        f"{board}, {mode}" for board in boards for mode in modes
     }
-    for one in found.parts:
-        sample = found.comparison.sample(one.case, one.who)
+    for place, parts in found.parts.items():
+        sample = found.sample(*place)
         assert sample is not None
-        assert set(one.parts) == set(PARTS)
-        assert min(one.parts.values()) >= 0.0
-        assert sample.median > one.parts["process"]
-    assert {"servo and its physics, lockstep", "servo and its physics, real time"} <= set(
-        found.comparison.baselines
-    )
-    assert [path.name for path in found.plot(tmp_path)] == ["cycle.png", "cycle.svg"]
-    assert any("servo and its physics" in line for line in found.lines(100))
+        assert set(parts) == set(PARTS)
+        assert min(parts.values()) >= 0.0
+        assert sample.median > parts["process"]
+    assert found.baselines == {"servo, lockstep": PHYSICS}
+    assert sum(PHYSICS in line for line in found.lines(100)) == 1
 
 
 @pytest.mark.slow
@@ -126,7 +100,7 @@ def test_replayed_physics_end_in_the_recorded_state(
     run = nasrem_run(tmp_path_factory)
     whole = len(Replay.of(Recording(run)).controls)
     assert whole > 1000
-    times_us = apart(replay, run, ReplayPace(), whole)
+    times_us = apart(replay, run, whole)
     assert len(times_us) == whole
     assert min(times_us) > 0.0
 
@@ -136,4 +110,4 @@ def test_physics_of_another_run_are_refused(tmp_path_factory: pytest.TempPathFac
     own = Replay.of(Recording(nasrem_run(tmp_path_factory)))
     short = replace(own, controls=own.controls[:20])
     with pytest.raises(Failure, match="do not end in the recorded state"):
-        short.run(ReplayPace(), 20)
+        short.run(20)

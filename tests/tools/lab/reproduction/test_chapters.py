@@ -10,13 +10,6 @@ from pathlib import Path
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.partition import (
-    LevelFigures,
-    PartitionFigures,
-    Partitions,
-    TaskFigures,
-)
-from rack.tools.lab.benches.switch import SwitchCost
 from rack.tools.lab.reproduction.experiments.deadline import DEADLINE, GotoRun, GotoRuns
 from rack.tools.lab.reproduction.experiments.determinism import (
     DETERMINISM,
@@ -25,16 +18,19 @@ from rack.tools.lab.reproduction.experiments.determinism import (
 )
 from rack.tools.lab.reproduction.experiments.experiment import KEPT, Experiment, Found, Workshop
 from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
-from rack.tools.lab.reproduction.experiments.measured import (
+from rack.tools.lab.reproduction.experiments.partition import (
     PARTITION,
-    SWITCH,
-    SwitchRun,
+    LevelFigures,
+    PartitionFigures,
+    Partitions,
+    TaskFigures,
 )
 from rack.tools.lab.reproduction.experiments.sharing import (
     CHAINS,
     ChainRun,
     Chains,
 )
+from rack.tools.lab.reproduction.experiments.switch import SWITCH, SwitchCost, SwitchRun
 from rack.tools.lab.reproduction.experiments.tables import TABLES, FiredRow, TableRun, TableRuns
 from rack.tools.lab.reproduction.experiments.tasks import NetworkRun
 from rack.tools.lab.reproduction.reproduction import CHAPTERS, chapters_named, experiments, forget
@@ -237,16 +233,16 @@ def test_partitions_are_judged_by_what_slow_and_fast_levels_miss(
     slow: int, fast: int, plans: int, ruling: Ruling
 ) -> None:
     def figures(partition: str, missed: dict[str, int]) -> PartitionFigures:
-        planner = TaskFigures(1.0, plans, 0, 0, None, None, None)
+        planner = TaskFigures(plans, 0, 0, None)
         levels = (
-            LevelFigures(level, TaskFigures(1.0, 100, bad, 0, None, None, None), planner, None)
+            LevelFigures(level, TaskFigures(100, bad, 0, None), planner, None)
             for level, bad in missed.items()
         )
         return PartitionFigures(partition, tuple(levels), {0: 0.5})
 
     tight = figures("tight, 1 core", {"task": slow, "servo": fast})
     loose = figures("loose, 2 cores", {"task": slow, "servo": 0})
-    found = Partitions("nasrem", 4.0, 1, (tight, loose))
+    found = Partitions(4.0, (tight, loose))
     assert judged(application.CHAPTER, "figure-5", PARTITION, found).ruling is ruling
 
 

@@ -17,9 +17,16 @@ import pytest
 from pydantic import TypeAdapter
 
 from rack.boards.config import load
-from rack.tools.lab.benches import switch
-from rack.tools.lab.benches.systems.figures import prediction
-from rack.tools.lab.reproduction.experiments import figures, measured, nasrem, sharing, tasks
+from rack.tools.lab.reproduction.experiments import (
+    figures,
+    nasrem,
+    partition,
+    response,
+    sharing,
+    switch,
+    systems,
+    tasks,
+)
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import settings_of
 from rack.tools.lab.reproduction.experiments.nasrem import SystemResponse
@@ -185,7 +192,7 @@ def with_polling_later(workshop: BreakingWorkshop, statement: Statement) -> Clai
 def by_one_system(name: str) -> Judge:
     """Return a judge by the experiment of one system."""
     return lambda workshop, statement: by_experiments(
-        workshop, replace(statement, experiments=(measured.system_experiment(name),))
+        workshop, replace(statement, experiments=(systems.system_experiment(name),))
     )
 
 
@@ -342,7 +349,7 @@ ROWS = (
     Breaking(
         "systems",
         "systems that failed in a run",
-        {"condor": NO_RESTART},
+        {"condor": NO_RESTART + ONE_LOSS["kill-each-board"].replace("servo", "coordinator")},
         judge=by_one_system("condor"),
         alone=True,
     ),
@@ -377,12 +384,13 @@ ROWS = (
         "predictable-response",
         "lockstep: not at the predicted tick",
         {"nasrem": DELAYED.format(board="primitive", by=3)},
+        24.0,
         alone=True,
     ),
     Breaking(
         "two-levels",
         "levels, in the system with the fewest",
-        judge=lambda workshop, statement: judge_layers({"fig2": prediction(load("fig2"))}),
+        judge=lambda workshop, statement: judge_layers({"fig2": systems.prediction(load("fig2"))}),
     ),
     Breaking(
         "context-switch",
@@ -399,9 +407,9 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "SECONDS", 1.0)
     monkeypatch.setattr(figures, "ATTEMPTS", 1)
     monkeypatch.setattr(sharing, "SECONDS", 0.7)
-    monkeypatch.setattr(measured, "PARTITION_S", 2.5)
-    monkeypatch.setattr(measured, "COMMANDS", 4)
-    monkeypatch.setattr(measured, "TWINS", 0)
+    monkeypatch.setattr(partition, "SECONDS", 2.5)
+    monkeypatch.setattr(response, "COMMANDS", 4)
+    monkeypatch.setattr(response, "TWINS", 0)
     monkeypatch.setattr(switch, "WAKES", 200)
 
 

@@ -14,7 +14,7 @@ from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.config.schema import BudgetConfig
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.trace_times import plans
-from rack.tools.lab.benches import storing
+from rack.tools.lab.reproduction.experiments import storing
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,

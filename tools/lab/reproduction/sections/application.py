@@ -6,17 +6,21 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rack.boards.config import RackConfig, load
-from rack.tools.lab.benches.partition import LevelFigures, Partitions, TaskFigures
-from rack.tools.lab.benches.switch import PAPER_US
 from rack.tools.lab.reproduction.experiments import tables
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.measured import PARTITION, SWITCH, SwitchRun
 from rack.tools.lab.reproduction.experiments.nasrem import (
     NAME,
     NASREM,
     ExecutorCycles,
     NasremRun,
 )
+from rack.tools.lab.reproduction.experiments.partition import (
+    PARTITION,
+    LevelFigures,
+    Partitions,
+    TaskFigures,
+)
+from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SWITCH, SwitchRun
 from rack.tools.lab.reproduction.experiments.tables import TABLES, FiredRow, TableRuns
 from rack.tools.lab.reproduction.sections.comparison import HOSTS
 from rack.tools.lab.reproduction.sections.equations import forecast_of, stolen

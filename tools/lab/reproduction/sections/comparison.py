@@ -7,11 +7,14 @@ from functools import cache, partial
 
 from rack.boards.config import load, wire
 from rack.levels.timing.trace_times import Distribution
-from rack.tools.lab.benches.systems.bench import systems
-from rack.tools.lab.benches.systems.figures import SystemFigures, SystemPrediction, prediction
-from rack.tools.lab.benches.systems.tables import Systems
-from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
-from rack.tools.lab.reproduction.experiments.measured import SYSTEMS, compared
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.systems import (
+    SYSTEMS,
+    SystemFigures,
+    SystemPrediction,
+    prediction,
+    systems,
+)
 from rack.tools.lab.reproduction.experiments.tasks import TASKS, TaskRun
 from rack.tools.lab.reproduction.sections.page import (
     DONE,
@@ -19,8 +22,6 @@ from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
     Columns,
-    Listing,
-    Plate,
     Requirement,
     Row,
     Side,
@@ -76,24 +77,22 @@ def _promise_row(name: str, said: SystemPrediction) -> Row:
     )
 
 
-def _compared_measured(workshop: Workshop, *each: Systems | TaskRun) -> Side:
-    found = compared([run for run in each if isinstance(run, Systems)])
+def _compared_measured(workshop: Workshop, *each: SystemFigures | TaskRun) -> Side:
+    found = [run for run in each if isinstance(run, SystemFigures)]
     tasks = [run for run in each if isinstance(run, TaskRun)]
     head = (
         "rack",
         "command down",
         "status up",
         "hold by an operator, longest",
-        "killed: ticks until a neighbour",
         "missed, %",
     )
-    rows = [_measured_row(figures) for figures in found.systems]
+    rows = [_measured_row(figures) for figures in found]
     caption = (
         "Responses in ms: longest of a run in real time. A hold is given to the highest level that"
         " takes one."
     )
-    drawn = workshop.shown(found.plot(workshop.folder / PICTURES))
-    failures = [f"{code(one.rack)}: {text(one.failure)}." for one in found.systems if one.failure]
+    failures = [f"{code(one.rack)}: {text(one.failure)}." for one in found if one.failure]
     ended = [
         (code(name), text(run.ended), f"{run.lasted_s:.1f}", f"{100 * run.missed:.2f}")
         for name, run in zip(TASKS, tasks, strict=True)
@@ -103,23 +102,15 @@ def _compared_measured(workshop: Workshop, *each: Systems | TaskRun) -> Side:
         Columns(head, rows, caption),
         Columns(task_head, ended, "In real time."),
         *failures,
-        Plate(
-            drawn,
-            "Responses with their bounds, ages of messages, and more, system by system.",
-        ),
-        Listing(
-            "\n".join(found.lines(None)),
-            f"All figures, as {code('rack bench systems')} prints them.",
-        ),
     ]
 
 
-def judge_systems(*each: Systems | TaskRun) -> ClaimVerdict:
+def judge_systems(*each: SystemFigures | TaskRun) -> ClaimVerdict:
     """Compare the responses of all systems with their bounds; a missed cycle may prolong them.
 
     Their whole tasks are done in real time.
     """
-    found = [one for run in each if isinstance(run, Systems) for one in run.systems]
+    found = [run for run in each if isinstance(run, SystemFigures)]
     undone = sum(isinstance(run, TaskRun) and run.ended != DONE for run in each)
     failed = sum(not one.worked for one in found)
     late = [one.realtime.missed for one in found if _is_beyond(one)]
@@ -140,15 +131,11 @@ def _measured_row(figures: SystemFigures) -> Row:
     held = None
     if hold and hold.measured_ms is not None:
         held = f"{hold.measured_ms:g} of {hold.longest_ms:g} ({hold.level})"
-    neighbours = [kill.neighbour for kill in figures.kills.detections]
-    ticks = sorted(tick for tick in neighbours if tick is not None)
-    killed = f"{ticks[0]} to {ticks[-1]}" if ticks else None
     return (
         code(figures.rack),
         _longest(ran.command_ms),
         _longest(ran.status_ms),
         held,
-        killed,
         f"{100 * ran.missed:.2f}",
     )
 

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from rack.boards.config import load
-from rack.tools.lab.benches.response import ResponseBench
 from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
-from rack.tools.lab.reproduction.experiments.measured import NAME, RESPONSE, ResponseRun
+from rack.tools.lab.reproduction.experiments.response import (
+    NAME,
+    RESPONSE,
+    ResponseFigures,
+    ResponseRun,
+)
 from rack.tools.lab.reproduction.sections.equations import forecast_of
 from rack.tools.lab.reproduction.sections.page import (
     Chapter,
@@ -19,6 +23,7 @@ from rack.tools.lab.reproduction.sections.page import (
     code,
     ruled,
 )
+from rack.tools.timing.operator_response import plot
 
 TIMES = (
     "min_ms",
@@ -60,7 +65,7 @@ def _predictable_measured(workshop: Workshop, found: ResponseRun) -> Side:
         "Holds and resumes at random ticks, in lockstep; ms from giving a command to the end of the"
         " cycle that acts."
     )
-    drawn = workshop.shown(found.realtime.plot(workshop.folder / PICTURES))
+    drawn = workshop.shown(plot(found.realtime.response, workshop.folder / PICTURES))
     return [
         Columns(head, _response_rows(found.lockstep), about),
         Columns(head, _response_rows(found.realtime), "The same in real time."),
@@ -68,7 +73,7 @@ def _predictable_measured(workshop: Workshop, found: ResponseRun) -> Side:
     ]
 
 
-def _response_rows(found: ResponseBench) -> list[Row]:
+def _response_rows(found: ResponseFigures) -> list[Row]:
     return [
         (
             row["level"],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from rack.boards.config import load, rack_timing, wire
-from rack.tools.lab.benches.partition import Partition, Partitions
 from rack.tools.lab.reproduction.experiments.determinism import (
     ATTEMPTS,
     DETERMINISM,
@@ -13,8 +12,8 @@ from rack.tools.lab.reproduction.experiments.determinism import (
     ComparedRuns,
 )
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.measured import PARTITION
 from rack.tools.lab.reproduction.experiments.nasrem import NASREM, ExecutorCycles, NasremRun
+from rack.tools.lab.reproduction.experiments.partition import PARTITION, Partition, Partitions
 from rack.tools.lab.reproduction.sections.page import (
     Chapter,
     ClaimVerdict,
