@@ -151,7 +151,7 @@ def lockstep(
 def launch(
     config: Config = "nasrem",
     rounds: Rounds = 10,
-    kills: Annotated[int, typer.Option(metavar="N", min=1, help="kills of each board")] = 10,
+    kills: Annotated[int, typer.Option(metavar="N", min=1, help="kills of the board")] = 10,
     against: Against = None,
     share: Share = False,
     as_json: Json = False,
@@ -160,9 +160,9 @@ def launch(
 
     A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to
     the checkout given by --against. The ratio of a short command is to a Python that imports numpy
-    and ends. `rack report` shows a report that the run has made. Then boards of a running rack are
-    killed: the output shows the time to detection, and the time until the brakes of the arm are
-    engaged.
+    and ends. `rack report` shows a report that the run has made. Then the board that drives the arm
+    of a running rack is killed again and again: the output shows the time to detection, and the
+    time until the brakes of the arm are engaged.
     """
     from rack.tools.lab.benches.launch import measure
 

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rack.levels.timing.trace_times import Occupation, unit_times
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
@@ -28,13 +27,11 @@ from rack.tools.lab.benches.chain import Chain
 from rack.tools.lab.benches.checkout import THIS, RackCommand, rack_commands
 from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
 from rack.tools.lab.benches.physics import SERVO, replay
+from rack.tools.recording.cycles import Cycles, cycles_of
 from rack.tools.recording.recording import Recording
 
 PARTS = ("wake", "read", "process", "write", "bookkeeping")
-"""Parts of a cycle, in the order of time; where a trace does not separate the last one, it is in
-the first."""
-STEADY_TICKS = 40
-"""Ticks at the start that are not judged: a new process touches its memory for the first time."""
+"""Parts of a cycle, in the order of time."""
 EMPTY = "empty"
 RATE_HZ = 400
 BOARDS = 6
@@ -50,19 +47,11 @@ COMPARED = f"{SERVO}, lockstep"
 """The case that is compared with its physics."""
 
 
-class Trace(NamedTuple):
-    """Cycles of one task: records of the trace, shape (n,), and processor times of C, R, X, W, ns,
-    shape (n, 4)."""
-
-    rows: np.ndarray
-    units: np.ndarray
-
-
 class CycleRun(NamedTuple):
-    """The steady cycles of a run by executor, and the processor time of each tick's bare physics,
-    us; empty unless they were replayed."""
+    """The cycles of a run by executor, and the processor time of each tick's bare physics, us;
+    empty unless they were replayed."""
 
-    traces: dict[str, Trace]
+    cycles: dict[str, Cycles]
     physics_us: list[float]
 
 
@@ -125,83 +114,63 @@ def measure(
             for command in commands
         }
         found = interleaved(contestants, rounds, progress, seconds + LAUNCH_S)
-    traces: defaultdict[tuple[str, str], list[Trace]] = defaultdict(list)
+    cycles: defaultdict[tuple[str, str], list[Cycles]] = defaultdict(list)
     physics_us: list[float] = []
     for (kind, who), runs in found.items():
         for run in runs:
             physics_us += run.physics_us
-            for board, trace in run.traces.items():
+            for board, own in run.cycles.items():
                 name = EMPTY if kind.config == EMPTY else board
-                traces[f"{name}, {kind.mode}", who].append(trace)
-    return costs(traces, physics_us, commands[-1].name if against else None)
+                cycles[f"{name}, {kind.mode}", who].append(own)
+    return costs(cycles, physics_us, commands[-1].name if against else None)
 
 
 def _run(
     kind: RackKind, command: RackCommand, seconds: float, scratch: str, share: bool
 ) -> CycleRun:
-    """Run one rack and take its traces; of this tree's arm in lockstep, replay the physics at
+    """Run one rack and take its cycles; of this tree's arm in lockstep, replay the physics at
     once."""
     folder = Path(mkdtemp(dir=scratch))
     lockstep = kind.mode == "lockstep"
-    config = kind.config if kind.config != EMPTY else Chain(BOARDS, RATE_HZ).write(folder)
+    config = kind.config
+    if config == EMPTY:
+        path = folder / "empty.toml"
+        path.write_text(Chain(BOARDS, RATE_HZ).text())
+        config = str(path)
     options = ["--set", f"name=bench-{os.getpid()}", "--seconds", seconds]
     options += ["--lockstep"] * lockstep + ["--share"] * share
     options += ["--out", folder / "run"]
     command.run("run", config, *options, bound_s=BOUND_S + 10.0 * seconds)
-    traces = traces_of(Recording(folder / "run"))
+    found = cycles_of(Recording(folder / "run"))
+    cycles = {name: own for name, own in found.items() if own.task.role == "executor"}
     if not lockstep or kind.config == EMPTY or command.name != THIS:
-        return CycleRun(traces, [])
-    return CycleRun(traces, apart(replay, folder / "run", REPLAYED_TICKS))
-
-
-def traces_of(recording: Recording) -> dict[str, Trace]:
-    """Return the steady cycles of every executor of a run, by task.
-
-    Checkouts record the same columns; one that an earlier version did not record is 0.
-    """
-    tasks = [task for task in recording.layout.tasks if len(recording.trace(task.name))]
-    spans = {task: Occupation.of(recording.trace(task.name)) for task in tasks}
-    found: dict[str, Trace] = {}
-    for task in tasks:
-        above = [
-            span
-            for other, span in spans.items()
-            if other.core == task.core and other.priority > task.priority
-        ]
-        rows = recording.trace(task.name)
-        times = unit_times(rows, Occupation.union(above))
-        steady = rows["tick"] >= STEADY_TICKS
-        if task.role == "executor" and steady.any():
-            found[task.name] = Trace(rows[steady], times[steady])
-    return found
+        return CycleRun(cycles, [])
+    return CycleRun(cycles, apart(replay, folder / "run", REPLAYED_TICKS))
 
 
 def costs(
-    traces: Mapping[tuple[str, str], list[Trace]], physics_us: list[float], other: str | None
+    cycles: Mapping[tuple[str, str], list[Cycles]], physics_us: list[float], other: str | None
 ) -> CycleCosts:
     """Return the costs of everything measured.
 
     Args:
-        traces: Traces of all runs, by case and contestant.
+        cycles: Cycles of all runs, by case and contestant.
         physics_us: Processor time of ticks of bare physics.
         other: The checkout with which this one is compared; without one, the servo level's cycle is
             compared with its physics.
     """
-    cases = list(dict.fromkeys(case for case, _ in traces))
-    # The contestants of a case stand together.
-    order = sorted(traces, key=lambda one: cases.index(one[0]))
+    cases = list(dict.fromkeys(case for case, _ in cycles))
     samples = []
     parts = {}
-    for one in order:
-        processor_us = np.concatenate([trace.rows["processor_ns"] * 1e-3 for trace in traces[one]])
-        samples.append(Sample(*one, tuple(processor_us.tolist()), "us"))
+    # The contestants of a case stand together.
+    for one in sorted(cycles, key=lambda one: cases.index(one[0])):
+        judged_ns = [own.rows["processor_ns"][own.is_judged] for own in cycles[one]]
+        samples.append(Sample(*one, tuple((np.concatenate(judged_ns) * 1e-3).tolist()), "us"))
+        each = [parts_of(own) for own in cycles[one]]
+        medians = {part: np.concatenate([found[part] for found in each]) for part in PARTS}
         # A single cycle has no parts: the record of the next one has its bookkeeping.
-        if len(processor_us) > len(traces[one]):
-            each = [parts_of(trace) for trace in traces[one]]
-            parts[one] = {
-                part: float(np.median(np.concatenate([found[part] for found in each])))
-                for part in PARTS
-            }
+        if len(medians[PARTS[0]]):
+            parts[one] = {part: float(np.median(times_us)) for part, times_us in medians.items()}
     if physics_us:
         samples.append(Sample(COMPARED, PHYSICS, tuple(physics_us), "us"))
     baselines = {COMPARED: PHYSICS} if other is None else dict.fromkeys(cases, other)
@@ -209,12 +178,10 @@ def costs(
     return CycleCosts("cycle", title, tuple(samples), baselines, parts=parts)
 
 
-def parts_of(trace: Trace) -> dict[str, np.ndarray]:
-    """Return the processor time of each part of each cycle but the first, us, shape (n - 1,)."""
-    rows = trace.rows
-    units = trace.units[1:]
-    exchange, read, process, write = units.T
-    beyond = rows["processor_ns"][1:] - units.sum(axis=1)
+def parts_of(cycles: Cycles) -> dict[str, np.ndarray]:
+    """Return the processor time of each part of each judged cycle but the first, us, shape (n,)."""
+    rows = cycles.rows
+    beyond = (rows["processor_ns"] - cycles.used_ns)[1:]
     # A record counts, and stamps, the bookkeeping of the cycle before: its own is not done when it
     # is written.
     closing = rows["closed_ns"][1:] - rows["end_ns"][:-1]
@@ -222,6 +189,14 @@ def parts_of(trace: Trace) -> dict[str, np.ndarray]:
     # Interrupted, as by the clock in lockstep, it seems longer than it was; then the way to the
     # next start is known.
     closing = np.where(closing > beyond, beyond - np.minimum(gap, beyond), closing)
-    closing[rows["closed_ns"][1:] == 0] = 0
-    times = beyond - closing, exchange + read, process, write, closing
-    return {part: time * 1e-3 for part, time in zip(PARTS, times, strict=True)}
+    read_ns, process_ns, write_ns = (
+        times_ns[1:]
+        for times_ns in (
+            cycles.exchange_ns + cycles.read_ns,
+            cycles.process_ns,
+            cycles.write_ns,
+        )
+    )
+    times = beyond - closing, read_ns, process_ns, write_ns, closing
+    judged = cycles.is_judged[1:]
+    return {part: time[judged] * 1e-3 for part, time in zip(PARTS, times, strict=True)}

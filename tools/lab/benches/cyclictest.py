@@ -9,11 +9,10 @@ time.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,31 +25,17 @@ LONGEST_US = 100_000
 """Largest lateness that has a place of its own in the histogram; one beyond it counts as the
 maximum."""
 PATIENCE_S = 30.0
-"""Time that a peer may take in addition to its wakes."""
+"""Time that it may take in addition to its wakes."""
 
 
-@dataclass(frozen=True)
-class WakeGrid:
-    """Points in time to sleep to: `wakes` of them, `period_ns` apart.
+class WakeGrid(NamedTuple):
+    """Points in time to sleep to on `core`: `wakes` of them, `period_ns` apart, at a `priority` of
+    SCHED_FIFO."""
 
-    The first of `cores` has the sleeper; `cyclictest` has one on each. `priority` is of SCHED_FIFO.
-    """
-
-    cores: tuple[int, ...]
+    core: int
     period_ns: int
     wakes: int
     priority: int
-
-    @classmethod
-    def at(cls, cores: Iterable[int], rate_hz: float, seconds: float, priority: int) -> WakeGrid:
-        """Return the points of a rate for a time."""
-        wakes = max(1, round(seconds * rate_hz))
-        return cls(tuple(sorted(cores)), round(1e9 / rate_hz), wakes, priority)
-
-    @property
-    def patience_s(self) -> float:
-        """Longest time that a program may take over it."""
-        return self.wakes * self.period_ns * 1e-9 + PATIENCE_S
 
 
 def absent_cyclictest() -> tuple[Absent, ...]:
@@ -62,35 +47,35 @@ def absent_cyclictest() -> tuple[Absent, ...]:
 
 
 def permits_fifo() -> bool:
-    """Say whether this process may take a real-time priority."""
+    """Return whether this process may take a real-time priority."""
     return set_priority(1) and set_priority(0)
 
 
 def cyclictest(grid: WakeGrid) -> np.ndarray:
-    """Return the lateness of every wake, us, shape (n,): smallest first, a thread at a time.
+    """Return the lateness of every wake, us, shape (n,), smallest first.
 
-    It leaves idle cores as they are, as a rack does by default (`--laptop`). Raises `Failure` if it
-    cannot run.
+    It leaves idle cores as they are, as a rack does by default (`--laptop`).
+
+    Raises:
+        Failure: If it cannot run.
     """
     with TemporaryDirectory(prefix="rack-bench-") as folder:
         path = Path(folder) / "found.json"
-        command = [CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo", "--laptop"]
-        command += [f"--affinity={','.join(map(str, grid.cores))}", f"--threads={len(grid.cores)}"]
-        command += [
+        command = [
+            *(CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo", "--laptop", "--threads=1"),
+            f"--affinity={grid.core}",
             f"--priority={grid.priority}",
             f"--interval={grid.period_ns // 1000}",
-            "--distance=0",
+            f"--loops={grid.wakes}",
+            f"--histogram={LONGEST_US}",
+            f"--json={path}",
         ]
-        command += [f"--loops={grid.wakes}", f"--histogram={LONGEST_US}", f"--json={path}"]
-        done = finished(CYCLICTEST, command, grid.patience_s)
+        bound_s = grid.wakes * grid.period_ns * 1e-9 + PATIENCE_S
+        done = finished(CYCLICTEST, command, bound_s)
         if done.returncode or not path.is_file():
             status = f"exit status {done.returncode}, and no figures"
             raise Failure(f"{CYCLICTEST}: {' '.join(done.stderr.split()) or status}")
-        threads = json.loads(path.read_text())["thread"].values()
-    return np.concatenate([_lateness_us(thread) for thread in threads])
-
-
-def _lateness_us(thread: dict[str, Any]) -> np.ndarray:
+        (thread,) = json.loads(path.read_text())["thread"].values()
     counts = thread["histogram"]
     beyond = thread["cycles"] - sum(counts.values())
     return np.repeat([*map(float, counts), float(thread["max"])], [*counts.values(), beyond])

@@ -186,16 +186,6 @@ class Comparison:
     absent: tuple[Absent, ...] = ()
     conclusion: str = ""
 
-    @property
-    def cases(self) -> list[str]:
-        """The cases, in order."""
-        return list(dict.fromkeys(sample.case for sample in self.samples))
-
-    @property
-    def contestants(self) -> list[str]:
-        """The contestants, in order."""
-        return list(dict.fromkeys(sample.who for sample in self.samples))
-
     def sample(self, case: str, who: str) -> Sample | None:
         """Return one sample; None where the contestant was not measured."""
         return self._samples.get((case, who))

@@ -10,20 +10,31 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from random import Random
 
+import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
+from rack.boards.events import Event
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kind import DIED
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
+from rack.tools.faults.evidence import BRAKES
 from rack.tools.lab.benches.checkout import RackCommand, rack_commands
 from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
-from rack.tools.lab.benches.kill import KILL_S, measure_kills
+from rack.tools.lab.benches.observed import UNVIEWED, endless, record
+from rack.tools.recording.time_line import RackGrid
 
 BOUND_S = 60.0
 """Longest time that a command may take."""
+KILL_S = 2.5
+"""Time between kills: the board is back, and the arm moves again."""
+PHASES_S = 0.1
+"""Kills are spread over all phases of the slower cycles."""
 RUN_S = 0.25
 """Simulated time of a run of which only the beginning counts."""
 LAUNCH = "launch"
@@ -40,21 +51,23 @@ def measure(
     Args:
         name: Config of the rack, by name or path.
         rounds: Rounds of launches and commands.
-        kills: Kills of each of two boards.
+        kills: Kills of the board that drives the arm.
         against: Another checkout, launched by turns.
         share: Run racks even on cores that another one holds.
-        progress: Told of each part.
+        progress: Told of both parts.
 
     Raises:
-        Failure: If a command fails, or a kill has no reaction.
+        Failure: If a command fails, or the rack has no arm.
     """
-    progress.total(rounds * ROUND_S + 2 * kills * KILL_S)
+    progress.total(rounds * ROUND_S + kills * KILL_S)
     trees = rack_commands(against)
     with tempfile.TemporaryDirectory() as folder:
         progress.begin("launches and commands")
         samples = _measure_commands(name, trees, Path(folder), rounds, share)
         progress.end(rounds * ROUND_S)
-    samples += measure_kills(name, kills, progress)
+        progress.begin("kills")
+        samples += measure_kills(name, kills, Path(folder) / "kills", share)
+        progress.end(kills * KILL_S)
     cases = [sample.case for sample in samples if sample.who == INTERPRETER]
     baselines = dict.fromkeys(cases, INTERPRETER)
     if against is not None:
@@ -131,3 +144,48 @@ def _command_s(rack: RackCommand, arguments: tuple[object, ...]) -> float:
     began = time.monotonic()
     rack.run(*arguments, bound_s=BOUND_S)
     return time.monotonic() - began
+
+
+def measure_kills(name: str, count: int, folder: Path, share: bool = True) -> list[Sample]:
+    """Kill the board that drives the arm again and again, in a run in real time; return the times
+    to detection and to engaged brakes.
+
+    Raises:
+        Failure: If the rack has no arm, or no kill had a reaction.
+    """
+    endless_restarts = "supervision.restarts=10000"
+    config = load(name, [f"name=bench-kill-{os.getpid()}", endless_restarts, *UNVIEWED])
+    if config.robot is None:
+        raise Failure(f"{name}: no arm whose brakes could engage", 2)
+    servo = fastest(config)
+    random = Random(count)
+    instants_s = [KILL_S * (1 + at) + random.uniform(0.0, PHASES_S) for at in range(count)]
+    kills = tuple(
+        FaultConfig(kind="kill", board=servo, tick=round(at_s * 1e9 / config.clock_ns))
+        for at_s in instants_s
+    )
+    killing = endless(config.model_copy(update={"fault": kills}))
+    result, recording = record(killing, KILL_S * (count + 1), folder, share)
+    events = [Event(**event) for event in recording.events if "tick" in event]
+    grid = RackGrid(recording)
+    times_ms: dict[str, list[float]] = {"detected": [], "brakes engaged": []}
+    for kill in result.faults:
+        own = [
+            event
+            for event in events
+            if 0 <= event.tick - kill.tick < KILL_S * 1e9 / config.clock_ns
+        ]
+        died, braked = (
+            next((event for event in own if event.code == code), None) for code in (DIED, BRAKES)
+        )
+        if died is None or braked is None:
+            continue
+        died_ns = died.time_ns - result.clock_offset_ns
+        # The board that drives the arm reports the brakes once it is back, with the tick at which
+        # they engaged.
+        braked_ns = int(grid.stamp_ns(np.array(braked.tick)))
+        for who, reaction_ns in zip(times_ms, (died_ns, braked_ns), strict=True):
+            times_ms[who].append((reaction_ns - kill.time_ns) * 1e-6)
+    if not times_ms["detected"]:
+        raise Failure(f"'{servo}' was killed {count} times: no reactions")
+    return [Sample(f"{servo} killed", who, tuple(found), "ms") for who, found in times_ms.items()]

@@ -8,6 +8,7 @@ prolongs.
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -64,10 +65,12 @@ def measure(
     samples = []
     for rack, seconds in racks.items():
         progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
+        options = ["--set", f"name=bench-{os.getpid()}"]
+        options += [] if seconds is None else ["--seconds", f"{seconds}"]
         with TemporaryDirectory() as folder:
-            ticks = _check(rack, seconds, Path(folder) / "run")
+            ticks = _check(rack, options, Path(folder) / "run")
         progress.end(EXPECTED_S, "equal")
-        runs = {each.name: partial(_run, each, rack, seconds) for each in commands}
+        runs = {each.name: partial(_run, each, rack, options) for each in commands}
         runs[BARE] = partial(_run_bare, rack, ticks)
         found = interleaved(runs, rounds, progress, EXPECTED_S)
         samples += [Sample(rack, who, tuple(times_ms), "ms") for who, times_ms in found.items()]
@@ -87,22 +90,19 @@ def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
     )
 
 
-def _run(command: RackCommand, rack: str, seconds: float | None) -> float:
-    tick_us = command.tick_us(rack, *_options(seconds), bound_s=BOUND_S)
-    return _ms_a_second(rack, tick_us)
-
-
-def _options(seconds: float | None) -> list[object]:
-    until = [] if seconds is None else ["--seconds", seconds]
-    return ["--set", f"name=bench-{os.getpid()}", *until]
+def _run(command: RackCommand, rack: str, options: Sequence[object]) -> float:
+    """Return the time of a simulated second, ms."""
+    words = ("run", rack, "--lockstep", "--no-record", "--json", *options)
+    found = json.loads(command.run(*words, bound_s=BOUND_S))
+    return _ms_a_second(rack, found["wall_s"], found["outcome"]["ticks"])
 
 
 def _run_bare(rack: str, ticks: int) -> float:
-    return _ms_a_second(rack, _bare(rack, ticks).processor_s * 1e6 / ticks)
+    return _ms_a_second(rack, _bare(rack, ticks).processor_s, ticks)
 
 
-def _ms_a_second(rack: str, tick_us: float) -> float:
-    return tick_us * 1e6 / load(rack).clock_ns
+def _ms_a_second(rack: str, lasted_s: float, ticks: int) -> float:
+    return lasted_s / ticks * 1e12 / load(rack).clock_ns
 
 
 def _bare(rack: str, ticks: int) -> BareRun:
@@ -119,10 +119,10 @@ def run_bare(config: RackConfig, ticks: int) -> BareRun:
         return BareRun(ticks, processor_s, rack.serials, last)
 
 
-def _check(rack: str, seconds: float | None, folder: Path) -> int:
+def _check(rack: str, options: Sequence[object], folder: Path) -> int:
     """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran
     for."""
-    words = ("run", rack, "--lockstep", *_options(seconds), "--out", folder)
+    words = ("run", rack, "--lockstep", *options, "--out", folder)
     rack_commands(None)[0].run(*words, bound_s=BOUND_S)
     recording = Recording(folder)
     ticks = int(recording.ended["outcome"]["ticks"])

@@ -26,7 +26,6 @@ from rack.boards.config import RackConfig, load
 from rack.boards.config.layout import obtained_core
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.console.tables import decimal, table
 from rack.tools.lab.benches.cyclictest import (
     CYCLICTEST,
     WakeGrid,
@@ -108,16 +107,19 @@ class RateFigures:
     failure: str = ""
 
     @property
-    def reason(self) -> str:
-        """Why the rate is not held; empty if it is."""
-        late = self.late or 0.0
+    def verdict(self) -> str:
+        """Whether the rate is held, and if not, why."""
         if self.failure:
-            return self.failure
-        if late > PERMITTED:
-            return f"the machine woke {CYCLICTEST} a cycle late in {late:.2%} of its wakes"
-        if self.missed - late > PERMITTED:
-            return f"the rack missed {self.missed:.2%} of its cycles"
-        return ""
+            return f"not held: {self.failure}"
+        if (self.late or 0.0) > PERMITTED:
+            return "not held: the machine is late"
+        return "held" if self.is_held else "not held: the rack is late"
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the machine and the rack are in time, and no run ended early."""
+        late = self.late or 0.0
+        return not self.failure and late <= PERMITTED and self.missed - late <= PERMITTED
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ class Machine(Comparison):
         """The highest rate that is held, as all below it are; None if the lowest is not."""
         highest = None
         for one in self.rates:
-            if one.reason:
+            if not one.is_held:
                 break
             highest = one.rate_hz
         return highest
@@ -156,8 +158,9 @@ class Machine(Comparison):
         else:
             yield f"fit for real time up to {highest:g} Hz"
         for one in self.rates:
-            words = "held" if not one.reason else f"not held: {one.reason}"
-            yield f"{one.rate_hz:g} Hz {words}; {self._worst(one.rate_hz)}"
+            late = "" if one.late is None else f", {CYCLICTEST} late in {one.late:.2%}"
+            counts = f"missed {one.missed:.2%} of {one.cycles} cycles{late}"
+            yield f"{one.rate_hz:g} Hz {one.verdict}; {counts}; {self._worst(one.rate_hz)}"
 
     def _worst(self, rate_hz: float) -> str:
         samples = ((who, self.sample(_case(rate_hz), who)) for who in (self.who, CYCLICTEST))
@@ -166,7 +169,7 @@ class Machine(Comparison):
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data, without the raw values."""
-        rates = [{**asdict(one), "held": not one.reason} for one in self.rates]
+        rates = [{**asdict(one), "held": one.is_held} for one in self.rates]
         return {
             **super().document(),
             "fit": self.is_fit,
@@ -177,21 +180,8 @@ class Machine(Comparison):
         }
 
     def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield the verdict, then both tables, fitted to `width`."""
+        """Yield the verdict, then the lateness as a table, fitted to `width`."""
         yield from self.verdict
-        yield ""
-        yield f"cycles of {self.who} missed, and wakes of {CYCLICTEST} late by a cycle, %"
-        head = ["rate, Hz", "cycles", "missed", f"{CYCLICTEST} late"]
-        rows = [
-            [
-                f"{one.rate_hz:g}",
-                f"{one.cycles}",
-                f"{100 * one.missed:.3f}",
-                decimal(None if one.late is None else 100 * one.late),
-            ]
-            for one in self.rates
-        ]
-        yield from table(head, rows, width, ("cycles",))
         yield ""
         yield from super().lines(width)
 
@@ -229,14 +219,15 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
     for rate_hz, rack in racks.items():
         progress.begin(_case(rate_hz))
         priority = config.board[fastest].priority or 1
-        grid = WakeGrid.at((core,), rate_hz, runs.seconds, priority)
+        wakes = max(1, round(runs.seconds * rate_hz))
+        grid = WakeGrid(core, round(1e9 / rate_hz), wakes, priority)
         contestants: dict[str, Callable[[], RackRun]] = {
             who: partial(_run, rack, fastest, runs, awake=False)
         }
         if not refusal:
             contestants[who + AWAKE] = partial(_run, rack, fastest, runs, awake=True)
         if is_compared:
-            contestants[CYCLICTEST] = lambda grid=grid: RackRun(cyclictest(grid))
+            contestants[CYCLICTEST] = partial(_sleep, grid)
         found = interleaved(contestants, runs.rounds)
         for one, each in found.items():
             late_us = np.concatenate([run.late_us for run in each])
@@ -252,7 +243,7 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
                 failure=next(filter(None, (run.failure for run in found[who])), ""),
             )
         )
-        progress.end(each_s, rates[-1].reason or "held")
+        progress.end(each_s, rates[-1].verdict)
     return Machine(
         name="machine",
         title=f"lateness: from grid point to start, on core {core}",
@@ -283,6 +274,10 @@ def _run(rack: RackConfig, board: str, runs: Runs, awake: bool) -> RackRun:
         result, recording = record(rack, runs.seconds, Path(folder), runs.share)
         late_us = lateness_us(recording, board)
         return RackRun(late_us, result.tasks[board], result.outcome.failure)
+
+
+def _sleep(grid: WakeGrid) -> RackRun:
+    return RackRun(cyclictest(grid))
 
 
 def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:

@@ -10,53 +10,59 @@ import numpy as np
 import pytest
 
 from rack.backplane.trace import RECORD
+from rack.boards.config import load, wire
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.cycle import PARTS, PHYSICS, Trace, costs, measure, parts_of
+from rack.tools.lab.benches.cycle import PARTS, PHYSICS, costs, measure, parts_of
 from rack.tools.lab.benches.physics import Replay, replay
+from rack.tools.recording.cycles import Cycles
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
 pytestmark = pytest.mark.thorough
 
 
-def trace(processor_us: int, cycles: int = 5) -> Trace:
+TASK = wire(load("nasrem")).task("servo")
+
+
+def cycles(processor_us: int, count: int = 5) -> Cycles:
     """Return cycles with 1 us of exchange, 2 of reading, 30 of processing and 4 of writing."""
-    rows = np.zeros(cycles, RECORD)
-    rows["tick"] = np.arange(cycles)
+    rows = np.zeros(count, RECORD)
+    rows["tick"] = np.arange(count)
     rows["processor_ns"] = processor_us * 1000
-    return Trace(rows, np.tile(np.array([1000, 2000, 30000, 4000]), (cycles, 1)))
+    rows["end_ns"] = rows["tick"] * 2_500_000
+    rows["closed_ns"][1:] = rows["end_ns"][:-1] + 5000
+    parts = np.tile(np.array([1000, 2000, 30000, 4000]), (count, 1))
+    return Cycles(TASK, 0, 0, rows, parts, np.ones(count, bool), 0, 0, np.zeros(count, int))
 
 
 def test_the_parts_of_a_cycle_are_its_whole_processor_time() -> None:
-    one = trace(50)
-    one.rows["end_ns"] = one.rows["tick"] * 2_500_000
-    one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 5000
-    found = parts_of(one)
+    found = parts_of(cycles(50))
     assert tuple(found) == PARTS
     assert [times.tolist() for times in found.values()] == [
         [us] * 4 for us in (8.0, 3.0, 30.0, 4.0, 5.0)
     ]
 
 
-def test_bookkeeping_that_a_trace_does_not_separate_is_part_of_waking_up() -> None:
-    assert [times[0] for times in parts_of(trace(50)).values()] == [13.0, 3.0, 30.0, 4.0, 0.0]
-
-
 def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
-    one = trace(50)
-    one.rows["end_ns"] = one.rows["tick"] * 2_500_000
+    one = cycles(50)
     one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 90_000
     one.rows["start_ns"][1:] = one.rows["closed_ns"][1:] + 2000
     assert [times[0] for times in parts_of(one).values()] == [2.0, 3.0, 30.0, 4.0, 11.0]
 
 
-THIS_TREE = {("servo, lockstep", "this tree"): [trace(50), trace(50), trace(200)]}
+def test_start_up_and_stalls_are_not_judged() -> None:
+    one = cycles(50)
+    one.is_judged[[0, 3]] = False
+    assert len(parts_of(one)["process"]) == 3
+
+
+THIS_TREE = {("servo, lockstep", "this tree"): [cycles(50), cycles(50), cycles(200)]}
 
 
 def test_a_board_is_compared_with_another_checkout_or_the_servo_with_its_physics() -> None:
-    both = costs({**THIS_TREE, ("servo, lockstep", "base"): [trace(100)]}, [20.0], "base")
+    both = costs({**THIS_TREE, ("servo, lockstep", "base"): [cycles(100)]}, [20.0], "base")
     alone = costs(THIS_TREE, [20.0], None)
     for found, ratio in ((both, 0.5), (alone, 2.5)):
         own = found.sample("servo, lockstep", "this tree")
@@ -66,7 +72,7 @@ def test_a_board_is_compared_with_another_checkout_or_the_servo_with_its_physics
 
 
 def test_a_single_cycle_has_no_parts() -> None:
-    found = costs({**THIS_TREE, ("task, lockstep", "this tree"): [trace(50, cycles=1)]}, [], None)
+    found = costs({**THIS_TREE, ("task, lockstep", "this tree"): [cycles(50, count=1)]}, [], None)
     assert list(found.parts) == [("servo, lockstep", "this tree")]
     assert found.sample("task, lockstep", "this tree") is not None
 

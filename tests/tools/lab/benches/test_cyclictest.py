@@ -14,7 +14,7 @@ from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cycli
 from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
 
-GRID = WakeGrid((0,), 1_000_000, 50, 80)
+GRID = WakeGrid(0, 1_000_000, 50, 80)
 needs_cyclictest = pytest.mark.skipif(
     shutil.which("cyclictest") is None, reason="needs cyclictest (rt-tests)"
 )
@@ -35,8 +35,6 @@ def test_wakes_beyond_the_histogram_count_as_the_latest(
     found = cyclictest(GRID)
     assert np.unique(found, return_counts=True)[1].tolist() == [47, 1, 2]
     assert found.max() == 150_000.0
-    # A thread on every core.
-    assert len(cyclictest(WakeGrid((0, 1), 1_000_000, 50, 80))) == 100
 
 
 def test_idle_cores_are_left_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

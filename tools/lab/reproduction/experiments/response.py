@@ -154,10 +154,12 @@ def _is_moving(run: Recording, status: str, tick: int) -> bool:
 def first_difference(first: Recording, second: Recording, status: str) -> int | None:
     """Return the first tick at which the torques in `status` differ in any bit, over the ticks that
     both runs have; None if they never do."""
-    torques = []
-    for run in (first, second):
-        ticks = run.signal(status, "tick").tolist()
-        values = [value.tobytes() for value in run.signal(status, "torque")]
-        torques.append(dict(zip(ticks, values, strict=True)))
-    common = sorted(torques[0].keys() & torques[1].keys())
-    return next((tick for tick in common if torques[0][tick] != torques[1][tick]), None)
+    ticks, *places = np.intersect1d(
+        first.signal(status, "tick"), second.signal(status, "tick"), return_indices=True
+    )
+    bits, others = (
+        run.signal(status, "torque")[place].view(np.uint64)
+        for run, place in zip((first, second), places, strict=True)
+    )
+    differing = ticks[(bits != others).any(axis=1)]
+    return int(differing[0]) if len(differing) else None
