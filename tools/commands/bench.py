@@ -95,8 +95,7 @@ def mailbox(
     """What does a message cost, next to iceoryx2 and pipes?
 
     Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2 and
-    pipes of multiprocessing. The ratio is to the best of these peers. A raw copy is the least that
-    can be done, and no peer.
+    pipes of multiprocessing. The ratio is to the best of these peers.
     """
     from rack.tools.lab.benches.mailbox import CASES, measure
 

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from random import Random
 
 import numpy as np
 import pyarrow.compute as pc
@@ -33,8 +32,6 @@ BOUND_S = 60.0
 """Longest time that a command may take."""
 KILL_S = 2.5
 """Time between kills: the board is back, and the arm moves again."""
-PHASES_S = 0.1
-"""Kills are spread over all phases of the slower cycles."""
 RUN_S = 0.25
 """Simulated time of a run of which only the beginning counts."""
 LAUNCH = "launch"
@@ -158,11 +155,10 @@ def measure_kills(name: str, count: int, folder: Path, share: bool = True) -> li
     if config.robot is None:
         raise Failure(f"{name}: no arm whose brakes could engage", 2)
     servo = fastest(config)
-    random = Random(count)
-    instants_s = [KILL_S * (1 + at) + random.uniform(0.0, PHASES_S) for at in range(count)]
+    # One tick more than a multiple of the slower cycles: each kill comes at another phase of them.
+    between = round(KILL_S * 1e9 / config.clock_ns) + 1
     kills = tuple(
-        FaultConfig(kind="kill", board=servo, tick=round(at_s * 1e9 / config.clock_ns))
-        for at_s in instants_s
+        FaultConfig(kind="kill", board=servo, tick=at * between) for at in range(1, count + 1)
     )
     killing = endless(config.model_copy(update={"fault": kills}))
     result, recording = record(killing, KILL_S * (count + 1), folder, share)
@@ -170,11 +166,7 @@ def measure_kills(name: str, count: int, folder: Path, share: bool = True) -> li
     grid = RackGrid(recording)
     times_ms: dict[str, list[float]] = {"detected": [], "brakes engaged": []}
     for kill in result.faults:
-        own = [
-            event
-            for event in events
-            if 0 <= event.tick - kill.tick < KILL_S * 1e9 / config.clock_ns
-        ]
+        own = [event for event in events if 0 <= event.tick - kill.tick < between]
         died, braked = (
             next((event for event in own if event.code == code), None) for code in (DIED, BRAKES)
         )

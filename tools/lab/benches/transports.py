@@ -10,7 +10,6 @@ removed as soon as both ends are open, so that nothing is left even if the proce
 from __future__ import annotations
 
 import ctypes
-import mmap
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -42,23 +41,6 @@ class Peer(NamedTuple):
     name: str
     module: str
     opened: Callable[[np.dtype, int], AbstractContextManager[Transport]]
-
-
-@contextmanager
-def raw_copy(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Copy bytes into shared memory and out again: no serial, no check, no readers in step with the
-    writer."""
-    shared = mmap.mmap(-1, dtype.itemsize)
-    message = Message(dtype)
-    with memoryview(shared) as view:
-
-        def send(tick: int) -> None:
-            view[:] = message.raw
-
-        def fetch(raw: memoryview) -> None:
-            raw[:] = view
-
-        yield Transport(message, send, [_into(dtype, fetch) for _ in range(readers)])
 
 
 @contextmanager
@@ -108,8 +90,6 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
             end.close()
 
 
-REFERENCES = (Peer("raw copy", "mmap", raw_copy),)
-"""No peer: the least that can be done."""
 PEERS = (
     Peer("iceoryx2 blackboard", "iceoryx2", iceoryx2_blackboard),
     Peer("multiprocessing pipe", "multiprocessing", multiprocessing_pipe),
