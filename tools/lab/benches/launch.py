@@ -10,23 +10,23 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from random import Random
 
-import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
-from rack.boards.events import Event
-from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import DIED
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
+from rack.tools.faults.campaigns.plan import Kill
+from rack.tools.faults.campaigns.trial import Killer
 from rack.tools.faults.evidence import BRAKES
 from rack.tools.lab.benches.checkout import RackCommand, rack_commands
 from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
-from rack.tools.lab.benches.observed import UNVIEWED, endless, record
-from rack.tools.recording.time_line import RackGrid
+from rack.tools.lab.benches.observed import endless
 
 BOUND_S = 60.0
 """Longest time that a command may take."""
@@ -63,7 +63,7 @@ def measure(
         samples = _measure_commands(name, trees, Path(folder), rounds, share)
         progress.end(rounds * ROUND_S)
         progress.begin("kills")
-        samples += measure_kills(name, kills, Path(folder) / "kills", share)
+        samples += measure_kills(name, kills, share)
         progress.end(kills * KILL_S)
     cases = [sample.case for sample in samples if sample.who == INTERPRETER]
     baselines = dict.fromkeys(cases, INTERPRETER)
@@ -143,41 +143,40 @@ def _command_s(rack: RackCommand, arguments: tuple[object, ...]) -> float:
     return time.monotonic() - began
 
 
-def measure_kills(name: str, count: int, folder: Path, share: bool = True) -> list[Sample]:
-    """Kill the board that drives the arm again and again, in a run in real time; return the times
-    to detection and to engaged brakes.
+def measure_kills(name: str, count: int, share: bool = True) -> list[Sample]:
+    """Kill the board that drives the arm again and again, from outside and at any phase of its
+    cycle; return the times to detection and to engaged brakes.
 
     Raises:
         Failure: If the rack has no arm, or no kill had a reaction.
     """
-    endless_restarts = "supervision.restarts=10000"
-    config = load(name, [f"name=bench-kill-{os.getpid()}", endless_restarts, *UNVIEWED])
+    config = load(name, [f"name=bench-kill-{os.getpid()}", "supervision.restarts=10000"])
     if config.robot is None:
         raise Failure(f"{name}: no arm whose brakes could engage", 2)
     servo = fastest(config)
+    random = Random(count)
     # One tick more than a multiple of the slower cycles: each kill comes at another phase of them.
     between = round(KILL_S * 1e9 / config.clock_ns) + 1
-    kills = tuple(
-        FaultConfig(kind="kill", board=servo, tick=at * between) for at in range(1, count + 1)
-    )
-    killing = endless(config.model_copy(update={"fault": kills}))
-    result, recording = record(killing, KILL_S * (count + 1), folder, share)
-    events = [Event(**event) for event in recording.events if "tick" in event]
-    grid = RackGrid(recording)
+    kills = [Kill(servo, at * between, random.random()) for at in range(1, count + 1)]
+    with Rack(endless(config), share=share) as rack:
+        killer = Killer(rack.segment, kills)
+        rack.start(KILL_S * (count + 1))
+        while rack.watch(killer.due_in_s()):
+            killer.advance()
+        # From CLOCK_MONOTONIC to the time of events.
+        offset_ns = time.time_ns() - time.monotonic_ns()
+        epoch_ns = rack.segment.words[System.EPOCH_NS]
     times_ms: dict[str, list[float]] = {"detected": [], "brakes engaged": []}
-    for kill in result.faults:
-        own = [event for event in events if 0 <= event.tick - kill.tick < between]
+    for kill in killer.done:
+        own = [event for event in rack.events if 0 <= event.tick - kill.tick < between]
         died, braked = (
             next((event for event in own if event.code == code), None) for code in (DIED, BRAKES)
         )
-        if died is None or braked is None:
-            continue
-        died_ns = died.time_ns - result.clock_offset_ns
-        # The board that drives the arm reports the brakes once it is back, with the tick at which
-        # they engaged.
-        braked_ns = int(grid.stamp_ns(np.array(braked.tick)))
-        for who, reaction_ns in zip(times_ms, (died_ns, braked_ns), strict=True):
-            times_ms[who].append((reaction_ns - kill.time_ns) * 1e-6)
+        if died is not None and braked is not None:
+            # The board reports the brakes once it is back, with the tick at which they engaged.
+            braked_ns = epoch_ns + braked.tick * config.clock_ns
+            times_ms["detected"].append((died.time_ns - offset_ns - kill.time_ns) * 1e-6)
+            times_ms["brakes engaged"].append((braked_ns - kill.time_ns) * 1e-6)
     if not times_ms["detected"]:
         raise Failure(f"'{servo}' was killed {count} times: no reactions")
     return [Sample(f"{servo} killed", who, tuple(found), "ms") for who, found in times_ms.items()]

@@ -53,15 +53,15 @@ def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(
     assert not list((tmp_path / "runs").iterdir())
 
 
-def test_a_rack_without_an_arm_has_no_brakes(small: Path, tmp_path: Path) -> None:
+def test_a_rack_without_an_arm_has_no_brakes(small: Path) -> None:
     with pytest.raises(Failure, match="no arm whose brakes could engage"):
-        measure_kills(str(small), 1, tmp_path / "run")
+        measure_kills(str(small), 1)
 
 
 @pytest.mark.slow
 @pytest.mark.alone
-def test_a_kill_is_detected_and_the_brakes_engage(tmp_path: Path) -> None:
-    detected, braked = measure_kills("nasrem", 2, tmp_path / "run")
+def test_a_kill_is_detected_and_the_brakes_engage() -> None:
+    detected, braked = measure_kills("nasrem", 2)
     assert {one.case for one in (detected, braked)} == {"servo killed"}
     assert [(one.who, one.count, one.unit) for one in (detected, braked)] == [
         ("detected", 2, "ms"),
