@@ -82,20 +82,17 @@ def reproduce(
     from rack.tools.lab.reproduction import reproduction
     from rack.tools.lab.reproduction.experiments.experiment import Workshop
 
-    wanted = reproduction.chapters_named(only)
+    wanted = reproduction.select_sections(only)
     if out.exists() and not out.is_dir():
         raise Failure(f"--out {out}: exists, and is not a folder", 2)
     if not can_draw():
         raise Failure(NO_PICTURES, 2)
-    if again:
-        reproduction.forget(wanted, out)
     with (
         INTERRUPT.orderly(INTERRUPT.end, unfinished=STAYS.format(out)),
         progress_for(as_json) as progress,
     ):
-        page = reproduction.reproduce(wanted, Workshop(out, share), progress)
-    is_good = reproduction.worked(page, wanted)
-    print_answer(
-        reproduction.document(page, out, is_good), reproduction.summary(page, out), as_json
-    )
+        page = reproduction.reproduce(wanted, Workshop(out, share), progress, again)
+    is_good = reproduction.has_worked(page, wanted)
+    document = {"folder": str(out), "worked": is_good, **page.document()}
+    print_answer(document, reproduction.summarize(page, out), as_json)
     sys.exit(0 if is_good else 1)

@@ -224,5 +224,5 @@ def program_files() -> Iterator[Path]:
     for floor in FLOORS:
         for path in sorted((PROGRAM / floor).rglob("*.*")):
             is_source = path.suffix in (".py", ".toml", ".xml") and path.is_file()
-            if is_source and path.parent not in (page, page / "sections"):
+            if is_source and path.parent != page:
                 yield path
