@@ -4,7 +4,6 @@ judge it, and the reason of the ruling if it holds."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 from rack.tools.lab.reproduction import predictions, rules
@@ -42,23 +41,23 @@ from rack.tools.lab.reproduction.verdict import Verdict
 
 def _equation(
     number: str,
-    title: str,
-    quote: str,
     form: str,
+    quote: str,
     config: str,
     settings: tuple[str, ...] = (),
     judge: Callable[[NasremRun], Verdict] | None = None,
+    is_pictured: bool = False,
 ) -> Claim:
     """Return an equation as a claim; it fails in this config with these settings."""
     return Claim(
         f"equation-{number}",
-        f"Equation {number}: {title}",
+        f"Equation {number}: {form}",
         quote,
         "It holds for every level, in the worst cycle too.",
         (NASREM,),
         judge or partial(rules.judge_equation, number),
         partial(predictions.predict_equation, number, config, settings),
-        form=form,
+        is_pictured,
     )
 
 
@@ -80,7 +79,7 @@ def _figure(
         tuple(rack.experiment for rack in racks),
         judge,
         predict,
-        predictions.show_pictures,
+        True,
     )
 
 
@@ -235,27 +234,24 @@ SECTIONS = (
         (
             _equation(
                 "3.1",
-                "processing and communication fit the cycle",
+                "t_proc + t_c = R_i ≤ R_max",
                 "... the ith level spends t_c seconds communicating/waiting for commands and"
                 " status, and t_proc processing.",
-                "t_proc + t_c = R_i ≤ R_max",
                 "fig4-overload",
             ),
             _equation(
                 "3.2",
-                "the bound on the system's response",
-                "An upper bound to the system response time R_s can be calculated.",
                 "R_s ≤ n R_max",
+                "An upper bound to the system response time R_s can be calculated.",
                 "nasrem",
                 HURRIED,
             ),
             _equation(
                 "3.3",
-                "the system's response as a sum",
+                "R_s = Σ R_i + Σ R_j",
                 "This leads to a definition of R_s, system response time, as the sum of R_i"
                 " response times tied to the machine update rate, and the sum of R_j response"
                 " times arbitrarily set.",
-                "R_s = Σ R_i + Σ R_j",
                 "nasrem",
                 HURRIED,
                 rules.judge_sum,
@@ -268,32 +264,27 @@ SECTIONS = (
         (
             _equation(
                 "3.4",
-                "the executor's time is below the limit",
+                "t_exec < R_max",
                 "t_exec, the time the executor runs each cycle, is less than the level response"
                 " time limit maximum.",
-                "t_exec < R_max",
                 "fig4-overload",
                 settings_of("fig4-overload", 6.0),
             ),
             _equation(
                 "3.5",
-                "the parts of a cycle",
+                "R_i = t_exec + t_comm + t_residual",
                 "R_i is composed of t_exec, ... t_comm, ... and t_residual, time remaining before"
                 " the next cycle.",
-                "R_i = t_exec + t_comm + t_residual",
                 "fig4-overload",
             ),
-            replace(
-                _equation(
-                    "3.6",
-                    "the residual of the worst cycle",
-                    "[The residual] must be bounded by a sum of the worst case times for both"
-                    " processing and communication.",
-                    "0 < t_residual ≤ R_i - max t_exec - max t_comm",
-                    "fig4",
-                    settings_of("fig4", 3.0),
-                ),
-                show=predictions.show_pictures,
+            _equation(
+                "3.6",
+                "0 < t_residual ≤ R_i - max t_exec - max t_comm",
+                "[The residual] must be bounded by a sum of the worst case times for both"
+                " processing and communication.",
+                "fig4",
+                settings_of("fig4", 3.0),
+                is_pictured=True,
             ),
         ),
     ),
@@ -322,9 +313,8 @@ SECTIONS = (
             ),
             _equation(
                 "3.7",
-                "cycles of fixed length",
-                "Levels execute every cycle and these cycles are of fixed time c.",
                 "t_i+1 = t_i + c",
+                "Levels execute every cycle and these cycles are of fixed time c.",
                 "nasrem",
                 ("board.primitive.rate_hz=60",),
             ),
@@ -339,17 +329,15 @@ SECTIONS = (
             ),
             _equation(
                 "3.8",
-                "a planner on its executor's processor",
-                "The planner must finish any plan within d cycles.",
                 "t_plan / d < t_residual - 2 t_cs",
+                "The planner must finish any plan within d cycles.",
                 "fig3",
             ),
             _equation(
                 "3.9",
-                "the cycle with a planner in it",
+                "R_i = t_exec + t_comm + t_plan+residual + 2 t_cs",
                 "Including the planner on the same processor adds two extra context switches to a"
                 " cycle.",
-                "R_i = t_exec + t_comm + t_plan+residual + 2 t_cs",
                 "fig3",
                 settings_of("fig3", 3.0),
             ),
@@ -364,9 +352,8 @@ SECTIONS = (
             ),
             _equation(
                 "3.10",
-                "the update of the plan is small",
-                "The planner to executor communication is small.",
                 "t_e,p-comm ≪ R_i",
+                "The planner to executor communication is small.",
                 "fig2",
                 ("timing.small_share=0.1",),
             ),
@@ -414,7 +401,7 @@ SECTIONS = (
                 " cycles no updated plan exists.",
                 "It fails with every X, as the paper says.",
                 (FIG3, SHORT_3),
-                rules.judge_figure_3,
+                rules.judge_failing,
                 partial(predictions.predict_figure, FIG3),
             ),
             _figure(
@@ -581,7 +568,7 @@ SECTIONS = (
                 " and 3.3.",
                 (response.RESPONSE,),
                 rules.judge_predictable,
-                show=predictions.show_responses,
+                is_pictured=True,
             ),
         ),
     ),

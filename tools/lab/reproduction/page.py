@@ -37,7 +37,6 @@ class JudgedClaim:
     claim: str
     title: str
     quote: str
-    form: str
     predicted: tuple[Evidence, ...]
     measured: tuple[Evidence, ...] = ()
     ruling: Ruling = Ruling.UNMADE
@@ -53,11 +52,10 @@ class Claim:
         title: Its heading.
         quote: The paper's sentence.
         why: The reason for its ruling if every comparison is met.
-        experiments: Experiments whose records `judge` and `show` take, in this order.
+        experiments: Experiments whose records `judge` takes, in this order.
         judge: Its rule.
         predict: Returns what follows from configs alone.
-        show: Returns pictures of the experiments.
-        form: The equation, if it is one; an index follows "_".
+        is_pictured: Whether the pictures of its experiments are shown.
     """
 
     name: str
@@ -67,12 +65,11 @@ class Claim:
     experiments: tuple[Experiment[Any], ...]
     judge: Callable[..., Verdict]
     predict: Callable[[Workshop], tuple[Evidence, ...]] = lambda workshop: ()
-    show: Callable[..., tuple[Evidence, ...]] = lambda workshop, *found: ()
-    form: str = ""
+    is_pictured: bool = False
 
     def judge_by(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> JudgedClaim:
         """Return the claim with its ruling; a text among the `results` says why there is none."""
-        unruled = JudgedClaim(self.name, self.title, self.quote, self.form, self.predict(workshop))
+        unruled = JudgedClaim(self.name, self.title, self.quote, self.predict(workshop))
         found = []
         for one in self.experiments:
             result = results.get(one.name, "not run yet")
@@ -82,11 +79,14 @@ class Claim:
                 return replace(unruled, ruling=Ruling.UNTESTABLE, why=result.lacking)
             found.append(one.record(result.found))
         verdict = self.judge(*found)
+        shown = found if self.is_pictured else []
+        paths = [str(path) for run in shown for path in run.pictures.values()]
+        pictures = [Evidence(path, picture=path) for path in paths]
         return replace(
             unruled,
             ruling=verdict.ruling,
             why=describe_unmet(verdict.checks) or self.why,
-            measured=(*self.show(workshop, *found), Evidence(checks=verdict.checks)),
+            measured=(*pictures, Evidence(checks=verdict.checks)),
         )
 
 

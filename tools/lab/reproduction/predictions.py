@@ -1,23 +1,20 @@
-"""Evidence that follows from configs alone, and pictures of runs."""
+"""Evidence that follows from configs alone."""
 
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.errors import ConfigError
 from rack.levels.timing.forecast import Forecast
-from rack.tools.lab.reproduction.experiments.experiment import PICTURES, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import FIG2, FigureRack, sweep
 from rack.tools.lab.reproduction.experiments.nasrem import NAME
-from rack.tools.lab.reproduction.experiments.response import ResponseRun
 from rack.tools.lab.reproduction.experiments.systems import SystemPrediction, prediction, systems
 from rack.tools.lab.reproduction.page import Evidence
 from rack.tools.lab.reproduction.rules import PAPER_X, check_equations, check_planning
 from rack.tools.timing.charts import figure5
 from rack.tools.timing.charts.letters import column_for, lines
-from rack.tools.timing.operator_response import plot
 
 
 def predict_equation(
@@ -65,15 +62,3 @@ def predict_figure_5(workshop: Workshop) -> tuple[Evidence, ...]:
 def promise_systems() -> dict[str, SystemPrediction]:
     """Return what the config of each system promises."""
     return {name: prediction(load(name)) for name in systems()}
-
-
-def show_pictures(workshop: Workshop, *found: Any) -> tuple[Evidence, ...]:
-    """Return the pictures that experiments have left."""
-    paths = [str(path) for run in found for path in run.pictures.values()]
-    return tuple(Evidence(path, picture=path) for path in paths)
-
-
-def show_responses(workshop: Workshop, found: ResponseRun) -> tuple[Evidence, ...]:
-    """Return the responses in real time with their bounds."""
-    drawn = workshop.shown(plot(found.realtime.response, workshop.folder / PICTURES))
-    return (Evidence("response-realtime", picture=str(drawn)),)

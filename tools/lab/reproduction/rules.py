@@ -69,19 +69,17 @@ def judge_determinism(found: determinism.ComparedRuns) -> Verdict:
     digest = found.runs[0].digest
     lockstep = [run for run in found.runs if run.mode == "lockstep"]
     real = [run for run in found.runs if run.mode == "realtime"]
+    early = sum(
+        run.difference is not None
+        and (run.first_miss is None or run.first_miss > run.difference.tick)
+        for run in real
+    )
     always = check_none(
         lockstep_runs_that_differ=sum(run.digest != digest for run in lockstep),
-        realtime_runs_that_differ_before_a_miss=sum(map(_is_unexplained, real)),
+        realtime_runs_that_differ_before_a_miss=early,
     )
     equal = sum(run.first_miss is None and run.digest == digest for run in real)
     return rule_on(*always, compare("realtime_runs_equal", equal, ">=", 1), here=always)
-
-
-def _is_unexplained(run: determinism.ComparedRun) -> bool:
-    """Return whether a run diverges from the reference before it has missed a deadline."""
-    if run.difference is None:
-        return False
-    return run.first_miss is None or run.first_miss > run.difference.tick
 
 
 def judge_speedup(one: FigureRun, two: FigureRun) -> Verdict:
@@ -287,16 +285,12 @@ def judge_working(found: FigureRun) -> Verdict:
     return rule_on(*late, here=[_compare_late(found, "<=")], needs=_undisturbed(found))
 
 
-def judge_failing(found: FigureRun) -> Verdict:
-    """Rule on a figure of which the paper says that it fails."""
-    return rule_on(_compare_late(found, ">"), needs=_undisturbed(found))
-
-
-def judge_figure_3(found: FigureRun, short: FigureRun) -> Verdict:
-    """Compare plans with the usual X, and with the shortest that the paper permits."""
+def judge_failing(found: FigureRun, *shorter: FigureRun) -> Verdict:
+    """Rule on a figure of which the paper says that it fails, with the shortest X that the paper
+    permits too."""
     usual = _compare_late(found, ">")
-    shortest = _compare_late(short, ">", "shortest_X_late_share")
-    return rule_on(usual, shortest, here=[usual], needs=_undisturbed(found))
+    shortest = (_compare_late(run, ">", "shortest_X_late_share") for run in shorter)
+    return rule_on(usual, *shortest, here=[usual], needs=_undisturbed(found))
 
 
 def check_planning(one: Planning) -> tuple[Check, Check]:

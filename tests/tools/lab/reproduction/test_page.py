@@ -25,7 +25,6 @@ CLAIM = JudgedClaim(
     "equation-3.8",
     "Equation 3.8",
     "A plan must finish.",
-    "t_plan / d < t_residual",
     (Evidence("rack check fig3 --set a=1", text="R X W P | <U>"),),
     (
         Evidence("run", picture="pictures/one.svg"),
@@ -90,7 +89,7 @@ def test_html_fetches_nothing_and_holds_every_word(document: str) -> None:
     assert "color-scheme: light dark" in document
     assert {
         *("A plan must finish.", "Both cannot be <so>.", "R X W P | <U>", "NO"),
-        *("t_plan / d < t_residual", "servo: t_plan < R_i", "rack check fig3 --set a=1"),
+        *("servo: t_plan < R_i", "rack check fig3 --set a=1"),
         f"Equation 3.8: {LABELS[Ruling.CONTRADICTS]}",
     } <= set(links.texts)
 

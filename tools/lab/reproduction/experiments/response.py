@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from random import Random
 
 import numpy as np
@@ -20,12 +21,13 @@ from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import with_commands
 from rack.tools.lab.reproduction.experiments.experiment import (
+    PICTURES,
     Experiment,
     Workshop,
     need_real_time,
 )
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of
+from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, plot, response_of
 
 NAME = "nasrem"
 COMMANDS = 12
@@ -74,11 +76,14 @@ class ResponseRun:
 
     lockstep: ResponseFigures
     realtime: ResponseFigures
+    pictures: dict[str, Path]
 
 
 def _run(workshop: Workshop) -> ResponseRun:
     need_real_time()
-    return ResponseRun(measure(workshop, "lockstep", TWINS), measure(workshop, "realtime", 0))
+    lockstep, realtime = measure(workshop, "lockstep", TWINS), measure(workshop, "realtime", 0)
+    drawn = workshop.shown(plot(realtime.response, workshop.folder / PICTURES))
+    return ResponseRun(lockstep, realtime, {"realtime": drawn})
 
 
 RESPONSE = Experiment("response", "holds and resumes by an operator", LASTS_S, ResponseRun, _run)
