@@ -322,7 +322,7 @@ ROWS = (
     Breaking("background", "cycles_late_share", TOO_LONG, alone=True),
     Breaking(
         "loosely-coupled",
-        "response_later_ms 0,",
+        "response_off_expected_ms 100,",
         {"brown": LOCKSTEP, "brown/servo": CABLE_OUT},
         2.0,
     ),
