@@ -35,8 +35,8 @@ from rack.tools.lab.reproduction.experiments.figures import (
     settings_of,
 )
 from rack.tools.lab.reproduction.experiments.nasrem import NASREM, NasremRun
-from rack.tools.lab.reproduction.page import Claim, Evidence, Section
-from rack.tools.lab.reproduction.verdict import Verdict
+from rack.tools.lab.reproduction.page import Evidence, PaperClaim, Section
+from rack.tools.lab.reproduction.verdict import ClaimVerdict
 
 
 def _equation(
@@ -45,11 +45,11 @@ def _equation(
     quote: str,
     config: str,
     settings: tuple[str, ...] = (),
-    judge: Callable[[NasremRun], Verdict] | None = None,
+    judge: Callable[[NasremRun], ClaimVerdict] | None = None,
     is_pictured: bool = False,
-) -> Claim:
+) -> PaperClaim:
     """Return an equation as a claim; it fails in this config with these settings."""
-    return Claim(
+    return PaperClaim(
         f"equation-{number}",
         f"Equation {number}: {form}",
         quote,
@@ -67,11 +67,11 @@ def _figure(
     quote: str,
     why: str,
     racks: tuple[FigureRack, ...],
-    judge: Callable[..., Verdict],
+    judge: Callable[..., ClaimVerdict],
     predict: Callable[[Workshop], tuple[Evidence, ...]] = lambda workshop: (),
-) -> Claim:
+) -> PaperClaim:
     """Return a claim on runs of figures, which the page shows."""
-    return Claim(
+    return PaperClaim(
         name,
         title,
         quote,
@@ -88,13 +88,13 @@ def _system(
     title: str,
     quote: str,
     rates_hz: dict[str, int],
-    judge: Callable[..., Verdict] = rules.judge_links,
+    judge: Callable[..., ClaimVerdict] = rules.judge_links,
     rack: str = "",
-) -> Claim:
+) -> PaperClaim:
     """Return a claim on one of the paper's systems, judged by the messages between its sides."""
     why = "Both sides worked together until the task was done."
     experiments = (tasks.TASKS[rack or name],)
-    return Claim(name, title, quote, why, experiments, partial(judge, rates_hz))
+    return PaperClaim(name, title, quote, why, experiments, partial(judge, rates_hz))
 
 
 HURRIED = ("timing.response_ms=1000",)
@@ -104,7 +104,7 @@ SECTIONS = (
         "abstract",
         "",
         (
-            Claim(
+            PaperClaim(
                 "determinism",
                 "Determinism is the measure",
                 "Determinism, not performance, is the key element in assessing a control model.",
@@ -127,7 +127,7 @@ SECTIONS = (
                 (FIG3, FIG4),
                 rules.judge_speedup,
             ),
-            Claim(
+            PaperClaim(
                 "growth",
                 "Modular growth",
                 "Multiprocessor systems are beneficial for many reasons, including ... modular"
@@ -136,7 +136,7 @@ SECTIONS = (
                 (sharing.CHAINS,),
                 rules.judge_growth,
             ),
-            Claim(
+            PaperClaim(
                 "replication",
                 "Reliability through replication",
                 "... reliability through replication ...",
@@ -144,7 +144,7 @@ SECTIONS = (
                 (),
                 rules.judge_replication,
             ),
-            Claim(
+            PaperClaim(
                 "communication",
                 "The cost of communication",
                 "The cost of communications must not negate the time savings obtained by parallel"
@@ -159,7 +159,7 @@ SECTIONS = (
         "2",
         "Concurrent Hierarchical Real-Time Control",
         (
-            Claim(
+            PaperClaim(
                 "figure-1",
                 "Figure 1: information flow",
                 "Figure 1 illustrates the information flow in the concurrent hierarchical model.",
@@ -167,7 +167,7 @@ SECTIONS = (
                 (NASREM,),
                 rules.judge_flow,
             ),
-            Claim(
+            PaperClaim(
                 "virtual-control-loop",
                 "The virtual control loop",
                 "Virtual control ... consists of the following periodic actions: 1) inputting"
@@ -177,7 +177,7 @@ SECTIONS = (
                 (NASREM,),
                 rules.judge_loop,
             ),
-            Claim(
+            PaperClaim(
                 "locks",
                 "lock; read; unlock",
                 "... lock and unlock are primitives that guarantee mutual exclusion.",
@@ -194,7 +194,7 @@ SECTIONS = (
                 (FIG2, FIG4),
                 rules.judge_both,
             ),
-            Claim(
+            PaperClaim(
                 "bounded-waits",
                 "A dead board or sensor does not stall the system",
                 "A level awaiting a reading from a failed sensor could loop forever.",
@@ -202,7 +202,7 @@ SECTIONS = (
                 (losses.KILLS, losses.SENSORS),
                 rules.judge_losses,
             ),
-            Claim(
+            PaperClaim(
                 "pipeline",
                 "Five levels take five cycles",
                 "It would take 5 control cycles for information from the top level to filter down"
@@ -217,7 +217,7 @@ SECTIONS = (
         "3",
         "Timing Analysis",
         (
-            Claim(
+            PaperClaim(
                 "soft-and-real-time",
                 "GOTO A, and GOTO A BY t",
                 "GOTO A BY t_i, GOTO B BY t_i+1 ... demands real time handling.",
@@ -301,7 +301,7 @@ SECTIONS = (
                 (BEHIND, IN_LINE),
                 rules.judge_background,
             ),
-            Claim(
+            PaperClaim(
                 "loosely-coupled",
                 "Loosely coupled machines above",
                 "Loosely-coupled machines could conceivably link together in a distributed"
@@ -318,7 +318,7 @@ SECTIONS = (
                 "nasrem",
                 ("board.primitive.rate_hz=60",),
             ),
-            Claim(
+            PaperClaim(
                 "waiting",
                 "Blocking, and polling the clock",
                 "The executor could busy/wait and poll on a system clock ... where the time for a"
@@ -430,7 +430,7 @@ SECTIONS = (
         "4",
         "Application of Concurrent Hierarchical Control",
         (
-            Claim(
+            PaperClaim(
                 "state-tables",
                 "The earlier controller: executors and state tables",
                 "The flow of control featured state-table transitions.",
@@ -438,7 +438,7 @@ SECTIONS = (
                 (tables.TABLES,),
                 rules.judge_tables,
             ),
-            Claim(
+            PaperClaim(
                 "nasrem",
                 "NASREM: four levels, 400 and 50 Hz",
                 "The executor [of the primitive level] runs at 50Hz ... the robot receives torque"
@@ -447,7 +447,7 @@ SECTIONS = (
                 (NASREM,),
                 rules.judge_levels,
             ),
-            Claim(
+            PaperClaim(
                 "context-switch",
                 "The context switch",
                 "Task-switching is approximately 100 microseconds.",
@@ -462,7 +462,7 @@ SECTIONS = (
                 {"workstation.plan": 1, "adapter.hand": 50, "adapter.world": 50},
                 rack="condor",
             ),
-            Claim(
+            PaperClaim(
                 "figure-5",
                 "Figure 5: concurrency by cycle time",
                 "Multitasking on a single processor supplies enough processing power for both the"
@@ -478,7 +478,7 @@ SECTIONS = (
         "4.1",
         "Comparison of Concurrent Hierarchical Control to Other Models",
         (
-            Claim(
+            PaperClaim(
                 "systems",
                 "The systems next to each other",
                 "These architectures share common characteristics with the concurrent,"
@@ -487,7 +487,7 @@ SECTIONS = (
                 (*systems.SYSTEMS, *tasks.TASKS.values()),
                 rules.judge_systems,
             ),
-            Claim(
+            PaperClaim(
                 "two-levels",
                 "At least two levels",
                 "Most systems have at least a two-level hierarchy.",
@@ -559,7 +559,7 @@ SECTIONS = (
         "5",
         "Conclusion",
         (
-            Claim(
+            PaperClaim(
                 "predictable-response",
                 "Predictable response",
                 "The regulated and predictable behavior of the virtual control loop leads to"

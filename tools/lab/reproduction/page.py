@@ -16,7 +16,7 @@ from pydantic import TypeAdapter
 
 from rack.tools.console.answer import Document
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Kept, Workshop
-from rack.tools.lab.reproduction.verdict import Check, Ruling, Verdict, describe_unmet
+from rack.tools.lab.reproduction.verdict import Check, ClaimVerdict, Ruling, describe_unmet
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class JudgedClaim:
 
 
 @dataclass(frozen=True)
-class Claim:
+class PaperClaim:
     """A claim of the paper, with its experiments and its rule.
 
     Attributes:
@@ -63,7 +63,7 @@ class Claim:
     quote: str
     why: str
     experiments: tuple[Experiment[Any], ...]
-    judge: Callable[..., Verdict]
+    judge: Callable[..., ClaimVerdict]
     predict: Callable[[Workshop], tuple[Evidence, ...]] = lambda workshop: ()
     is_pictured: bool = False
 
@@ -96,7 +96,7 @@ class Section:
 
     name: str
     title: str
-    claims: tuple[Claim, ...]
+    claims: tuple[PaperClaim, ...]
 
 
 @dataclass(frozen=True)

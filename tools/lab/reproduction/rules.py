@@ -35,8 +35,8 @@ from rack.tools.lab.reproduction.experiments.tasks import LATER_MS, NetworkRun, 
 from rack.tools.lab.reproduction.verdict import (
     STRAY,
     Check,
+    ClaimVerdict,
     Ruling,
-    Verdict,
     check_none,
     compare,
     describe_unmet,
@@ -64,7 +64,7 @@ FEW = 0.01
 ROUNDING_MS = 1e-6
 
 
-def judge_determinism(found: determinism.ComparedRuns) -> Verdict:
+def judge_determinism(found: determinism.ComparedRuns) -> ClaimVerdict:
     """Compare digests, and where runs diverge with where they first missed a deadline."""
     digest = found.runs[0].digest
     lockstep = [run for run in found.runs if run.mode == "lockstep"]
@@ -82,26 +82,26 @@ def judge_determinism(found: determinism.ComparedRuns) -> Verdict:
     return rule_on(*always, compare("realtime_runs_equal", equal, ">=", 1), here=always)
 
 
-def judge_speedup(one: FigureRun, two: FigureRun) -> Verdict:
+def judge_speedup(one: FigureRun, two: FigureRun) -> ClaimVerdict:
     """Compare the plans of the same level on one processor and on two."""
     alone, both = (run.tasks[PLANNER].jobs for run in (one, two))
     needs = [compare("plans_on_one_processor", alone, ">=", 1)]
     return rule_on(compare("plans_on_two_processors", both, ">", alone), needs=needs)
 
 
-def judge_growth(found: Chains) -> Verdict:
+def judge_growth(found: Chains) -> ClaimVerdict:
     """Count missed cycles after boards were added: none has more to do for it."""
     grown = found.grown
     on_time = compare("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
     return rule_strays("cycles_missed", grown.missed, grown.due, on_time)
 
 
-def judge_locks(found: Chains) -> Verdict:
+def judge_locks(found: Chains) -> ClaimVerdict:
     """Count missed cycles of boards that lock, read and unlock as the paper's do."""
     return rule_strays("cycles_missed", found.locked.missed, found.locked.due)
 
 
-def judge_pipeline(found: Chains) -> Verdict:
+def judge_pipeline(found: Chains) -> ClaimVerdict:
     """Compare the cycles that messages took with the number of levels."""
     exact, real = found.lockstep.took, found.realtime.took
     sent, arrived = sum(exact.values()), sum(real.values())
@@ -119,12 +119,12 @@ def judge_pipeline(found: Chains) -> Verdict:
     )
 
 
-def judge_replication() -> Verdict:
+def judge_replication() -> ClaimVerdict:
     """Refuse to rule: no experiment replaces a board by a replica."""
     return rule_on(needs=[compare("replicas", 0, ">=", 1)])
 
 
-def judge_communication(found: NasremRun, partitions: partition.Partitions) -> Verdict:
+def judge_communication(found: NasremRun, partitions: partition.Partitions) -> ClaimVerdict:
     """Compare the processor time of communication with what a second processor takes off one, ms a
     second."""
     communication = sum(
@@ -137,7 +137,7 @@ def judge_communication(found: NasremRun, partitions: partition.Partitions) -> V
     return rule_on(compare("communication_ms_per_s", communication, "<", saved))
 
 
-def judge_flow(found: NasremRun) -> Verdict:
+def judge_flow(found: NasremRun) -> ClaimVerdict:
     """Compare the commands and statuses of the levels with what the ticks of their writers
     demand."""
     ways = [
@@ -152,14 +152,14 @@ def judge_flow(found: NasremRun) -> Verdict:
     return rule_strays("messages_lacking", lacking, due, compare("ways", used, "=", len(ways)))
 
 
-def judge_loop(found: NasremRun) -> Verdict:
+def judge_loop(found: NasremRun) -> ClaimVerdict:
     """Compare the cycles that missed their bound with all."""
     tasks = found.executors.values()
     bad = sum(task.missed + task.skipped for task in tasks)
     return rule_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
-def judge_losses(*runs: losses.LossesRun) -> Verdict:
+def judge_losses(*runs: losses.LossesRun) -> ClaimVerdict:
     """Compare when each loss was detected and over with its bounds."""
     faults = [fault for run in runs for fault in run.faults]
     lacking = check_none(
@@ -171,7 +171,7 @@ def judge_losses(*runs: losses.LossesRun) -> Verdict:
     return rule_on(compare("losses", struck, "=", len(faults)), *lacking)
 
 
-def judge_goto(found: deadline.GotoRuns) -> Verdict:
+def judge_goto(found: deadline.GotoRuns) -> ClaimVerdict:
     """Compare when A was done with the time by which it was promised, s."""
     early, met = found.early, found.met
     begun = early.moved + (early.done_s is not None)
@@ -190,7 +190,7 @@ def check_equations(verdicts: Iterable[EquationVerdict]) -> list[Check]:
     return checks
 
 
-def judge_equation(number: str, found: NasremRun) -> Verdict:
+def judge_equation(number: str, found: NasremRun) -> ClaimVerdict:
     """Compare both sides in the worst cycle of every subject; within bounds, in 99 of 100
     cycles."""
     verdicts = [one for one in found.verdicts if one.measured.equation == number]
@@ -201,7 +201,7 @@ def judge_equation(number: str, found: NasremRun) -> Verdict:
     )
 
 
-def judge_sum(found: NasremRun) -> Verdict:
+def judge_sum(found: NasremRun) -> ClaimVerdict:
     """Compare the longest responses with the sum alone, ms; within bounds, with the sum and its
     waits, which a missed cycle may prolong."""
     ways = {"command_ms": found.response.command, "status_ms": found.response.status}
@@ -219,7 +219,7 @@ def judge_sum(found: NasremRun) -> Verdict:
     )
 
 
-def judge_background(behind: FigureRun, in_line: FigureRun) -> Verdict:
+def judge_background(behind: FigureRun, in_line: FigureRun) -> ClaimVerdict:
     """Count the cycles that are late while a level stores data in the background, and compare with
     storing in the cycle."""
     stored = [
@@ -231,7 +231,7 @@ def judge_background(behind: FigureRun, in_line: FigureRun) -> Verdict:
     return rule_on(*late, *stored, here=[share, *stored])
 
 
-def judge_loose(plain: NetworkRun, later: NetworkRun) -> Verdict:
+def judge_loose(plain: NetworkRun, later: NetworkRun) -> ClaimVerdict:
     """Compare the servo rack's cycles, and when it responds to the machine above, with a network
     and with a slower one."""
     runs = plain, later
@@ -247,18 +247,18 @@ def judge_loose(plain: NetworkRun, later: NetworkRun) -> Verdict:
     return rule_on(*check_none(servo_missed_share=missed), *always, here=[share, *always])
 
 
-def judge_waits(found: Waits) -> Verdict:
+def judge_waits(found: Waits) -> ClaimVerdict:
     """Compare how late cycles start after polling, and after blocking, us."""
     blocks, polls = (found.late_us[wake]["p50"] for wake in ("signal", "poll"))
     return rule_on(compare("polling_late_median_us", polls, "<", blocks))
 
 
-def judge_update(found: FigureRun) -> Verdict:
+def judge_update(found: FigureRun) -> ClaimVerdict:
     """Count updates of a plan in which the executor began, of those that its release met."""
     return rule_strays("updates_preempted", found.preempted, found.met)
 
 
-def judge_both(*runs: FigureRun) -> Verdict:
+def judge_both(*runs: FigureRun) -> ClaimVerdict:
     """Compare the executors' late cycles with all, in runs in which planners made plans."""
     late = sum(run.tasks[LEVEL].late for run in runs)
     due = sum(run.tasks[LEVEL].jobs for run in runs)
@@ -278,13 +278,13 @@ def _undisturbed(found: FigureRun) -> list[Check]:
     return [compare("executor_late_share", late, "<=", STRAY)] if late <= MOSTLY else []
 
 
-def judge_working(found: FigureRun) -> Verdict:
+def judge_working(found: FigureRun) -> ClaimVerdict:
     """Rule on a figure of which the paper says that it works."""
     late = check_none(late=sum(count.late for count in found.tasks.values()))
     return rule_on(*late, here=[_compare_late(found, "<=")], needs=_undisturbed(found))
 
 
-def judge_failing(found: FigureRun, *shorter: FigureRun) -> Verdict:
+def judge_failing(found: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
     """Rule on a figure of which the paper says that it fails, with the shortest X that the paper
     permits too."""
     usual = _compare_late(found, ">")
@@ -302,7 +302,7 @@ def check_planning(one: Planning) -> tuple[Check, Check]:
     )
 
 
-def judge_sweep(short: FigureRun, long: FigureRun) -> Verdict:
+def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
     """Compare two sentences of the paper with each other, by computation and by two runs."""
     odd = sum(bool(describe_unmet(check_planning(one))) for one in sweep(FIG2.config, PAPER_X))
     return rule_on(
@@ -313,7 +313,7 @@ def judge_sweep(short: FigureRun, long: FigureRun) -> Verdict:
     )
 
 
-def judge_tables(found: tables.TableRuns) -> Verdict:
+def judge_tables(found: tables.TableRuns) -> ClaimVerdict:
     """Compare the state transitions of a run with a disturbance with those of a run without."""
     runs = found.disturbed, found.undisturbed
     disturbed, usual = (
@@ -325,7 +325,7 @@ def judge_tables(found: tables.TableRuns) -> Verdict:
     )
 
 
-def judge_levels(found: NasremRun) -> Verdict:
+def judge_levels(found: NasremRun) -> ClaimVerdict:
     """Compare the rates of the levels with the paper's, or else with the config's, and the gaps
     between their cycles with two periods: from there on a cycle was left out."""
     config = load(NAME)
@@ -343,7 +343,7 @@ def judge_levels(found: NasremRun) -> Verdict:
     return rule_on(*rates, *gaps, here=rates)
 
 
-def judge_switch(found: SwitchRun) -> Verdict:
+def judge_switch(found: SwitchRun) -> ClaimVerdict:
     """Compare this machine's switch with the paper's, and with what the config assumes, us."""
     times_us = found.cost.switch_us
     return rule_on(
@@ -353,7 +353,7 @@ def judge_switch(found: SwitchRun) -> Verdict:
     )
 
 
-def judge_figure_5(found: partition.Partitions) -> Verdict:
+def judge_figure_5(found: partition.Partitions) -> ClaimVerdict:
     """Compare what levels miss by partition: do slow levels do with multitasking, and do fast ones
     need more?"""
     places = figure5.placed(load(NAME))
@@ -380,7 +380,7 @@ def judge_figure_5(found: partition.Partitions) -> Verdict:
     )
 
 
-def judge_systems(*each: SystemFigures | TaskRun) -> Verdict:
+def judge_systems(*each: SystemFigures | TaskRun) -> ClaimVerdict:
     """Compare the responses of all systems with their bounds, ms; a missed cycle may prolong them.
 
     Their whole tasks are done in real time.
@@ -413,7 +413,7 @@ def _check_responses(one: SystemFigures) -> Iterator[Check]:
         yield compare(f"{one.rack}_hold_ms", ran.hold.measured_ms, "<=", most_ms)
 
 
-def judge_layers(promised: Mapping[str, SystemPrediction]) -> Verdict:
+def judge_layers(promised: Mapping[str, SystemPrediction]) -> ClaimVerdict:
     """Count levels, and the systems in which a level is faster than one below it."""
     inverted = sum(sorted(said.rates_hz) != list(said.rates_hz) for said in promised.values())
     levels = (
@@ -422,7 +422,7 @@ def judge_layers(promised: Mapping[str, SystemPrediction]) -> Verdict:
     return rule_on(*levels, *check_none(systems_with_a_faster_level_above=inverted))
 
 
-def judge_links(rates_hz: Mapping[str, int], found: TaskRun) -> Verdict:
+def judge_links(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
     """Compare what passed between the sides of a system with what its rates demand.
 
     Args:
@@ -432,7 +432,7 @@ def judge_links(rates_hz: Mapping[str, int], found: TaskRun) -> Verdict:
     return rule_on(*_check_links(rates_hz, found))
 
 
-def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> Verdict:
+def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
     """Judge RCCL's links as others; for it to hold, every joint has a processor, too."""
     links = _check_links(rates_hz, found)
     joints = [task.core for task in wire(load("rccl")).tasks if task.board.startswith("joint")]
@@ -451,7 +451,7 @@ def _check_links(rates_hz: Mapping[str, int], found: TaskRun) -> list[Check]:
     return checks
 
 
-def judge_predictable(found: response.ResponseRun) -> Verdict:
+def judge_predictable(found: response.ResponseRun) -> ClaimVerdict:
     """Compare responses with the tick predicted, and with equations 3.2 and 3.3; within bounds,
     with the longest that the grid permits instead of the sum of eq. 3.3."""
     exact, real = found.lockstep, found.realtime.response

@@ -56,7 +56,7 @@ def describe_unmet(checks: Iterable[Check]) -> str:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ClaimVerdict:
     """A ruling with the comparisons from which it results."""
 
     ruling: Ruling
@@ -73,7 +73,7 @@ def rule_on(
     here: Sequence[Check] = (),
     needs: Sequence[Check] = (),
     holding: Ruling = Ruling.HOLDS,
-) -> Verdict:
+) -> ClaimVerdict:
     """Rule on a claim by comparisons alone.
 
     Args:
@@ -94,10 +94,10 @@ def rule_on(
         ruling = Ruling.BOUNDED
     else:
         ruling = Ruling.FAILS
-    return Verdict(ruling, tuple(dict.fromkeys((*needs, *claim, *here))))
+    return ClaimVerdict(ruling, tuple(dict.fromkeys((*needs, *claim, *here))))
 
 
-def rule_strays(name: str, bad: int, due: int, *needs: Check) -> Verdict:
+def rule_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
     """Rule on something that must not happen; within bounds if at most a stray share did."""
     share = compare(f"{name}_share", bad / max(due, 1), "<=", STRAY)
     needs = *needs, compare(f"{name}_of", due, ">=", 1)

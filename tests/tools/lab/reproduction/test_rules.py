@@ -35,7 +35,7 @@ from rack.tools.lab.reproduction.experiments.tables import FiredRow, TableRun, T
 from rack.tools.lab.reproduction.experiments.tasks import NetworkRun
 from rack.tools.lab.reproduction.reproduction import SECTIONS, list_experiments, select_sections
 from rack.tools.lab.reproduction.rules import DONE
-from rack.tools.lab.reproduction.verdict import Ruling, Verdict, describe_unmet
+from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
 from rack.tools.recording.divergence import Difference
 from rack.tools.timing.charts.panel import Count
 
@@ -77,7 +77,7 @@ def test_each_equation_holds_in_nasrem_and_fails_in_the_rack_that_is_to_show_it(
         assert describe_unmet(failing.checks)
 
 
-def rule_on(name: str, *found: Any) -> Verdict:
+def rule_on(name: str, *found: Any) -> ClaimVerdict:
     """Return the verdict on a claim by results as they are read from their files."""
     claim = CLAIMS[name]
     pairs = list(zip(claim.experiments, found, strict=True))

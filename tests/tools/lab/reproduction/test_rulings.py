@@ -31,9 +31,9 @@ from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import settings_of
 from rack.tools.lab.reproduction.experiments.nasrem import SystemResponse
 from rack.tools.lab.reproduction.experiments.sharing import WAITS
-from rack.tools.lab.reproduction.page import Claim
+from rack.tools.lab.reproduction.page import PaperClaim
 from rack.tools.lab.reproduction.rules import judge_layers
-from rack.tools.lab.reproduction.verdict import Ruling, Verdict, describe_unmet
+from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
 from rack.tools.timing.analysis.analysis import Analysis
 from tests.tools.lab.reproduction.breaking import CHAIN, BreakingWorkshop
 from tests.tools.lab.reproduction.test_rules import CLAIMS, RUN
@@ -145,12 +145,12 @@ for = "50ms"
 """Short scripts in place of those of whole tasks."""
 
 
-Judge = Callable[[BreakingWorkshop, Claim], Verdict]
+Judge = Callable[[BreakingWorkshop, PaperClaim], ClaimVerdict]
 FOUND: dict[tuple[str, str], Any] = {}
 """What experiments have found, by their names and the racks: claims share some."""
 
 
-def by_experiments(workshop: BreakingWorkshop, claim: Claim) -> Verdict:
+def by_experiments(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
     """Return the ruling on what all experiments of a claim find."""
     found = []
     for one in claim.experiments:
@@ -168,7 +168,7 @@ IN_LOCKSTEP = ("clock.mode=lockstep",)
 def by_equation(rack: str, settings: tuple[str, ...] = IN_LOCKSTEP) -> Judge:
     """Return a judge of an equation by a run of another rack than NASREM's."""
 
-    def judge(workshop: BreakingWorkshop, claim: Claim) -> Verdict:
+    def judge(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
         run = workshop.run(rack, workshop.config(rack, settings)).recording
         analysis = Analysis.of(run)
         found = replace(RUN, verdicts=tuple(nasrem._verdicts(analysis)))
@@ -180,7 +180,7 @@ def by_equation(rack: str, settings: tuple[str, ...] = IN_LOCKSTEP) -> Judge:
     return judge
 
 
-def with_polling_later(workshop: BreakingWorkshop, claim: Claim) -> Verdict:
+def with_polling_later(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
     """Return the ruling on a run in which polling is given the later times: no rack makes it so,
     and on some machines it is so by itself."""
     found = WAITS.make(workshop)
