@@ -12,7 +12,6 @@ from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
     FigureRack,
     FigureRun,
-    PatternCount,
     planning,
     sweep,
 )
@@ -62,8 +61,7 @@ def test_figure_4_has_no_idle_time_with_the_longest_x() -> None:
 def ran(late: int, jobs: int = 100) -> FigureRun:
     """Return what a run of a figure leaves, with so many late plans."""
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
-    patterns = (PatternCount("level", "R X W P | R X W P U -", jobs),)
-    return FigureRun(counts, patterns, {}, 0, 0, {"measured": Path("pictures/x.svg")})
+    return FigureRun(counts, 0, 0, {"measured": Path("pictures/x.svg")})
 
 
 @pytest.mark.parametrize(

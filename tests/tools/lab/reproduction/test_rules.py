@@ -43,13 +43,9 @@ CLAIMS = {claim.name: claim for section in SECTIONS for claim in section.claims}
 NUMBERS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
 EQUATIONS = [f"equation-3.{number}" for number in range(1, 11)]
 HOLDS, BOUNDED, FAILS = Ruling.HOLDS, Ruling.BOUNDED, Ruling.FAILS
-NO_TIMES = Percentiles(1.0, 2.0, 3.0)
-WAY = WayResponse(4.0, NO_TIMES, ())
-RUN = NasremRun(
-    *("task done", 800, {}, (), {}, {}),
-    SystemResponse(("task", "servo"), 4.0, 4.0, WAY, WAY),
-    *((), {}, {}),
-)
+NO_TIMES = Percentiles(1.0, 3.0)
+WAY = WayResponse(NO_TIMES, ())
+RUN = NasremRun("task done", 800, (), {}, SystemResponse(4.0, WAY, WAY), (), {})
 
 
 def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_order() -> None:
@@ -89,7 +85,7 @@ def rule_on(name: str, *found: Any) -> ClaimVerdict:
 def compared(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> Any:
     """Return a run of which the digest counts."""
     difference = None if differs is None else Difference(differs, "servo.status")
-    return ComparedRun(mode, mode, digest, 1.0, 5, int(miss is not None), miss, difference)
+    return ComparedRun(mode, digest, miss, difference)
 
 
 def determined(*runs: ComparedRun, second: str = "a") -> ComparedRuns:
@@ -128,7 +124,7 @@ def tables(*rows: str, worked: bool = True) -> TableRuns:
 def background(late: int, blocks: int, in_line: int) -> tuple[FigureRun, FigureRun]:
     """Return a level of 100 cycles that stores blocks in the background, and in the cycle."""
     behind, line = (
-        FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, (), {}, 0, 0, {})
+        FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, 0, 0, {})
         for bad in (late, in_line)
     )
     return behind, line
@@ -174,9 +170,8 @@ def equation(holds: bool, mostly: bool) -> NasremRun:
 def response(*delays: str) -> NasremRun:
     """Return a run in which commands took 6 ms instead of the 4 ms of equation 3.3, with responses
     beyond the grid, if any, delayed by these."""
-    late = WayResponse(
-        8.0, replace(NO_TIMES, max=6.0), tuple({"delayed_by": [delay]} for delay in delays)
-    )
+    beyond = tuple({"delayed_by": [delay]} for delay in delays)
+    late = WayResponse(replace(NO_TIMES, max=6.0), beyond)
     return replace(RUN, response=replace(RUN.response, command=late))
 
 

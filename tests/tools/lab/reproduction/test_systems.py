@@ -31,10 +31,8 @@ def test_what_a_config_promises_is_read_from_it_alone() -> None:
     found = prediction(config)
     assert found.levels == ("task", "elemental_move", "primitive", "servo")
     assert found.rates_hz == pytest.approx((1, 4, 50, 400))
-    # Slots 2 to 7, one of them a planner's.
-    assert (found.boards, found.hosts) == (6, 0)
-    assert (found.longest_cycle_ms, found.bound_ms, found.sum_ms) == (1000, 4000, 1272.5)
-    assert found.fits
+    # The sum of the cycles, 1272.5 ms, and 10 ms until the primitive level's next read.
+    assert (found.command_ms, found.status_ms) == (1282.5, 2280.0)
 
 
 def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: Path) -> None:
@@ -42,13 +40,7 @@ def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: P
     path.write_text(PLAIN.replace('below = "wave"', 'reads = { status = "wave.status" }'))
     config = load(path)
     found = prediction(config)
-    assert (found.levels, found.rates_hz, found.longest_cycle_ms, found.command_ms, found.fits) == (
-        (),
-        (),
-        0,
-        0,
-        None,
-    )
+    assert (found.levels, found.rates_hz, found.command_ms) == ((), (), 0)
     assert hold_for(config, 10.0) is None
 
 

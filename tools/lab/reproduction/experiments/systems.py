@@ -39,41 +39,23 @@ ROUNDING_MS = 1e-6
 @dataclass(frozen=True)
 class SystemPrediction:
     """What a config promises, times in ms. `levels` are those of its longest response, the highest
-    first.
-
-    `boards` are the slots that it takes besides the clock's, `hosts` its boards without real time.
-    `fits` is None without a budget.
-    """
+    first."""
 
     levels: tuple[str, ...]
-    boards: int
-    hosts: int
     rates_hz: tuple[float, ...]
-    longest_cycle_ms: float
-    bound_ms: float
-    sum_ms: float
     command_ms: float
     status_ms: float
-    fits: bool | None
 
 
 def prediction(config: RackConfig) -> SystemPrediction:
     """Return what a config promises."""
-    layout = wire(config)
-    timing = rack_timing(config, layout)
-    forecast = Forecast.of(timing)
-    hierarchy = timing.hierarchy
+    timing = rack_timing(config, wire(config))
+    response = Forecast.of(timing).system
     return SystemPrediction(
-        levels=hierarchy.levels,
-        boards=len({task.slot for task in layout.tasks}),
-        hosts=len(config.host),
-        rates_hz=tuple(1e9 / (every * timing.clock_ns) for every in hierarchy.cycles),
-        longest_cycle_ms=max(hierarchy.cycles, default=0) * timing.clock_ns * 1e-6,
-        bound_ms=forecast.system.bound_eq_3_2_ms,
-        sum_ms=forecast.system.sum_eq_3_3_ms,
-        command_ms=forecast.system.command_ms,
-        status_ms=forecast.system.status_ms,
-        fits=forecast.holds if forecast.levels else None,
+        levels=timing.hierarchy.levels,
+        rates_hz=tuple(1e9 / (every * timing.clock_ns) for every in timing.hierarchy.cycles),
+        command_ms=response.command_ms,
+        status_ms=response.status_ms,
     )
 
 
