@@ -432,7 +432,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--only", nargs="+", default=PACKAGES, metavar="PATH", help="files or folders")
+    parser.add_argument(
+        "--only", nargs="+", default=PACKAGES, metavar="PATH", help="files or folders"
+    )
     options = parser.parse_args()
     paths = [ROOT / name for name in options.only]
     files = sorted(

@@ -100,7 +100,7 @@ class ClockConfig(Table):
     idle_cores: Literal["sleep", "awake"] = "sleep"
     """in real time, idle cores sleep or are held awake, which root alone may do; awake: wake-ups
     are earlier by some 20 us on bare metal; a virtual machine may lose its cores for ms; see rack
-    bench clock"""
+    bench machine"""
     core: Core = 0
     """core of the system controller"""
     priority: Priority = 0

@@ -29,7 +29,7 @@ COMMANDS = (
     ("command", LONG, "task", "hold"),
     ("inject", "fig2", LONG, "kill"),
     ("report", LONG),
-    ("bench", "partition", LONG),
+    ("bench", "machine", LONG),
     (LONG,),
 )
 

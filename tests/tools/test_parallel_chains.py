@@ -11,7 +11,7 @@ import pytest
 from rack.boards.config import load
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.lockstep import differences, run_bare
-from rack.tools.lab.benches.response import run_commands
+from rack.tools.lab.benches.observed import record
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
@@ -98,7 +98,7 @@ def test_a_slower_joint_has_a_response_of_its_own(
     jointed: Path, rack_name: str, tmp_path: Path
 ) -> None:
     config = load(jointed, [f"name={rack_name}", "board.joint2.rate_hz=100"])
-    recording = run_commands(config, (), tmp_path / "run", 1.0)
+    recording = record(config, 1.0, tmp_path / "run").recording
     first = write_report(recording.folder)[0]["system_response"]
     (other,) = first["others"]
     assert first["levels"] == ["path", "joint2", "arm"]
@@ -132,7 +132,7 @@ def test_the_levels_alone_write_what_they_write_in_the_rack(
     jointed: Path, rack_name: str, tmp_path: Path
 ) -> None:
     config = load(jointed, [f"name={rack_name}"])
-    recording = run_commands(config, (), tmp_path / "run", 0.5)
+    recording = record(config, 0.5, tmp_path / "run").recording
     bare = apart(run_bare, config, 200)
     assert list(differences(recording, bare)) == []
 

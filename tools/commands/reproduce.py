@@ -4,6 +4,7 @@ machine."""
 from __future__ import annotations
 
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +13,12 @@ import typer
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json
-from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.live.folder import RUNS
 
 PAGE = RUNS / "paper"
 """Where the page is made unless a folder is given: always the same one, so that the command
 continues."""
+NO_LAB = "the page needs jinja2 and matplotlib: pip install 'nasrem-rack[lab]'"
 STAYS = "{}: what is finished is kept; the same command goes on from there"
 
 Out = Annotated[
@@ -53,9 +54,9 @@ def reproduce(
     """Reproduce the paper on this machine, and write a page that goes through it claim by claim.
 
     The paper is NISTIR 90-4251 (1990). Each claim, equation and figure is given in its words, with
-    the prediction of the timing model, a measurement on real processes with its picture, and a
-    ruling: it holds; it holds here, within bounds; the paper contradicts itself; it is not testable
-    here; or it does not hold here.
+    what the timing model predicts of it, what real processes have shown, and a ruling: it holds; it
+    holds here, within bounds; the paper contradicts itself; it is not testable here; or it does not
+    hold here.
 
     The page is DIR/index.html, self-contained, and DIR/README.md with its pictures next to it.
     DIR/paper.json has everything as data, DIR/runs the recordings: `rack report`, `rack gantt` and
@@ -78,24 +79,21 @@ def reproduce(
       rack reproduce --only 3.4 --again
       rack reproduce --json | jq .rulings
     """
+    if not all(map(find_spec, ("jinja2", "matplotlib"))):
+        raise Failure(NO_LAB, 2)
     from rack.tools.console.progress import progress_for
     from rack.tools.lab.reproduction import reproduction
     from rack.tools.lab.reproduction.experiments.experiment import Workshop
 
-    wanted = reproduction.chapters_named(only)
+    wanted = reproduction.select_sections(only)
     if out.exists() and not out.is_dir():
         raise Failure(f"--out {out}: exists, and is not a folder", 2)
-    if not can_draw():
-        raise Failure(NO_PICTURES, 2)
-    if again:
-        reproduction.forget(wanted, out)
     with (
         INTERRUPT.orderly(INTERRUPT.end, unfinished=STAYS.format(out)),
         progress_for(as_json) as progress,
     ):
-        page = reproduction.reproduce(wanted, Workshop(out, share), progress)
-    is_good = reproduction.worked(page, wanted)
-    print_answer(
-        reproduction.document(page, out, is_good), reproduction.summary(page, out), as_json
-    )
+        page = reproduction.reproduce(wanted, Workshop(out, share), progress, again)
+    is_good = reproduction.has_worked(page, wanted)
+    document = {"folder": str(out), "worked": is_good, **page.document()}
+    print_answer(document, reproduction.summarize(page, out), as_json)
     sys.exit(0 if is_good else 1)

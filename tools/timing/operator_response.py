@@ -255,7 +255,7 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
     if response is None:
         why = "no operator commanded a level of its hierarchy"
         raise Failure(
-            f"{recording.folder}: {why}; see 'rack command', [[command]] and 'rack bench response'",
+            f"{recording.folder}: {why}; see 'rack command' and [[command]]",
             2,
         )
     folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,7 @@ import pytest
 from rack.boards.config import load
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.response import run_commands
+from rack.tools.lab.benches.observed import record, with_commands
 from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
 from tests.boards.commanded_racks import COMMANDED
 
@@ -27,7 +27,7 @@ def config(rack_name: str, tmp_path: Path) -> MakeConfig:
 
 
 def measured(config: RackConfig, folder: Path, *given: CommandConfig) -> OperatorResponse:
-    response = response_of(run_commands(config, given, folder, 1.0))
+    response = response_of(record(with_commands(config, given), 1.0, folder).recording)
     assert response is not None
     return response
 
@@ -95,7 +95,7 @@ def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorRes
 
 @pytest.mark.slow
 def test_a_run_without_commands_has_no_response(config: MakeConfig, tmp_path: Path) -> None:
-    recording = run_commands(config(), (), tmp_path / "run", 0.5)
+    recording = record(config(), 0.5, tmp_path / "run").recording
     assert response_of(recording) is None
     with pytest.raises(Failure, match="no operator commanded a level"):
         show(recording, tmp_path, as_json=False)

@@ -7,7 +7,6 @@ and its libraries.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Mapping
@@ -52,12 +51,6 @@ class RackCommand:
             why = last_line(done.stderr, f"exit status {done.returncode}")
             raise Failure(f"{called}: {why}")
         return done.stdout
-
-    def tick_us(self, config: object, *options: object, bound_s: float) -> float:
-        """Return the time of a tick of a rack in lockstep, us. Raises `Failure` as `run`."""
-        words = ("run", config, "--lockstep", "--no-record", "--json", *options)
-        found = json.loads(self.run(*words, bound_s=bound_s))
-        return float(found["wall_s"] * 1e6 / found["outcome"]["ticks"])
 
 
 def rack_commands(against: Path | None) -> list[RackCommand]:

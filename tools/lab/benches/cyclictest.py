@@ -9,18 +9,15 @@ time.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar
+from typing import NamedTuple
 
 import numpy as np
 
 from rack.backplane.process import set_priority
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import decimal
-from rack.tools.lab.benches.chart import BASELINE, Series
 from rack.tools.lab.benches.harness import Absent, absent_program, finished
 
 CYCLICTEST = "cyclictest"
@@ -28,31 +25,17 @@ LONGEST_US = 100_000
 """Largest lateness that has a place of its own in the histogram; one beyond it counts as the
 maximum."""
 PATIENCE_S = 30.0
-"""Time that a peer may take in addition to its wakes."""
+"""Time that it may take in addition to its wakes."""
 
 
-@dataclass(frozen=True)
-class WakeGrid:
-    """Points in time to sleep to: `wakes` of them, `period_ns` apart.
+class WakeGrid(NamedTuple):
+    """Points in time to sleep to on `core`: `wakes` of them, `period_ns` apart, at a `priority` of
+    SCHED_FIFO."""
 
-    The first of `cores` has the sleeper; `cyclictest` has one on each. `priority` is of SCHED_FIFO.
-    """
-
-    cores: tuple[int, ...]
+    core: int
     period_ns: int
     wakes: int
     priority: int
-
-    @classmethod
-    def at(cls, cores: Iterable[int], rate_hz: float, seconds: float, priority: int) -> WakeGrid:
-        """Return the points of a rate for a time."""
-        wakes = max(1, round(seconds * rate_hz))
-        return cls(tuple(sorted(cores)), round(1e9 / rate_hz), wakes, priority)
-
-    @property
-    def patience_s(self) -> float:
-        """Longest time that a program may take over it."""
-        return self.wakes * self.period_ns * 1e-9 + PATIENCE_S
 
 
 def absent_cyclictest() -> tuple[Absent, ...]:
@@ -63,87 +46,42 @@ def absent_cyclictest() -> tuple[Absent, ...]:
     return (Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)"),)
 
 
-def misses_count(absent: Sequence[Absent]) -> Iterator[str]:
-    """Yield what the absence of `cyclictest` means."""
-    for each in absent:
-        yield f"{each.line}; every miss counts against the rack"
-
-
 def permits_fifo() -> bool:
-    """Say whether this process may take a real-time priority."""
+    """Return whether this process may take a real-time priority."""
     return set_priority(1) and set_priority(0)
 
 
 def cyclictest(grid: WakeGrid) -> np.ndarray:
-    """Return the lateness of every wake, us, shape (n,): smallest first, a thread at a time.
+    """Return the lateness of every wake, us, shape (n,), smallest first.
 
-    It leaves idle cores as they are, as a rack does by default (`--laptop`). Raises `Failure` if it
-    cannot run.
+    It leaves idle cores as they are, as a rack does by default (`--laptop`).
+
+    Raises:
+        Failure: If it cannot run.
     """
     with TemporaryDirectory(prefix="rack-bench-") as folder:
         path = Path(folder) / "found.json"
-        command = [CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo", "--laptop"]
-        command += [f"--affinity={','.join(map(str, grid.cores))}", f"--threads={len(grid.cores)}"]
-        command += [
+        command = [
+            *(CYCLICTEST, "--quiet", "--mlockall", "--policy=fifo", "--laptop", "--threads=1"),
+            f"--affinity={grid.core}",
             f"--priority={grid.priority}",
             f"--interval={grid.period_ns // 1000}",
-            "--distance=0",
+            f"--loops={grid.wakes}",
+            f"--histogram={LONGEST_US}",
+            f"--json={path}",
         ]
-        command += [f"--loops={grid.wakes}", f"--histogram={LONGEST_US}", f"--json={path}"]
-        done = finished(CYCLICTEST, command, grid.patience_s)
+        bound_s = grid.wakes * grid.period_ns * 1e-9 + PATIENCE_S
+        done = finished(CYCLICTEST, command, bound_s)
         if done.returncode or not path.is_file():
             status = f"exit status {done.returncode}, and no figures"
             raise Failure(f"{CYCLICTEST}: {' '.join(done.stderr.split()) or status}")
-        threads = json.loads(path.read_text())["thread"].values()
-    return np.concatenate([_lateness_us(thread) for thread in threads])
-
-
-def _lateness_us(thread: dict[str, Any]) -> np.ndarray:
+        (thread,) = json.loads(path.read_text())["thread"].values()
     counts = thread["histogram"]
     beyond = thread["cycles"] - sum(counts.values())
     return np.repeat([*map(float, counts), float(thread["max"])], [*counts.values(), beyond])
 
 
-BEYOND = 0.001
-"""Share of missed cycles, beyond those of the machine, up to which a rate counts as held."""
-
-
-class MissesBeyond:
-    """Base of figures whose misses are judged by those of `cyclictest` in the same minutes; all are
-    shares."""
-
-    DERIVED: ClassVar[tuple[str, ...]] = ("beyond", "held")
-
-    missed: float
-    late: float | None  # of cyclictest's wakes, by a cycle or more; None: it is absent
-
-    @property
-    def beyond(self) -> float:
-        """Share missed beyond what the machine itself breaks."""
-        return self.missed - (self.late or 0.0)
-
-    @property
-    def held(self) -> bool:
-        """Whether the rate is held."""
-        return self.beyond <= BEYOND
-
-    def cells(self, digits: int = 3) -> list[str]:
-        """Return cells of a table: shares missed, late, and missed beyond, %."""
-        late = None if self.late is None else 100 * self.late
-        return [decimal(part, digits) for part in (100 * self.missed, late, 100 * self.beyond)]
-
-
-def missed_by(places: Sequence[float], figures: Sequence[MissesBeyond]) -> list[Series]:
-    """Return the series of what was missed, and late of `cyclictest`, by rate or number."""
-    missed = [100 * one.missed for one in figures]
-    late = [100 * one.late for one in figures if one.late is not None]
-    series = [Series("rack: missed", places, missed, "o-")]
-    if late:
-        series.append(Series("cyclictest: late by a cycle", places, late, "s-", BASELINE))
-    return series
-
-
-def overdue(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
+def late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
     """Return the share of grid points at which a sleeper was late by a cycle or more, those it
     skipped included; `runs` have the lateness of its wakes, us. None without any run."""
     if not runs:

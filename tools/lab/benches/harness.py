@@ -1,14 +1,13 @@
 """What the benches of `rack bench` share. Each answers one question of a user, which its help says.
 
-A bench is a function `measure(..., progress)` that returns a `BenchResult`: a record of what it has
+A bench is a function `measure(..., progress)` that returns a `Comparison`: a record of what it has
 found. `show` calls it, with the progress on the terminal, and prints the record as text or as one
-JSON document; with --plot it also writes pictures, whose panels are data (see `chart`).
+JSON document.
 
 A machine's speed drifts by a factor of two within a day, so no time means much alone. Contestants
 are measured by turns (`interleaved`) in an order that changes from round to round, and each is
-judged by the ratio of its median to that of the baseline in the same case. A `Comparison` is the
-record of a bench for which that is all. A peer that this machine lacks is `Absent`: it is named,
-and the others are measured all the same.
+judged by the ratio of its median to that of the baseline in the same case. A peer that this machine
+lacks is `Absent`: it is named, and the others are measured all the same.
 """
 
 from __future__ import annotations
@@ -16,13 +15,11 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib import import_module
-from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -30,9 +27,7 @@ import numpy as np
 
 from rack.backplane.process import pin, set_priority
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
-from rack.tools.lab.benches.chart import BASELINE, PALE, PALETTE, Diagram, Series, draw
 
 if TYPE_CHECKING:
     from rack.tools.console.progress import Progress
@@ -41,64 +36,8 @@ EXTRA = "pip install 'nasrem-rack[lab]'"
 """Brings the peers that are Python packages."""
 END_S = 1.2
 """Longest wait for a program that was asked to end."""
-KEY = "dot: median (ratio to the black one of the case); line: best to p99"
 _Name = TypeVar("_Name")
 _Result = TypeVar("_Result")
-
-
-class BenchResult(ABC):
-    """What a bench has found; a dataclass, of which its fields are the JSON."""
-
-    name: str
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return {"bench": self.name, **plain(self)}
-
-    @abstractmethod
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield it as text for people, fitted to `width`."""
-
-    def plot(self, folder: Path) -> list[Path]:
-        """Write its pictures into `folder`; return their paths. Not every bench has any."""
-        return []
-
-
-def plain(found: Any) -> Any:
-    """Return a record as plain data: its fields, and the properties that its class names in
-    `DERIVED`."""
-    if is_dataclass(found):
-        names = [*(each.name for each in fields(found)), *getattr(found, "DERIVED", ())]
-        return {name: plain(getattr(found, name)) for name in names}
-    if isinstance(found, Mapping):
-        return {key: plain(value) for key, value in found.items()}
-    return list(map(plain, found)) if isinstance(found, tuple | list) else found
-
-
-Found = TypeVar("Found", bound=BenchResult)
-
-
-def show(measure: Callable[[Progress], Found], plot: Path | None, as_json: bool) -> Found:
-    """Measure, with the progress on the terminal; print what was found and, if asked for, plot it.
-
-    Return it. Raises `Failure` at once if it cannot be plotted.
-    """
-    from rack.tools.console.progress import progress_for
-
-    if plot is not None and not can_draw():
-        raise Failure(f"--plot {plot}: {NO_PICTURES}", 2)
-    with progress_for(as_json) as progress:
-        found = measure(progress)
-    if as_json:
-        print_json(found.document())
-    else:
-        print_wrapped("\n".join(found.lines(terminal_width())))
-    if plot is not None:
-        plot.mkdir(parents=True, exist_ok=True)
-        paths = found.plot(plot)
-        if not as_json:
-            print(f"pictures: {', '.join(map(str, paths))}")
-    return found
 
 
 @dataclass(frozen=True)
@@ -232,7 +171,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 @dataclass(frozen=True)
-class Comparison(BenchResult):
+class Comparison:
     """All samples of a bench. `baselines` names the contestant of each case that the others are
     compared with.
 
@@ -246,16 +185,6 @@ class Comparison(BenchResult):
     baselines: Mapping[str, str]
     absent: tuple[Absent, ...] = ()
     conclusion: str = ""
-
-    @property
-    def cases(self) -> list[str]:
-        """The cases, in order."""
-        return list(dict.fromkeys(sample.case for sample in self.samples))
-
-    @property
-    def contestants(self) -> list[str]:
-        """The contestants, in order."""
-        return list(dict.fromkeys(sample.who for sample in self.samples))
 
     def sample(self, case: str, who: str) -> Sample | None:
         """Return one sample; None where the contestant was not measured."""
@@ -280,7 +209,7 @@ class Comparison(BenchResult):
             "title": self.title,
             "baselines": dict(self.baselines),
             "samples": [self._figures(sample) for sample in self.samples],
-            "absent": plain(self.absent),
+            "absent": [asdict(one) for one in self.absent],
             "conclusion": self.conclusion,
         }
 
@@ -317,26 +246,21 @@ class Comparison(BenchResult):
         ratios = [decimal(self.ratio(sample, name), 2) for name in ("median", "p99")]
         return [sample.case, sample.who, f"{sample.count}", *figures, sample.unit, *ratios]
 
-    def plot(self, folder: Path) -> list[Path]:
-        """Write the comparison into `folder`, a panel a case; return the paths."""
-        panels = [self._diagram(case) for case in self.cases]
-        return draw(folder / self.name, f"{self.title}\n{KEY}", panels, self.contestants)
 
-    def _diagram(self, case: str) -> Diagram:
-        """Return a dot at each median, and a line from best to p99."""
-        own = [sample for sample in self.samples if sample.case == case]
-        rows = [self.contestants.index(sample.who) for sample in own]
-        p99s = [sample.p99 for sample in own]
-        series = [Series("", p99s, rows, "span", PALE, [sample.best for sample in own])]
-        for sample, row in zip(own, rows, strict=True):
-            is_baseline = self.baselines.get(case) == sample.who
-            colour = BASELINE if is_baseline else PALETTE[0]
-            ratio = self.ratio(sample)
-            note = shown(sample.median)
-            if ratio is not None:
-                note += f"  ({ratio:.2f})"
-            series.append(Series("", [sample.median], [row], "o", colour, notes=[note]))
-        return Diagram(own[0].unit, series, title=case)
+Found = TypeVar("Found", bound=Comparison)
+
+
+def show(measure: Callable[[Progress], Found], as_json: bool) -> Found:
+    """Measure, with the progress on the terminal; print what was found, and return it."""
+    from rack.tools.console.progress import progress_for
+
+    with progress_for(as_json) as progress:
+        found = measure(progress)
+    if as_json:
+        print_json(found.document())
+    else:
+        print_wrapped("\n".join(found.lines(terminal_width())))
+    return found
 
 
 def shown(value: float) -> str:

@@ -8,10 +8,11 @@ prolongs.
 
 from __future__ import annotations
 
+import json
 import os
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,10 +24,9 @@ from rack.boards import OneProcess
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.console.tables import table
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.checkout import RackCommand, rack_commands
-from rack.tools.lab.benches.harness import BenchResult, Comparison, Sample, interleaved, shown
+from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
 from rack.tools.recording.recording import Recording
 
 RACKS: Mapping[str, float | None] = {"nasrem": None, "k1607": None, "fig4": 10.0}
@@ -51,97 +51,58 @@ class BareRun:
     last: Mapping[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class LockstepSpeeds(BenchResult):
-    """The time that a simulated second takes, by rack and contestant; `speeds` are simulated
-    seconds a second, of the median."""
-
-    comparison: Comparison
-    speeds: Mapping[tuple[str, str], float]
-
-    def document(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        speeds = [
-            {"rack": rack, "who": who, "value": value} for (rack, who), value in self.speeds.items()
-        ]
-        return {**self.comparison.document(), "simulated_seconds_a_second": speeds}
-
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield both tables for people, fitted to `width`."""
-        who = list(dict.fromkeys(who for _, who in self.speeds))
-        racks = dict.fromkeys(rack for rack, _ in self.speeds)
-        rows = [[rack, *(shown(self.speeds[rack, one]) for one in who)] for rack in racks]
-        yield "Simulated seconds a second in lockstep"
-        yield from table(["rack", *who], rows, width)
-        yield ""
-        yield from self.comparison.lines(width)
-
-    def plot(self, folder: Path) -> list[Path]:
-        """Write lockstep.png and lockstep.svg into `folder`; return their paths."""
-        return self.comparison.plot(folder)
-
-
 def measure(
     against: Path | None, racks: Mapping[str, float | None], rounds: int, progress: Progress
-) -> LockstepSpeeds:
+) -> Comparison:
     """Run every rack, its levels without a rack, and another checkout's, by turns; times in ms a
     simulated second.
 
-    Raises `Failure` if a run fails, or if the levels without a rack did other work.
+    Raises:
+        Failure: If a run fails, or if the levels without a rack did other work.
     """
     commands = rack_commands(against)
     progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
-    found: dict[tuple[str, str], list[float]] = {}
+    samples = []
     for rack, seconds in racks.items():
         progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
+        options = ["--set", f"name=bench-{os.getpid()}"]
+        options += [] if seconds is None else ["--seconds", f"{seconds}"]
         with TemporaryDirectory() as folder:
-            ticks = _check(rack, seconds, Path(folder) / "run")
+            ticks = _check(rack, options, Path(folder) / "run")
         progress.end(EXPECTED_S, "equal")
-        runs = {(rack, each.name): partial(_run, each, rack, seconds) for each in commands}
-        runs[rack, BARE] = partial(_run_bare, rack, ticks)
-        found |= interleaved(runs, rounds, progress, EXPECTED_S)
-    return speeds(found, [command.name for command in commands])
+        runs = {each.name: partial(_run, each, rack, options) for each in commands}
+        runs[BARE] = partial(_run_bare, rack, ticks)
+        found = interleaved(runs, rounds, progress, EXPECTED_S)
+        samples += [Sample(rack, who, tuple(times_ms), "ms") for who, times_ms in found.items()]
+    return compare(samples, commands[-1].name if against else BARE)
 
 
-def speeds(found: Mapping[tuple[str, str], list[float]], names: list[str]) -> LockstepSpeeds:
-    """Return the speeds from the times of runs, ms a simulated second; the last of two `names` is
-    compared with."""
-    samples: list[Sample] = []
-    baselines: dict[str, str] = {}
-    for rack in dict.fromkeys(rack for rack, _ in found):
-        own = [Sample(rack, who, tuple(found[rack, who]), "ms") for who in (*names, BARE)]
-        if len(names) > 1:
-            samples += own[:-1]
-            baselines[rack] = names[-1]
-        samples += [replace(sample, case=_limit(rack)) for sample in own]
-        baselines[_limit(rack)] = BARE
-    title = "Time of a simulated second in lockstep"
-    comparison = Comparison("lockstep", title, tuple(samples), baselines)
-    a_second = {key: float(1e3 / np.median(times_ms)) for key, times_ms in found.items()}
-    return LockstepSpeeds(comparison, a_second)
+def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
+    """Return the comparison of these samples with one contestant, and how many simulated seconds a
+    second they are."""
+    speeds = [f"{one.case} {shown(1e3 / one.median)} ({one.who})" for one in samples]
+    return Comparison(
+        name="lockstep",
+        title="Time of a simulated second in lockstep",
+        samples=tuple(samples),
+        baselines=dict.fromkeys((sample.case for sample in samples), baseline),
+        conclusion=f"simulated seconds a second: {', '.join(speeds)}",
+    )
 
 
-def _limit(rack: str) -> str:
-    """Return the case in which a rack is compared with its levels alone."""
-    return f"{rack} and its limit"
-
-
-def _run(command: RackCommand, rack: str, seconds: float | None) -> float:
-    tick_us = command.tick_us(rack, *_options(seconds), bound_s=BOUND_S)
-    return _ms_a_second(rack, tick_us)
-
-
-def _options(seconds: float | None) -> list[object]:
-    until = [] if seconds is None else ["--seconds", seconds]
-    return ["--set", f"name=bench-{os.getpid()}", *until]
+def _run(command: RackCommand, rack: str, options: Sequence[object]) -> float:
+    """Return the time of a simulated second, ms."""
+    words = ("run", rack, "--lockstep", "--no-record", "--json", *options)
+    found = json.loads(command.run(*words, bound_s=BOUND_S))
+    return _ms_a_second(rack, found["wall_s"], found["outcome"]["ticks"])
 
 
 def _run_bare(rack: str, ticks: int) -> float:
-    return _ms_a_second(rack, _bare(rack, ticks).processor_s * 1e6 / ticks)
+    return _ms_a_second(rack, _bare(rack, ticks).processor_s, ticks)
 
 
-def _ms_a_second(rack: str, tick_us: float) -> float:
-    return tick_us * 1e6 / load(rack).clock_ns
+def _ms_a_second(rack: str, lasted_s: float, ticks: int) -> float:
+    return lasted_s / ticks * 1e12 / load(rack).clock_ns
 
 
 def _bare(rack: str, ticks: int) -> BareRun:
@@ -158,10 +119,10 @@ def run_bare(config: RackConfig, ticks: int) -> BareRun:
         return BareRun(ticks, processor_s, rack.serials, last)
 
 
-def _check(rack: str, seconds: float | None, folder: Path) -> int:
+def _check(rack: str, options: Sequence[object], folder: Path) -> int:
     """Record a rack in lockstep and compare it with its levels alone; return the ticks that it ran
     for."""
-    words = ("run", rack, "--lockstep", *_options(seconds), "--out", folder)
+    words = ("run", rack, "--lockstep", *options, "--out", folder)
     rack_commands(None)[0].run(*words, bound_s=BOUND_S)
     recording = Recording(folder)
     ticks = int(recording.ended["outcome"]["ticks"])

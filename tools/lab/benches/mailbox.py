@@ -34,7 +34,7 @@ from rack.tools.lab.benches.harness import (
     absent_package,
     interleaved,
 )
-from rack.tools.lab.benches.transports import PEERS, REFERENCES, Peer, Transport
+from rack.tools.lab.benches.transports import PEERS, Peer, Transport
 
 SIZES = {"64 B": 64, "200 B": 200, "2 kB": 2048, "16 kB": 16384}
 """Bytes of a message: a serial, and three arrays of numbers."""
@@ -77,8 +77,8 @@ CASES = tuple(Case(size, readers) for readers in READERS for size in SIZES)
 def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
     """Measure every contestant that is installed in every case; the baseline of a case is its best
     peer."""
-    missing = {peer.name: absent_package(peer.name, peer.module) for peer in (*REFERENCES, *PEERS)}
-    present = [peer for peer in (*REFERENCES, *PEERS) if not missing[peer.name]]
+    missing = {peer.name: absent_package(peer.name, peer.module) for peer in PEERS}
+    present = [peer for peer in PEERS if not missing[peer.name]]
     progress.total(CASE_S * len(cases))
     samples: list[Sample] = []
     for case in cases:

@@ -8,120 +8,70 @@ them. The replay must end in the recorded state, bit for bit: otherwise it was o
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from rack.boards.config.cell import built_cell
-from rack.levels.robot.cell import Cell
 from rack.levels.robot.state import restore_state, sleeping
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import pinned
 from rack.tools.recording.recording import Recording
 
 SERVO = "servo"
 
 
-class ReplayPace(NamedTuple):
-    """How a replay runs: a tick every `period_ns` on `core` at a real-time `priority`; all 0: tick
-    after tick."""
+def replay(folder: Path, ticks: int) -> list[float]:
+    """Replay the longest stretch of a recorded run, without missed cycles, in which motors, not
+    brakes, moved the arm.
 
-    period_ns: int = 0
-    core: int = 0
-    priority: int = 0
+    To be called by `apart`: only in the environment of boards are the physics theirs.
 
+    Args:
+        folder: Folder of the run.
+        ticks: Ticks to replay, at most.
 
-@dataclass(frozen=True)
-class Replay:
-    """The longest stretch of a recorded run in which motors, not brakes, moved the arm.
+    Returns:
+        Processor time of each tick, us.
 
-    `start` and `end` are MuJoCo's states before and after it; `controls` are the actuators' inputs
-    by tick, shape (ticks, nu).
+    Raises:
+        Failure: If the arm never moved, or the whole stretch is replayed and does not end in the
+            recorded state.
     """
-
-    cell: Cell
-    substeps: int
-    clock_ns: int
-    first_tick: int
-    start: np.ndarray
-    end: np.ndarray
-    controls: np.ndarray
-
-    @classmethod
-    def of(cls, recording: Recording) -> Replay:
-        """Take it from a recording without missed cycles. Raises `Failure` if the arm never moved
-        in it."""
-        config = recording.rack_config
-        cell = built_cell(config)
-        cell = replace(cell, model=sleeping(cell.model, config.scene))
-        first, last = _stretch(recording)
-        status = f"{SERVO}.status"
-        state = f"{SERVO}.state"
-        ticks = recording.signal(status, "tick")
-        given = (ticks >= first) & (ticks < last)
-        controls = np.zeros((last - first, cell.model.nu))
-        controls[:, cell.actuators] = recording.signal(status, "torque")[given]
-        if cell.gripper is not None:
-            controls[:, cell.gripper.actuator] = recording.signal(status, "grip_force")[given]
-        states = dict(
-            zip(
-                recording.signal(state, "tick").tolist(),
-                recording.signal(state, "state"),
-                strict=True,
-            )
+    recording = Recording(folder)
+    config = recording.rack_config
+    cell = built_cell(config)
+    model = sleeping(cell.model, config.scene)
+    first, last = _stretch(recording)
+    status = f"{SERVO}.status"
+    given = recording.signal(status, "tick")
+    in_stretch = (given >= first) & (given < last)
+    controls = np.zeros((last - first, model.nu))
+    controls[:, cell.actuators] = recording.signal(status, "torque")[in_stretch]
+    if cell.gripper is not None:
+        controls[:, cell.gripper.actuator] = recording.signal(status, "grip_force")[in_stretch]
+    data, recorded = mujoco.MjData(model), mujoco.MjData(model)
+    recorded_at = recording.signal(f"{SERVO}.state", "tick")
+    states = recording.signal(f"{SERVO}.state", "state")
+    for each, tick in ((data, first), (recorded, last)):
+        restore_state(model, each, states[recorded_at == tick][0])
+    substeps = round(config.clock_ns * 1e-9 / model.opt.timestep)
+    found: list[float] = []
+    for number, control in enumerate(controls[:ticks], first + 1):
+        data.ctrl[:] = control
+        start_ns = time.thread_time_ns()
+        for _ in range(substeps):
+            mujoco.mj_step(model, data)
+        found.append((time.thread_time_ns() - start_ns) * 1e-3)
+        data.time = number * config.clock_ns * 1e-9
+    ends_alike = np.array_equal(data.qpos, recorded.qpos) and np.array_equal(
+        data.qvel, recorded.qvel
+    )
+    if len(found) == len(controls) and not ends_alike:
+        raise Failure(
+            "the replayed physics do not end in the recorded state: they are not what the servo ran"
         )
-        substeps = round(config.clock_ns * 1e-9 / cell.model.opt.timestep)
-        return cls(cell, substeps, config.clock_ns, first, states[first], states[last], controls)
-
-    def run(self, pace: ReplayPace, ticks: int) -> list[float]:
-        """Replay at most so many ticks; return the processor time of each, us.
-
-        Raises `Failure` if the whole stretch is replayed and does not end as recorded.
-        """
-        model = self.cell.model
-        data = mujoco.MjData(self.cell.model)
-        restore_state(model, data, self.start)
-        found: list[float] = []
-        alone = pinned(pace.core, pace.priority) if pace.priority else nullcontext()
-        with alone:
-            due_ns = time.monotonic_ns()
-            for number, control in enumerate(self.controls[:ticks], self.first_tick + 1):
-                due_ns += pace.period_ns
-                if pace.period_ns:
-                    time.sleep(max(0, due_ns - time.monotonic_ns()) * 1e-9)
-                data.ctrl[:] = control
-                start_ns = time.thread_time_ns()
-                for _ in range(self.substeps):
-                    mujoco.mj_step(model, data)
-                found.append((time.thread_time_ns() - start_ns) * 1e-3)
-                data.time = number * self.clock_ns * 1e-9
-        if len(found) == len(self.controls):
-            self._check(data)
-        return found
-
-    def _check(self, data: mujoco.MjData) -> None:
-        recorded = mujoco.MjData(self.cell.model)
-        restore_state(self.cell.model, recorded, self.end)
-        if not (
-            np.array_equal(data.qpos, recorded.qpos) and np.array_equal(data.qvel, recorded.qvel)
-        ):
-            raise Failure(
-                "the replayed physics do not end in the recorded state: they are not what the"
-                " servo ran"
-            )
-
-
-def replay(folder: Path, pace: ReplayPace, ticks: int) -> list[float]:
-    """Replay at most so many ticks of a recorded run; return the processor time of each, us.
-
-    To be called by `apart`: only in the environment of boards are the physics theirs. Raises
-    `Failure` as `Replay`.
-    """
-    return Replay.of(Recording(folder)).run(pace, ticks)
+    return found
 
 
 def _stretch(recording: Recording) -> tuple[int, int]:

@@ -1,8 +1,4 @@
-"""The emptiest boards: one sends a message in every cycle, each of the others passes it on.
-
-The same file runs in another checkout, whose packages may have other names: it imports nothing but
-what a level needs.
-"""
+"""The emptiest boards: one sends a message in every cycle, each of the others passes it on."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Comparisons: figures and ratios of given samples, the table, the picture, who is absent, and
-taking turns."""
+"""Comparisons: figures and ratios of given samples, the table, who is absent, and taking turns."""
 
 from __future__ import annotations
 
@@ -7,7 +6,6 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +21,6 @@ from rack.tools.lab.benches.harness import (
     absent_package,
     absent_program,
     interleaved,
-    plain,
     turns,
 )
 
@@ -34,32 +31,6 @@ SAMPLES = (
     Sample("large", "theirs", (0.0, 0.0), "us"),
 )
 BOTH = Comparison("pair", "Two contestants", SAMPLES, {"small": "theirs", "large": "theirs"})
-
-
-@dataclass(frozen=True)
-class Pair:
-    """A record with a property that is shown."""
-
-    DERIVED = ("total",)
-
-    first: int
-    others: tuple[Sample, ...] = ()
-
-    @property
-    def total(self) -> int:
-        return self.first + 1
-
-
-def test_a_record_is_plain_data_with_the_properties_that_it_names() -> None:
-    assert plain({"one": Pair(1, SAMPLES[1:2])}) == {
-        "one": {
-            "first": 1,
-            "others": [
-                {"case": "small", "who": "theirs", "values": [4.0, 4.0, 10.0], "unit": "us"}
-            ],
-            "total": 2,
-        }
-    }
 
 
 class Hidden:
@@ -122,22 +93,13 @@ def test_the_document_has_every_figure_and_says_who_is_absent() -> None:
 
 
 def test_the_table_fits_the_terminal_and_names_who_is_absent() -> None:
-    missing = Absent("zenoh", "No module named 'zenoh'", EXTRA)
+    missing = Absent("iceoryx2", "No module named 'iceoryx2'", EXTRA)
     found = Comparison("pair", "Two contestants", SAMPLES, BOTH.baselines, (missing,))
     lines = list(found.lines())
     assert lines[0] == "Two contestants"
-    assert lines[-1] == "absent: zenoh: No module named 'zenoh'; to install: " + EXTRA
+    assert lines[-1] == "absent: iceoryx2: No module named 'iceoryx2'; to install: " + EXTRA
     assert " ".join(lines[2].split()) == "small ours 3 2 2.98 1 3 us 0.50 0.30"
     assert max(map(len, list(found.lines(50))[1:-1])) <= 50
-
-
-def test_the_picture_is_written_as_png_and_svg(tmp_path: Path) -> None:
-    paths = BOTH.plot(tmp_path)
-    assert [path.name for path in paths] == ["pair.png", "pair.svg"]
-    text = paths[1].read_text()
-    assert all(
-        f"<!-- {word} -->" in text for word in ("small", "large", "ours", "theirs", "2  (0.50)")
-    )
 
 
 def test_a_package_that_cannot_be_imported_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The bench of launches: what it reads from a run, and both reactions to a kill."""
+"""The bench of launches: what it reads from a run, and the reactions to a kill."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ import pytest
 
 from rack.boards.config import load
 from rack.tools.console.answer import Failure
-from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.checkout import rack_commands
-from rack.tools.lab.benches.kill import DETECTED, SAFE, Killing
-from rack.tools.lab.benches.launch import BOUND_S, ShortRuns, fastest, first_cycle_ns
+from rack.tools.lab.benches.launch import (
+    BOUND_S,
+    fastest,
+    first_cycle_ns,
+    launch_s,
+    measure_kills,
+)
 
 pytestmark = pytest.mark.thorough
 
@@ -44,26 +48,24 @@ def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(
     small: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "runs").mkdir()
-    assert 0.0 < ShortRuns(tmp_path / "runs").launch_s(rack_commands(None)[0], str(small)) < BOUND_S
+    this = rack_commands(None)[0]
+    assert 0.0 < launch_s(this, str(small), tmp_path / "runs", share=False) < BOUND_S
     assert not list((tmp_path / "runs").iterdir())
 
 
 def test_a_rack_without_an_arm_has_no_brakes(small: Path) -> None:
     with pytest.raises(Failure, match="no arm whose brakes could engage"):
-        Killing(str(small), 1, Progress())
+        measure_kills(str(small), 1)
 
 
 @pytest.mark.slow
 @pytest.mark.alone
-@pytest.mark.parametrize("of", ["the arm", "its commands"])
-def test_a_kill_is_detected_before_the_brakes_are_engaged(of: str) -> None:
-    killing = Killing("nasrem", 2, Progress())
-    assert killing.boards == ("servo", "primitive")
-    board = killing.boards[of == "its commands"]
-    samples = {(sample.who, sample.unit): sample for sample in killing.samples(board)}
-    assert {who for who, _ in samples} == {DETECTED, SAFE}
-    assert all(sample.count == 2 for sample in samples.values())
-    # nasrem's servo level cycles every 2.5 ms.
-    for who in (DETECTED, SAFE):
-        assert samples[who, "ms"].median == pytest.approx(2.5 * samples[who, "cycles"].median)
-    assert all(value > 0.0 for value in samples[DETECTED, "ms"].values)
+def test_a_kill_is_detected_and_the_brakes_engage() -> None:
+    detected, braked = measure_kills("nasrem", 2)
+    assert {one.case for one in (detected, braked)} == {"servo killed"}
+    assert [(one.who, one.count, one.unit) for one in (detected, braked)] == [
+        ("detected", 2, "ms"),
+        ("brakes engaged", 2, "ms"),
+    ]
+    assert min(detected.values) > 0.0
+    assert 0.0 < max(braked.values) < 1000.0

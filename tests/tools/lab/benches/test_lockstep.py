@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,8 @@ from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.lockstep import BARE, differences, measure, run_bare, speeds
+from rack.tools.lab.benches.harness import Sample
+from rack.tools.lab.benches.lockstep import BARE, compare, differences, measure, run_bare
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
@@ -39,36 +39,25 @@ def test_levels_without_a_rack_write_what_they_write_in_one(
     assert list(differences(recording, other)) == ["servo.status, field position"]
 
 
-def test_speeds_are_ratios_to_the_other_checkout_and_to_the_limit() -> None:
-    times = {
-        ("nasrem", "this tree"): [200.0, 240.0, 250.0],
-        ("nasrem", "base"): [500.0],
-        ("nasrem", BARE): [160.0],
-    }
-    found = speeds(times, ["this tree", "base"])
-    assert found.speeds == {
-        ("nasrem", "this tree"): 1000 / 240,
-        ("nasrem", "base"): 2.0,
-        ("nasrem", BARE): 6.25,
-    }
-    own = [sample for sample in found.comparison.samples if sample.who == "this tree"]
-    assert [found.comparison.ratio(sample) for sample in own] == [0.48, 1.5]
-    assert found.comparison.cases == ["nasrem", "nasrem and its limit"]
-    alone = speeds({key: value for key, value in times.items() if key[1] != "base"}, ["this tree"])
-    assert alone.comparison.cases == ["nasrem and its limit"]
-    assert list(alone.lines(80))[1].split() == ["rack", "this", "tree", "no", "rack"]
+def test_speeds_follow_from_times_and_the_ratios_from_the_baseline() -> None:
+    times = {"this tree": (200.0, 240.0, 250.0), "base": (500.0,), BARE: (160.0,)}
+    samples = [Sample("nasrem", who, values, "ms") for who, values in times.items()]
+    ratios = {"base": [0.48, 1.0, 0.32], BARE: [1.5, 3.125, 1.0]}
+    for baseline, expected in ratios.items():
+        found = compare(samples, baseline)
+        assert [found.ratio(sample) for sample in samples] == expected
+        assert list(found.lines())[-1] == (
+            "simulated seconds a second:"
+            " nasrem 4.17 (this tree), nasrem 2 (base), nasrem 6.25 (no rack)"
+        )
 
 
 @pytest.mark.slow
-def test_a_short_bench_runs_a_rack_and_its_levels_alone(tmp_path: Path) -> None:
+def test_a_short_bench_runs_a_rack_and_its_levels_alone() -> None:
     found = measure(None, {"fig4": 0.5}, 1, Progress())
-    assert {(sample.who, sample.count) for sample in found.comparison.samples} == {
-        ("this tree", 1),
-        (BARE, 1),
-    }
+    assert {(sample.who, sample.count) for sample in found.samples} == {("this tree", 1), (BARE, 1)}
+    assert found.baselines == {"fig4": BARE}
     assert json.loads(json.dumps(found.document())) == found.document()
-    assert all(one["value"] > 0.0 for one in found.document()["simulated_seconds_a_second"])
-    assert [path.name for path in found.plot(tmp_path)] == ["lockstep.png", "lockstep.svg"]
 
 
 def fails() -> None:

@@ -1,52 +1,58 @@
-"""A rack observed by its rings: its cycles are counted against the clock's grid, not against the
-records it left."""
+"""A recorded rack: its cycles are counted by its own counters, and its lateness from its trace."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rack.backplane.trace import RECORD, Flag
+from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import loads, wire
-from rack.boards.events import Outcome
 from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.observed import CycleCount, Observed, missed_share, observe
+from rack.tools.lab.benches.observed import count_cycles, lateness_us, record
+from rack.tools.recording.recording import Recording
 
 LAYOUT = wire(loads(Chain(1, 400).text()))
 
 
-def run(ticks: list[int], late: tuple[int, ...] = (), lost: int = 0) -> Observed:
-    """Return a run of ten ticks that left records of these, some of them late."""
-    rows = np.zeros(len(ticks), RECORD)
-    rows["tick"] = ticks
-    rows["flags"][np.isin(ticks, late)] = Flag.MISSED
-    outcome = Outcome("time over", 10, "", "", "", ())
-    return Observed({"board1": rows}, {"board1": lost}, {}, LAYOUT, outcome)
+class Overslept(Recording):
+    """A recording of three cycles, of which the last overslept two releases."""
+
+    layout = LAYOUT
+
+    def __init__(self) -> None:
+        pass
+
+    def trace(self, task: str) -> np.ndarray:
+        rows = np.zeros(3, RECORD)
+        rows["release_ns"] = np.array([0, 200, 203]) * LAYOUT.clock_ns
+        rows["start_ns"] = rows["release_ns"] + 100_000
+        rows["flags"][2] = Flag.SKIPPED | 2 << SKIPPED_SHIFT
+        return rows
 
 
-@pytest.mark.parametrize(
-    ("observed", "found"),
-    [
-        (run(list(range(10))), (0, 9)),
-        (run(list(range(9))), (0, 9)),
-        (run([0, 1, 2, 5, 6, 7, 8, 9], late=(2, 9)), (3, 9)),
-        (run([4, 5, 6, 7, 8, 9], lost=4), (0, 5)),
-        (run([]), (9, 9)),
-    ],
-    ids=["all in time", "the last not read yet", "skipped and late", "overwritten", "never ran"],
-)
-def test_every_cycle_that_was_due_counts(observed: Observed, found: tuple[int, int]) -> None:
-    assert observed.cycles("board1") == found
+def test_a_board_that_overslept_grid_points_is_late_from_the_first_of_them() -> None:
+    # The start of the run does not count.
+    assert lateness_us(Overslept(), "board1").tolist() == [100.0, 5100.0]
 
 
 def test_shares_are_of_all_tasks_together() -> None:
-    assert missed_share([CycleCount(1, 100), CycleCount(0, 300)]) == 0.0025
+    tasks = [{"missed": 1, "skipped": 1, "due": 100}, {"missed": 0, "skipped": 0, "due": 300}]
+    assert count_cycles(tasks).share == 0.005
+    assert count_cycles([]).share == 0.0
 
 
 @pytest.mark.slow
-def test_a_run_leaves_traces_messages_and_its_outcome() -> None:
+def test_a_chain_passes_a_message_on_in_every_cycle(tmp_path: Path) -> None:
     chain = Chain(2, 400, "lockstep")
-    found = observe(loads(chain.text()), 0.1, True, ["board2.status"])
-    assert found.outcome.ticks == 40
-    assert [found.cycles(name) for name in chain.names] == [(0, 39), (0, 39)]
-    assert found.messages["board2.status"]["message"]["sent"].tolist() == [-1, *range(39)]
+    result, recording = record(loads(chain.text()), 0.1, tmp_path / "run")
+    assert result.outcome.ticks == 40
+    assert count_cycles(result.tasks[name] for name in chain.names) == (0, 80)
+    assert recording.signal("board2.status", "sent").tolist() == [-1, *range(39)]
+
+
+def test_a_chain_of_boards_fills_the_crate() -> None:
+    layout = wire(loads(Chain(20, 400).text()))
+    assert [task.slot for task in layout.tasks] == list(range(2, 22))
+    assert layout.mailbox("board19.status").readers == ("board20",)

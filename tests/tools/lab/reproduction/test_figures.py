@@ -8,25 +8,25 @@ from pathlib import Path
 import pytest
 
 from rack.tools.lab.reproduction.experiments import figures
-from rack.tools.lab.reproduction.experiments.experiment import Document, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
     FigureRack,
     FigureRun,
-    PatternCount,
     planning,
     sweep,
 )
-from rack.tools.lab.reproduction.sections import gantt
-from rack.tools.lab.reproduction.sections.page import Listing, Plate, Ruling
+from rack.tools.lab.reproduction.predictions import predict_figure
+from rack.tools.lab.reproduction.rules import PAPER_X, check_planning
+from rack.tools.lab.reproduction.verdict import Ruling, describe_unmet
 from rack.tools.timing.charts.panel import Count
+from tests.tools.lab.reproduction.test_rules import rule_on
 
-NOWHERE = Workshop(Path("nowhere"), share=True)
 NEWER_X = 4.0
 """The X of the paper's newer version, ms."""
 
 
 def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
-    rows = {one.process_ms: one for one in sweep("fig2", gantt.PAPER_X)}
+    rows = {one.process_ms: one for one in sweep("fig2", PAPER_X)}
     # R X W P U in 8 ms: P has 5 - X ms a cycle, 2 ms with the longest X, not "at least 3 ms".
     assert {x: one.each_ms for x, one in rows.items()} == {
         1.0: 4.0,
@@ -35,7 +35,7 @@ def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
         2.5: 2.5,
         3.0: 2.0,
     }
-    assert [one.process_ms for one in gantt.contradicting(list(rows.values()))] == [2.5, 3.0]
+    assert [x for x, one in rows.items() if describe_unmet(check_planning(one))] == [2.5, 3.0]
     # With one U for each plan: 2 x 3 ms for P and U, which need 7.
     assert (rows[3.0].once_ms, rows[3.0].cycles_once, rows[3.0].permitted) == (3.0, 3, 2)
     assert rows[3.0].cycles_each == 3
@@ -58,39 +58,35 @@ def test_figure_4_has_no_idle_time_with_the_longest_x() -> None:
     assert {"3.1", "3.6"} <= set(newer.failing)
 
 
-def document(late: int, jobs: int = 100) -> Document:
+def ran(late: int, jobs: int = 100) -> FigureRun:
     """Return what a run of a figure leaves, with so many late plans."""
     counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
-    patterns = (PatternCount("level", "R X W P | R X W P U -", jobs),)
-    run = FigureRun(counts, patterns, {}, 0, 0, {"measured": Path("pictures/x.svg")})
-    return figures.FIG2.experiment.document(run)
+    return FigureRun(counts, 0, 0, {"measured": Path("pictures/x.svg")})
 
 
 @pytest.mark.parametrize(
-    ("late", "ruling"),
-    [(0, Ruling.HOLDS), (3, Ruling.BOUNDED), (97, Ruling.FAILS)],
-    ids=["in time", "stray", "late"],
+    ("name", "late", "ruling"),
+    [
+        ("figure-2", (0,), Ruling.HOLDS),
+        ("figure-2", (3,), Ruling.BOUNDED),
+        ("figure-2", (97,), Ruling.FAILS),
+        ("figure-4-overload", (97,), Ruling.HOLDS),
+        ("figure-4-overload", (3,), Ruling.FAILS),
+        ("figure-3", (97, 97), Ruling.HOLDS),
+        ("figure-3", (97, 0), Ruling.BOUNDED),
+        ("figure-3", (0, 97), Ruling.FAILS),
+        ("figure-2-x", (0, 100), Ruling.CONTRADICTS),
+        # Runs that do not confirm the contradiction make it no finding.
+        ("figure-2-x", (0, 0), Ruling.FAILS),
+    ],
 )
-def test_a_figure_that_works_is_judged_by_its_run(late: int, ruling: Ruling) -> None:
-    (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2"]
-    assert statement.tested({"fig2": document(late)}, NOWHERE).ruling is ruling
-
-
-def test_runs_that_do_not_confirm_the_contradiction_make_it_no_finding() -> None:
-    (statement,) = [one for one in gantt.CHAPTER.statements if one.name == "figure-2-x"]
-    confirmed = {figures.SHORT_2.label: document(0), figures.LONG_2.label: document(100)}
-    assert statement.tested(confirmed, NOWHERE).ruling is Ruling.CONTRADICTS
-    assert (
-        statement.tested({**confirmed, figures.LONG_2.label: document(0)}, NOWHERE).ruling
-        is Ruling.FAILS
-    )
+def test_a_figure_is_judged_by_its_runs(name: str, late: tuple[int, ...], ruling: Ruling) -> None:
+    assert rule_on(name, *map(ran, late)).ruling is ruling
 
 
 def test_a_schedule_is_drawn_as_the_paper_draws_it(tmp_path: Path) -> None:
     workshop = Workshop(tmp_path, share=True)
     workshop.prepare()
-    plate, letters = gantt.drawn(FigureRack("fig2", 2), workshop)
-    assert isinstance(plate, Plate)
-    assert isinstance(letters, Listing)
-    assert (tmp_path / plate.path).read_text().startswith("<?xml")
-    assert "RXXWPPPPRXXWPPU-" in letters.text
+    (drawn,) = predict_figure(FigureRack("fig2", 2), workshop)
+    assert (tmp_path / drawn.picture).read_text().startswith("<?xml")
+    assert "RXXWPPPPRXXWPPU-" in drawn.text

@@ -17,23 +17,29 @@ import pytest
 from pydantic import TypeAdapter
 
 from rack.boards.config import load
-from rack.tools.lab.benches import switch
-from rack.tools.lab.benches.systems.figures import prediction
-from rack.tools.lab.reproduction.experiments import figures, measured, nasrem, sharing, tasks
+from rack.tools.lab.reproduction.experiments import (
+    figures,
+    nasrem,
+    partition,
+    response,
+    sharing,
+    switch,
+    systems,
+    tasks,
+)
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import settings_of
 from rack.tools.lab.reproduction.experiments.nasrem import SystemResponse
 from rack.tools.lab.reproduction.experiments.sharing import WAITS
-from rack.tools.lab.reproduction.reproduction import CHAPTERS
-from rack.tools.lab.reproduction.sections.comparison import judge_layers
-from rack.tools.lab.reproduction.sections.page import ClaimVerdict, Ruling, Statement, unmet
+from rack.tools.lab.reproduction.page import PaperClaim
+from rack.tools.lab.reproduction.rules import judge_layers
+from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
 from rack.tools.timing.analysis.analysis import Analysis
 from tests.tools.lab.reproduction.breaking import CHAIN, BreakingWorkshop
-from tests.tools.lab.reproduction.test_equations import RUN
+from tests.tools.lab.reproduction.test_rules import CLAIMS, RUN
 
 pytestmark = [pytest.mark.thorough, pytest.mark.slow, pytest.mark.timeout(300)]
 
-STATEMENTS = {one.name: one for chapter in CHAPTERS for one in chapter.statements}
 UNJUDGED = {"replication"}
 """Claims on something that is not built: the page refuses to rule."""
 HERE = Path(__file__).parent
@@ -139,20 +145,20 @@ for = "50ms"
 """Short scripts in place of those of whole tasks."""
 
 
-Judge = Callable[[BreakingWorkshop, Statement], ClaimVerdict]
+Judge = Callable[[BreakingWorkshop, PaperClaim], ClaimVerdict]
 FOUND: dict[tuple[str, str], Any] = {}
 """What experiments have found, by their names and the racks: claims share some."""
 
 
-def by_experiments(workshop: BreakingWorkshop, statement: Statement) -> ClaimVerdict:
+def by_experiments(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
     """Return the ruling on what all experiments of a claim find."""
     found = []
-    for one in statement.experiments:
+    for one in claim.experiments:
         key = one.name, workshop.about
         if key not in FOUND:
             FOUND[key] = one.make(workshop)
         found.append(FOUND[key])
-    return statement.judged(*found)
+    return claim.judge(*found)
 
 
 IN_LOCKSTEP = ("clock.mode=lockstep",)
@@ -162,30 +168,30 @@ IN_LOCKSTEP = ("clock.mode=lockstep",)
 def by_equation(rack: str, settings: tuple[str, ...] = IN_LOCKSTEP) -> Judge:
     """Return a judge of an equation by a run of another rack than NASREM's."""
 
-    def judge(workshop: BreakingWorkshop, statement: Statement) -> ClaimVerdict:
+    def judge(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
         run = workshop.run(rack, workshop.config(rack, settings)).recording
         analysis = Analysis.of(run)
         found = replace(RUN, verdicts=tuple(nasrem._verdicts(analysis)))
         if analysis.response is not None:
             response = TypeAdapter(SystemResponse).validate_python(analysis.response)
             found = replace(found, response=response)
-        return statement.judged(found)
+        return claim.judge(found)
 
     return judge
 
 
-def with_polling_later(workshop: BreakingWorkshop, statement: Statement) -> ClaimVerdict:
+def with_polling_later(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
     """Return the ruling on a run in which polling is given the later times: no rack makes it so,
     and on some machines it is so by itself."""
     found = WAITS.make(workshop)
     sooner, later = sorted(found.late_us.values(), key=itemgetter("p50"))
-    return statement.judged(replace(found, late_us={"signal": sooner, "poll": later}))
+    return claim.judge(replace(found, late_us={"signal": sooner, "poll": later}))
 
 
 def by_one_system(name: str) -> Judge:
     """Return a judge by the experiment of one system."""
-    return lambda workshop, statement: by_experiments(
-        workshop, replace(statement, experiments=(measured.system_experiment(name),))
+    return lambda workshop, claim: by_experiments(
+        workshop, replace(claim, experiments=(systems.system_experiment(name),))
     )
 
 
@@ -214,27 +220,25 @@ UNEVEN = dict.fromkeys(("fig2", "fig4"), "[board.level.params]\nprocess_ms = [9.
 TOO_LONG = {"fig2": "[board.level.params]\nprocess_ms = 9.0\n"}
 LATE_SERVO = {"nasrem": LATE.format(board="servo", at=0.3)}
 ROWS = (
-    Breaking("determinism", "runs in lockstep that differ", {"nasrem": WALL_CLOCK}, 0.5),
-    Breaking("figure-1", "messages not written, part of all", LATE_SERVO, alone=True),
-    Breaking(
-        "virtual-control-loop", "cycles missed or skipped, part of all", LATE_SERVO, alone=True
-    ),
-    Breaking("locks", "cycles missed or skipped, part of all", {CHAIN: LATE_BOARD}, alone=True),
-    Breaking("planner-and-executor", "cycles of executors late, part of all", UNEVEN, alone=True),
+    Breaking("determinism", "lockstep_runs_that_differ", {"nasrem": WALL_CLOCK}, 0.5),
+    Breaking("figure-1", "messages_lacking_share", LATE_SERVO, alone=True),
+    Breaking("virtual-control-loop", "cycles_missed_share", LATE_SERVO, alone=True),
+    Breaking("locks", "cycles_missed_share", {CHAIN: LATE_BOARD}, alone=True),
+    Breaking("planner-and-executor", "cycles_late_share", UNEVEN, alone=True),
     Breaking(
         "bounded-waits",
-        "tasks not done",
+        "tasks_not_done",
         {"nasrem": "[board.servo]\nrestarts = 0\n" + LOCKSTEP},
         2.0,
         ONE_LOSS,
     ),
     Breaking(
         "pipeline",
-        "messages in lockstep that took other",
+        "lockstep_messages_off",
         {CHAIN: '\n[protocol]\ndefault = "double-buffer"\n'},
         alone=True,
     ),
-    Breaking("nasrem", "servo: part off 400 Hz", LATE_SERVO, alone=True),
+    Breaking("nasrem", "servo_off_400_Hz_share", LATE_SERVO, alone=True),
     Breaking("equation-3.1", "level: t_proc + t_c", judge=by_equation("fig4-overload")),
     Breaking(
         "equation-3.4",
@@ -261,28 +265,28 @@ ROWS = (
         "level",
         judge=by_equation("fig2", (*IN_LOCKSTEP, "timing.small_share=0.05")),
     ),
-    Breaking("figure-2", "part of cycles, or plans, late", TOO_LONG, alone=True),
+    Breaking("figure-2", "late_share", TOO_LONG, alone=True),
     Breaking(
         "figure-2-x",
-        "X = 3: part late",
+        "longest_X_late_share",
         {"fig2": "[board.level.params]\nplan_ms = 1.0\n"},
         alone=True,
     ),
     Breaking(
         "figure-3",
-        "part of cycles, or plans, late",
+        "late_share",
         {"fig3": "[board.level.params]\nplan_ms = 1.0\n"},
         alone=True,
     ),
     Breaking(
         "figure-4",
-        "part of cycles, or plans, late",
+        "late_share",
         {"fig4": "[board.level.params]\nprocess_ms = 7.0\n"},
         alone=True,
     ),
     Breaking(
         "figure-4-overload",
-        "part of cycles, or plans, late",
+        "late_share",
         {"fig4-overload": "[board.level.params]\nprocess_ms = 0.5\n"},
         alone=True,
     ),
@@ -295,59 +299,55 @@ ROWS = (
     ),
     Breaking(
         "equation-3.3",
-        "beyond the sum with its waits, without a miss",
+        "beyond_grid_without_miss",
         {"nasrem": DELAYED.format(board="elemental_move", by=4) + LOCKSTEP},
         7.0,
         judge=by_equation("nasrem"),
     ),
     Breaking(
         "speedup",
-        "plans on two processors",
+        "plans_on_two_processors",
         {"fig4": "[board.level.params]\nplan_ms = 60.0\n"},
         alone=True,
     ),
-    Breaking("growth", "cycles missed or skipped, part of all", {CHAIN: LATE_BOARD}, alone=True),
-    Breaking(
-        "waiting", "median lateness, polling and blocking", judge=with_polling_later, alone=True
-    ),
+    Breaking("growth", "cycles_missed_share", {CHAIN: LATE_BOARD}, alone=True),
+    Breaking("waiting", "polling_late_median_us", judge=with_polling_later, alone=True),
     Breaking(
         "update",
-        "updates preempted, part of all",
+        "updates_preempted_share",
         {"fig3": '[protocol.mailbox]\n"level.plan" = "time-slice"\n'},
         alone=True,
     ),
-    Breaking("slices-and-buffers", "cycles of executors late, part of all", UNEVEN, alone=True),
-    Breaking("background", "in the background: cycles late, part of all", TOO_LONG, alone=True),
+    Breaking("slices-and-buffers", "cycles_late_share", UNEVEN, alone=True),
+    Breaking("background", "cycles_late_share", TOO_LONG, alone=True),
     Breaking(
         "loosely-coupled",
-        "response later by: 0 ms",
+        "response_off_expected_ms 100,",
         {"brown": LOCKSTEP, "brown/servo": CABLE_OUT},
         2.0,
     ),
-    Breaking(
-        "communication", "communication, against the time saved", {"nasrem": SLOW_BUS}, alone=True
-    ),
+    Breaking("communication", "communication_ms_per_s", {"nasrem": SLOW_BUS}, alone=True),
     Breaking(
         "soft-and-real-time",
-        "by the time promised: A done",
+        "done_as_promised_s",
         {"nasrem": HELD + LOCKSTEP},
         20.0,
     ),
     Breaking(
         "state-tables",
-        "transitions only with the disturbance",
+        "answering_transitions",
         {"nist-state-table": "[scene]\nmotion = []\n" + LOCKSTEP},
     ),
-    Breaking("figure-5", "slow levels: part missed", {"nasrem": LATE_TASK}, alone=True),
+    Breaking("figure-5", "slow_levels_missed_share", {"nasrem": LATE_TASK}, alone=True),
     Breaking(
         "systems",
-        "systems that failed in a run",
-        {"condor": NO_RESTART},
+        "_failed",
+        {"condor": NO_RESTART + ONE_LOSS["kill-each-board"].replace("servo", "coordinator")},
         judge=by_one_system("condor"),
         alone=True,
     ),
     *(
-        Breaking(claim, f"{box}.command, a second", {claim: LOCKSTEP, name: LOST.format(board=box)})
+        Breaking(claim, f"{box}.command_messages", {claim: LOCKSTEP, name: LOST.format(board=box)})
         for claim, name, box in (
             ("rccl", "rccl", "joint1"),
             ("brown", "brown/servo", "supervisor"),
@@ -356,7 +356,7 @@ ROWS = (
     ),
     *(
         Breaking(
-            claim, f"{host}.{box}, messages", {name: f"[host.{host}]\nexternal = true\n" + LOCKSTEP}
+            claim, f"{host}.{box}_messages", {name: f"[host.{host}]\nexternal = true\n" + LOCKSTEP}
         )
         for claim, name, host, box in (
             ("chimera", "chimera", "command", "requests"),
@@ -367,7 +367,7 @@ ROWS = (
     ),
     Breaking(
         "ibm",
-        "bridge.sensors, a second",
+        "bridge.sensors_messages",
         {
             "ibm": '[board.bridge.params.pass]\nsensors = { from = "arm.status", every = 8 }\n'
             + LOCKSTEP
@@ -375,18 +375,19 @@ ROWS = (
     ),
     Breaking(
         "predictable-response",
-        "lockstep: not at the predicted tick",
+        "lockstep_off_predicted_tick",
         {"nasrem": DELAYED.format(board="primitive", by=3)},
+        24.0,
         alone=True,
     ),
     Breaking(
         "two-levels",
-        "levels, in the system with the fewest",
-        judge=lambda workshop, statement: judge_layers({"fig2": prediction(load("fig2"))}),
+        "fig2_levels",
+        judge=lambda workshop, claim: judge_layers({"fig2": systems.prediction(load("fig2"))}),
     ),
     Breaking(
         "context-switch",
-        "99th percentile, the config's",
+        "switch_p99_us",
         {"nasrem": "[timing]\ncontext_switch_ms = 0.0001\n"},
         alone=True,
     ),
@@ -399,9 +400,9 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "SECONDS", 1.0)
     monkeypatch.setattr(figures, "ATTEMPTS", 1)
     monkeypatch.setattr(sharing, "SECONDS", 0.7)
-    monkeypatch.setattr(measured, "PARTITION_S", 2.5)
-    monkeypatch.setattr(measured, "COMMANDS", 4)
-    monkeypatch.setattr(measured, "TWINS", 0)
+    monkeypatch.setattr(partition, "SECONDS", 2.5)
+    monkeypatch.setattr(response, "COMMANDS", 4)
+    monkeypatch.setattr(response, "TWINS", 0)
     monkeypatch.setattr(switch, "WAKES", 200)
 
 
@@ -418,13 +419,13 @@ def test_claims_do_not_hold_in_a_rack_that_breaks_them(
 ) -> None:
     for row in rows:
         workshop = BreakingWorkshop(tmp_path, row.changes, row.seconds, row.scripts)
-        verdict = row.judge(workshop, STATEMENTS[row.claim])
-        assert row.unmet in unmet(verdict.demands), verdict
+        verdict = row.judge(workshop, CLAIMS[row.claim])
+        assert row.unmet in describe_unmet(verdict.checks), verdict
         assert verdict.ruling is Ruling.FAILS
 
 
 HEALTHY = (
-    Breaking("two-levels", "", judge=lambda workshop, statement: statement.judged()),
+    Breaking("two-levels", "", judge=lambda workshop, claim: claim.judge()),
     Breaking("equation-3.2", "", {"nasrem": LOCKSTEP}, 7.0, judge=by_equation("nasrem")),
     Breaking("bounded-waits", "", {"nasrem": LOCKSTEP}, 3.5, ONE_LOSS),
     Breaking("loosely-coupled", "", {"brown": LOCKSTEP, "brown/servo": LOCKSTEP}, 10.0),
@@ -437,8 +438,8 @@ test_figures.py have the others, by data."""
 @pytest.mark.parametrize("row", HEALTHY, ids=lambda row: row.claim)
 def test_a_claim_holds_in_a_rack_that_keeps_it(row: Breaking, tmp_path: Path) -> None:
     workshop = BreakingWorkshop(tmp_path, row.changes, row.seconds, row.scripts)
-    verdict = row.judge(workshop, STATEMENTS[row.claim])
-    assert unmet(verdict.demands) == ""
+    verdict = row.judge(workshop, CLAIMS[row.claim])
+    assert describe_unmet(verdict.checks) == ""
     assert verdict.ruling is Ruling.HOLDS
 
 
@@ -453,5 +454,5 @@ def test_a_task_that_takes_too_long_is_ended_and_not_done(
 
 
 def test_every_ruling_of_the_page_has_a_rack_that_breaks_it() -> None:
-    assert sorted(row.claim for row in ROWS) == sorted(set(STATEMENTS) - UNJUDGED)
-    assert all(STATEMENTS[name].judged().ruling is Ruling.UNTESTABLE for name in UNJUDGED)
+    assert sorted(row.claim for row in ROWS) == sorted(set(CLAIMS) - UNJUDGED)
+    assert all(CLAIMS[name].judge().ruling is Ruling.UNTESTABLE for name in UNJUDGED)

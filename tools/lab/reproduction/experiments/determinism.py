@@ -20,15 +20,11 @@ LASTS_S = 2 * 3.0 + 2 * (SECONDS + 3.0)
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """How a run ended, the tick of its first missed deadline, and where it diverges from the
+    """The digest of a run, the tick of its first missed deadline, and where it diverges from the
     first run."""
 
-    run: str
     mode: str
     digest: str
-    wall_s: float
-    messages: int
-    missed: int
     first_miss: int | None
     difference: Difference | None
 
@@ -66,14 +62,9 @@ def _recorded(workshop: Workshop, label: str, mode: str) -> Recorded:
 
 def _compared(run: Recorded, reference: Recording | None) -> ComparedRun:
     result, recording = run
-    missed = misses(recording)
     return ComparedRun(
-        run=recording.folder.name,
         mode=recording.rack_config.clock.mode,
         digest=result.outcome.digest,
-        wall_s=result.wall_s,
-        messages=sum(len(recording.signal(name, "serial")) for name in recording.mailboxes),
-        missed=len(missed),
-        first_miss=min((miss["tick"] for miss in missed), default=None),
+        first_miss=min((miss["tick"] for miss in misses(recording)), default=None),
         difference=None if reference is None else first_difference(recording, reference),
     )

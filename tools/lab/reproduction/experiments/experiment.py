@@ -8,21 +8,20 @@ killed command continues where it was.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import xxhash
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.segment import racks
@@ -138,49 +137,44 @@ def depends() -> Document:
 
 @dataclass(frozen=True)
 class Kept:
-    """A result that is kept: what was found, when, in which time; or why nothing can be found on
-    this machine."""
+    """A result that is kept: what was found, when, in which time, and what it depends on; or why
+    nothing can be found on this machine."""
 
     found: Document
     took_s: float
     made_at: str
     lacking: str = ""
+    depends: Document = field(default_factory=dict)
 
 
 def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
     """Return the result of an experiment if it is still right; None if it must be made."""
     try:
-        document = json.loads(
-            (folder / KEPT / f"{experiment.name}.json").read_text(encoding="utf-8")
-        )
-        basis = document.pop("depends")
-        result = Kept(**document)
-        pictures = result.found.get("pictures", {})
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        text = (folder / KEPT / f"{experiment.name}.json").read_bytes()
+        result = TypeAdapter(Kept).validate_json(text)
+    except (OSError, ValidationError):
         return None
-    if basis != depends():
-        return None
-    return result if all((folder / path).is_file() for path in pictures.values()) else None
+    pictures = result.found.get("pictures", {}).values()
+    is_whole = all((folder / path).is_file() for path in pictures)
+    return result if is_whole and result.depends == depends() else None
 
 
 def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
     """Make an experiment and keep its result. Raises `Failure` and what a rack raises."""
     started = time.monotonic()
     basis = depends()
+    found: Document = {}
     lacking = ""
     try:
         found = experiment.document(experiment.make(workshop))
     except Lacking as reason:
-        found = {}
         lacking = str(reason)
     if INTERRUPT.number:
         # A signal ends a run in order, but before its time.
         INTERRUPT.end()
-    result = Kept(
-        found, round(time.monotonic() - started, 1), time.strftime("%Y-%m-%d %H:%M:%S"), lacking
-    )
-    path = workshop.folder / KEPT / f"{experiment.name}.json"
-    write_json(path, {"depends": basis, **vars(result)})
+    took_s = round(time.monotonic() - started, 1)
+    result = Kept(found, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), lacking, basis)
+    write_json(workshop.folder / KEPT / f"{experiment.name}.json", vars(result))
     return result
 
 
@@ -230,5 +224,5 @@ def program_files() -> Iterator[Path]:
     for floor in FLOORS:
         for path in sorted((PROGRAM / floor).rglob("*.*")):
             is_source = path.suffix in (".py", ".toml", ".xml") and path.is_file()
-            if is_source and path.parent not in (page, page / "sections"):
+            if is_source and path.parent != page:
                 yield path

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,13 +13,12 @@ from rack.boards.config import RackConfig, load, rack_timing, wire
 from rack.boards.config.schema import BudgetConfig
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.trace_times import plans
-from rack.tools.lab.benches import storing
+from rack.tools.lab.reproduction.experiments import storing
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
     need_real_time,
 )
-from rack.tools.recording.history import steal
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import Count, Panel
 from rack.tools.timing.charts.scheduled import Schedule
@@ -38,8 +36,6 @@ PLANNER = "level.planner"
 STORING_MS = 30.0
 """About how long a block takes to store."""
 PARTS = {"planner": "plan_ms", "executor": "process_ms"}
-COMMON = 4
-"""Patterns of a lane that are kept, the most frequent ones."""
 MS = 1e-6
 
 
@@ -133,26 +129,15 @@ def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
     )
 
 
-class PatternCount(NamedTuple):
-    """How often a pattern came in a lane."""
-
-    lane: str
-    pattern: str
-    times: int
-
-
 @dataclass(frozen=True)
 class FigureRun:
-    """A run of a figure: jobs of its tasks, the most frequent patterns of each lane, for plans and
-    for cycles, and the hypervisor's part of each core, percent.
+    """A run of a figure: jobs of its tasks.
 
     Releases of the executor `met` so many updates of the plan; it began within so many,
     `preempted`.
     """
 
     tasks: dict[str, Count]
-    patterns: tuple[PatternCount, ...]
-    steal: dict[str, float]
     met: int
     preempted: int
     pictures: dict[str, Path]
@@ -176,13 +161,6 @@ def _run(figure: FigureRack, workshop: Workshop) -> FigureRun:
     drawn = save([panel], f"{figure.label}: a run", workshop.picture(f"{figure.label}-run"))
     return FigureRun(
         tasks=dict(panel.counts),
-        patterns=tuple(
-            PatternCount(lane, *most)
-            for lane, patterns in panel.patterns.items()
-            for counts in patterns
-            for most in counts.most_common(COMMON)
-        ),
-        steal=steal(run.recording)["percent"],
         met=_within(updates, executor["release_ns"]),
         preempted=_within(updates, executor["start_ns"]),
         pictures={"measured": workshop.shown(drawn)},

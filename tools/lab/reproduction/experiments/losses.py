@@ -21,15 +21,10 @@ LASTS_S = 34.0
 
 @dataclass(frozen=True)
 class LossesRun:
-    """A run with a script of faults: each fault, detections that none explains, and how it
-    ended."""
+    """A run with a script of faults: each fault, and whether the run worked."""
 
     faults: tuple[Judgement, ...]
-    unexplained: int
-    cause: str
-    ticks: int
     worked: bool
-    clock_ms: float
 
 
 def losses_of(script: str, about: str) -> Experiment[LossesRun]:
@@ -47,15 +42,8 @@ def _run(script: str, workshop: Workshop) -> LossesRun:
     need_real_time()
     config = workshop.config(NAME, (), script)
     result, recording = workshop.run(script, config)
-    report = faults(recording.events, recording.layout)
-    return LossesRun(
-        faults=TypeAdapter(tuple[Judgement, ...]).validate_python(report["faults"]),
-        unexplained=len(report["unexplained"]),
-        cause=result.outcome.cause,
-        ticks=result.outcome.ticks,
-        worked=result.worked,
-        clock_ms=config.clock.period_ms,
-    )
+    found = faults(recording.events, recording.layout)["faults"]
+    return LossesRun(TypeAdapter(tuple[Judgement, ...]).validate_python(found), result.worked)
 
 
 KILLS = losses_of("kill-each-board", "every board of nasrem killed once")

@@ -18,7 +18,6 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     need_real_time,
 )
 from rack.tools.recording.cycles import Cycles
-from rack.tools.recording.history import steal
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import task_document
@@ -31,20 +30,18 @@ MS = 1e-6
 
 @dataclass(frozen=True)
 class Percentiles:
-    """Median and longest of the times of a run; 99 of 100 are at most `p99`."""
+    """Median and longest of the times of a run."""
 
     p50: float
-    p99: float
     max: float
 
 
 @dataclass(frozen=True)
 class Phases:
-    """The stamped parts of an executor's cycle, C, R, X and W, us."""
+    """The parts of an executor's cycle in which it communicates, C, R and W, us."""
 
     exchange: Percentiles
     read: Percentiles
-    process: Percentiles
     write: Percentiles
 
 
@@ -60,15 +57,11 @@ class MeasuredVerdict:
 class ExecutorCycles:
     """The cycles of an executor, with times in ms."""
 
-    core: int
     cycles: int
     start_up: int
     stalled: int
     missed: int
     skipped: int
-    used_ms: Percentiles
-    deviation_ms: float
-    lateness_ms: Percentiles
     slice_ms: float
     largest_gap_ms: float
     phases: Phases
@@ -79,36 +72,22 @@ class MailboxTraffic:
     """What passed through a mailbox, next to what the ticks of its writer demand."""
 
     mailbox: str
-    every_ms: float
     due: int
     messages: int
-
-
-@dataclass(frozen=True)
-class BusAccesses:
-    """Accesses of a task to the backplane."""
-
-    reads: int
-    read_bytes: int
-    writes: int
-    write_bytes: int
 
 
 @dataclass(frozen=True)
 class WayResponse:
     """The response of a hierarchy one way, ms; None: nothing went all the way."""
 
-    bound_ms: float
     measured_ms: Percentiles | None
     beyond: tuple[Document, ...]
 
 
 @dataclass(frozen=True)
 class SystemResponse:
-    """The response of a hierarchy, down and up, next to equations 3.2 and 3.3, ms."""
+    """The response of a hierarchy, down and up, next to equation 3.3, ms."""
 
-    levels: tuple[str, ...]
-    bound_eq_3_2_ms: float
     sum_eq_3_3_ms: float
     command: WayResponse
     status: WayResponse
@@ -116,16 +95,14 @@ class SystemResponse:
 
 @dataclass(frozen=True)
 class NasremRun:
-    """What a run in real time left: `steal` is the hypervisor's part of a core, percent."""
+    """What a run in real time left."""
 
     ended: str
     ticks: int
-    steal: dict[str, float]
     verdicts: tuple[MeasuredVerdict, ...]
     executors: dict[str, ExecutorCycles]
     response: SystemResponse
     mailboxes: tuple[MailboxTraffic, ...]
-    bus: dict[str, BusAccesses]
 
 
 def _run(workshop: Workshop) -> NasremRun:
@@ -137,7 +114,6 @@ def _run(workshop: Workshop) -> NasremRun:
     return NasremRun(
         ended=result.outcome.cause,
         ticks=ticks,
-        steal=steal(recording)["percent"],
         verdicts=tuple(_verdicts(analysis)),
         executors={
             name: _executor(cycles, analysis.predicted)
@@ -146,7 +122,6 @@ def _run(workshop: Workshop) -> NasremRun:
         },
         response=TypeAdapter(SystemResponse).validate_python(analysis.response),
         mailboxes=tuple(_mailbox(recording, name, ticks) for name in recording.mailboxes),
-        bus=TypeAdapter(dict[str, BusAccesses]).validate_python(result.tasks),
     )
 
 
@@ -171,7 +146,6 @@ def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
     stamped_ns = {
         "exchange": cycles.exchange_ns,
         "read": cycles.read_ns,
-        "process": cycles.process_ns,
         "write": cycles.write_ns,
     }
     phases = {
@@ -187,7 +161,6 @@ def _mailbox(recording: Recording, name: str, ticks: int) -> MailboxTraffic:
     every = recording.layout.mailbox(name).every
     return MailboxTraffic(
         mailbox=name,
-        every_ms=every * recording.layout.clock_ns * MS,
         due=-(-ticks // every),
         messages=len(np.unique(recording.signal(name, "serial"))),
     )

@@ -3,19 +3,17 @@ waits for its cycle."""
 
 from __future__ import annotations
 
-import os
+from collections import Counter
 from dataclasses import dataclass
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from rack.backplane.layout import Wake
 from rack.boards.config import loads
 from rack.levels.timing.trace_times import Distribution, distribution
-from rack.tools.lab.benches.boards import responses_of
-from rack.tools.lab.benches.chain import PRIORITY, Chain
-from rack.tools.lab.benches.clock import board
-from rack.tools.lab.benches.cyclictest import WakeGrid
-from rack.tools.lab.benches.observed import observe
+from rack.tools.lab.benches.chain import Chain
+from rack.tools.lab.benches.observed import Recorded, count_cycles, lateness_us
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
@@ -55,21 +53,27 @@ class Chains:
 
 def _chains(workshop: Workshop) -> Chains:
     return Chains(
-        lockstep=_chain(workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
-        realtime=_chain(workshop, Chain(LEVELS, RATE_HZ)),
-        locked=_chain(workshop, Chain(LEVELS, RATE_HZ), LOCKS),
-        grown=_chain(workshop, Chain(GROWN, RATE_HZ)),
+        lockstep=_chain("chain-lockstep", workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
+        realtime=_chain("chain-realtime", workshop, Chain(LEVELS, RATE_HZ)),
+        locked=_chain("chain-locked", workshop, Chain(LEVELS, RATE_HZ), LOCKS),
+        grown=_chain("chain-grown", workshop, Chain(GROWN, RATE_HZ)),
     )
 
 
-def _chain(workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
+def _chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
+    run = _run(label, workshop, chain, protocol)
+    missed, due = count_cycles(run.result.tasks[name] for name in chain.names)
     last = f"{chain.names[-1]}.status"
+    sent, visible_at = (run.recording.signal(last, name) for name in ("sent", "visible_at"))
+    # A message that a miss repeats counts once; -1: none was sent yet.
+    sent, first = np.unique(sent, return_index=True)
+    took = Counter((visible_at[first] - sent)[sent >= 0].tolist())
+    return ChainRun(chain.boards, due, missed, dict(sorted(took.items())))
+
+
+def _run(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> Recorded:
     config = loads(workshop.source(chain.text() + protocol))
-    run = observe(
-        config.model_copy(update={"name": workshop.rack}), SECONDS, workshop.share, [last]
-    )
-    missed, due = map(sum, zip(*map(run.cycles, chain.names), strict=True))
-    return ChainRun(chain.boards, due, missed, responses_of([run.messages[last]]))
+    return workshop.run(label, config.model_copy(update={"name": workshop.rack}), SECONDS)
 
 
 CHAINS = Experiment(
@@ -90,8 +94,11 @@ class Waits:
 
 def _waits(workshop: Workshop) -> Waits:
     need_real_time(cores=2)
-    grid = WakeGrid.at((max(os.sched_getaffinity(0)),), RATE_HZ, SECONDS, PRIORITY)
-    late_us = {wake: distribution(board(wake, workshop.share, grid)) for wake in WAYS}
+    late_us = {}
+    for wake in WAYS:
+        chain = Chain(1, RATE_HZ, wake=wake)
+        run = _run(f"waits-{wake}", workshop, chain)
+        late_us[wake] = distribution(lateness_us(run.recording, chain.names[0]))
     return TypeAdapter(Waits).validate_python({"late_us": late_us})
 
 

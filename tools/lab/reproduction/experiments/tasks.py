@@ -19,7 +19,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.observed import UNVIEWED
+from rack.tools.lab.benches.observed import UNVIEWED, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import (
     RUNS,
     Experiment,
@@ -28,7 +28,6 @@ from rack.tools.lab.reproduction.experiments.experiment import (
 )
 from rack.tools.live.host_side import entries_of
 from rack.tools.live.launch import RunResult
-from rack.tools.recording.history import counted, misses
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackGrid
 
@@ -115,8 +114,7 @@ def _found(result: RunResult, *recordings: Recording) -> TaskRun:
 
 
 def _missed(*recordings: Recording) -> float:
-    cycles = sum(len(rows) for one in recordings for rows in one.cycles.values())
-    return sum(sum(counted(misses(one))) for one in recordings) / cycles
+    return count_cycles(task for one in recordings for task in one.ended["tasks"].values()).share
 
 
 def _run_two(later_ms: int, workshop: Workshop) -> NetworkRun:

@@ -9,8 +9,14 @@ import pytest
 from rack.boards.config import load, loads
 from rack.boards.errors import ConfigError
 from rack.tools.console.answer import Failure
-from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.partition import PARTITIONS, Partition, measure
+from rack.tools.lab.reproduction.experiments import partition
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.partition import (
+    PARTITION,
+    PARTITIONS,
+    Partition,
+    Partitions,
+)
 from tests.boards.conftest import CLOCK, PLANNED
 from tests.machine import needs_fifo, needs_two_cores
 
@@ -67,39 +73,44 @@ def test_a_board_that_polls_cannot_share_the_only_core() -> None:
         Partition("tight", 1).of(config)
 
 
+def partitioned(
+    text: str, seconds: float, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> Partitions:
+    """Run the partitions of the rack of a config."""
+    (folder / "rack.toml").write_text(text)
+    monkeypatch.setattr(partition, "NAME", str(folder / "rack.toml"))
+    monkeypatch.setattr(partition, "SECONDS", seconds)
+    workshop = Workshop(folder, share=True)
+    workshop.prepare()
+    return PARTITION.make(workshop)
+
+
 @pytest.mark.slow
-def test_partitions_are_run_and_measured_one_after_another(tmp_path: Path) -> None:
-    path = tmp_path / "waves.toml"
-    path.write_text(PLANNED)
-    found = measure(str(path), 0.3, 1, Progress())
-    assert [one.partition for one in found.partitions] == [
-        partition.name for partition in PARTITIONS
-    ]
+@needs_fifo
+@needs_two_cores
+def test_partitions_are_run_and_measured_one_after_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = partitioned(PLANNED, 0.3, tmp_path, monkeypatch)
+    assert [one.partition for one in found.partitions] == [one.name for one in PARTITIONS]
     for one in found.partitions:
         wave, watch = one.levels
         assert (wave.level, watch.level) == ("wave", "watch")
         assert 0 < wave.executor.cycles <= 120
-        assert wave.planner is not None
-        assert wave.planner.slice_ms == 10.0
         assert wave.plan_age_ms is not None
         # A plan is read from the end of its slice on, four cycles after its release.
         assert wave.plan_age_ms["min"] >= 10.0
-        assert watch.planner is None
-        assert wave.executor.fits is None
-    lines = list(found.lines())
-    assert sum("watch" in line for line in lines) == len(PARTITIONS)
-    assert sum("wave" in line for line in lines) == 2 * len(PARTITIONS)
-    assert max(map(len, found.lines(80))) <= 80
+        assert (watch.planner, wave.executor.fits) == (None, None)
 
 
 @pytest.mark.slow
 @needs_fifo
 @needs_two_cores
 @pytest.mark.alone
-def test_predictions_from_budgets_agree_with_measurements(tmp_path: Path) -> None:
-    path = tmp_path / "slow.toml"
-    path.write_text(SLOW_PLANS)
-    measured = measure(str(path), 0.6, 1, Progress())
+def test_predictions_from_budgets_agree_with_measurements(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured = partitioned(SLOW_PLANS, 0.6, tmp_path, monkeypatch)
     found = {one.partition: one.levels[0] for one in measured.partitions}
     tight, loose = found["tight, 2 cores"].planner, found["loose, 2 cores"].planner
     assert tight is not None
@@ -110,4 +121,3 @@ def test_predictions_from_budgets_agree_with_measurements(tmp_path: Path) -> Non
     assert tight.cycles > 5
     assert tight.missed > tight.cycles / 2
     assert loose.missed < loose.cycles / 2
-    assert any("FAILS" in line for line in measured.lines())

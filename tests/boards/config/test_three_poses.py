@@ -1,0 +1,44 @@
+"""The same motion by every rack with a PUMA 560: one set of poses in every form."""
+
+from __future__ import annotations
+
+import runpy
+
+import numpy as np
+
+from rack.boards.config import load
+from rack.boards.config.files import CONFIGS, read
+from rack.levels.planning.ik import InverseKinematics
+from rack.levels.robot.cell import build_cell
+
+TASKS = CONFIGS / "tasks"
+LIMITS = ("home", "velocity", "acceleration", "jerk")
+
+
+POSES = [action["joints"] for action in read(TASKS / "three-poses.toml")["task"]["action"]]
+RACKS = ("rccl", "chimera", "brown", "ibm", "nist-state-table", "penn")
+
+
+def test_every_form_of_the_motion_has_the_same_poses() -> None:
+    steps = read(TASKS / "three-motions.toml")["task"]["step"]
+    assert [step["joints"] for step in steps if step["do"] == "move"] == POSES
+    moved: list[tuple[float, ...]] = []
+    runpy.run_path(
+        str(TASKS / "three_poses.py"), {"move": moved.append, "wait": lambda request: None}
+    )
+    assert [list(pose) for pose in moved] == POSES
+    tables = CONFIGS / "nist-state-table" / "tables"
+    places = read(tables / "three_poses_move.toml")["plan"]["place"]
+    order = [step["place"] for step in read(tables / "three_poses_task.toml")["plan"]["step"]]
+    config = load("nist-state-table/three-poses")
+    assert config.robot is not None
+    ik = InverseKinematics(build_cell(config.robot, config.scene, config.clock_ns), 0)
+    for name, pose in zip(order, np.array(POSES), strict=True):
+        assert np.abs(ik.tool_at(pose).position - places[name]).max() < 1e-4
+
+
+def test_all_racks_move_the_same_arm_from_the_same_start_within_the_same_limits() -> None:
+    first = load("nasrem-three-poses").robot
+    for name in RACKS:
+        other = load(f"{name}/three-poses").robot
+        assert all(getattr(other, limit) == getattr(first, limit) for limit in LIMITS)

@@ -1,0 +1,198 @@
+"""The bench of the machine: a rack at other rates, which of them it holds, and the verdict."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import RackConfig, load, loads, wire
+from rack.tools.console.answer import Failure
+from rack.tools.console.progress import Progress
+from rack.tools.lab.benches import machine
+from rack.tools.lab.benches.cyclictest import CYCLICTEST
+from rack.tools.lab.benches.harness import Sample
+from rack.tools.lab.benches.machine import (
+    AWAKE,
+    RATES_HZ,
+    STEP_MS,
+    Machine,
+    RateFigures,
+    at_rate,
+    compare_idle_cores,
+    measure,
+)
+from rack.tools.lab.benches.observed import Recorded, Runs, record
+from tests.boards.conftest import PLAIN
+from tests.tools.command_line import rack
+from tests.tools.lab.benches import peers
+
+WHO = "'wave' of waves"
+HELD = RateFigures(400.0, 6000, 0.0012, 0.0005)
+MISSED = replace(HELD, rate_hz=1000.0, missed=0.0016)
+SAMPLES = tuple(
+    Sample("400 Hz", who, (us,), "us") for who, us in ((WHO, 182.0), (CYCLICTEST, 120.0))
+)
+FOUND = Machine("machine", "", SAMPLES, {}, who=WHO, is_fifo=True, rates=(HELD, MISSED))
+
+
+@pytest.fixture
+def waves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A config, next to which is the only program on the path."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    path = tmp_path / "waves.toml"
+    path.write_text(PLAIN)
+    return path
+
+
+@pytest.mark.parametrize("rate_hz", RATES_HZ)
+def test_only_the_servo_level_changes_its_rate(rate_hz: float) -> None:
+    config = load("nasrem")
+    found = at_rate(config, rate_hz)
+    tasks = {task.name: task for task in wire(found).tasks}
+    assert tasks["servo"].every == 1
+    assert found.clock.period_ms == pytest.approx(1000 / rate_hz)
+    for name in config.board:
+        before_ms = config.every(name) * config.clock.period_ms
+        after_ms = found.every(name) * found.clock.period_ms
+        assert name == "servo" or after_ms == pytest.approx(before_ms, rel=0.002)
+    assert tasks["servo.planner"].within_cycles * found.clock.period_ms == pytest.approx(20.0)
+    assert found.robot is not None
+    step_ms = found.clock.period_ms / found.robot.substeps
+    assert STEP_MS / 2 < step_ms <= STEP_MS * 1.000001
+
+
+def test_a_rack_without_a_board_at_every_tick_is_refused() -> None:
+    config = loads(PLAIN.replace("rate_hz = 400", "rate_hz = 200"))
+    with pytest.raises(Failure, match="no board cycles at every tick"):
+        at_rate(config, 1000)
+
+
+@pytest.mark.parametrize(
+    ("figures", "verdict"),
+    [
+        (HELD, "held"),
+        (MISSED, "not held: the rack is late"),
+        # A machine that is late itself is not fit, whatever the rack misses.
+        (replace(HELD, missed=0.02, late=0.0195), "not held: the machine is late"),
+        # Without cyclictest every miss counts.
+        (replace(HELD, late=None), "not held: the rack is late"),
+        (replace(HELD, failure="board lost: servo"), "not held: board lost: servo"),
+    ],
+)
+def test_a_rate_is_held_up_to_its_bound(figures: RateFigures, verdict: str) -> None:
+    assert (figures.verdict, figures.is_held) == (verdict, verdict == "held")
+
+
+def test_the_verdict_comes_first_and_says_up_to_which_rate_and_why_no_further() -> None:
+    lines = list(FOUND.lines())
+    assert lines[:3] == [
+        "fit for real time up to 400 Hz",
+        "400 Hz held; missed 0.12% of 6000 cycles, cyclictest late in 0.05%;"
+        f" worst lateness: {WHO} 182 us, cyclictest 120 us",
+        "1000 Hz not held: the rack is late; missed 0.16% of 6000 cycles, cyclictest late in"
+        " 0.05%; worst lateness: unknown",
+    ]
+    assert FOUND.is_fit
+    # A rate counts only if all below it are held.
+    worse = replace(FOUND, rates=(replace(HELD, missed=0.02), replace(HELD, rate_hz=1000.0)))
+    assert not worse.is_fit
+    assert next(worse.lines()) == "not fit for real time at 400 Hz or more"
+    refused = replace(FOUND, is_fifo=False)
+    assert not refused.is_fit
+    assert next(refused.lines()).startswith("not fit for real time: SCHED_FIFO is refused")
+    document = json.loads(json.dumps(FOUND.document()))
+    assert [document[name] for name in ("fit", "highest_hz", "fifo")] == [True, 400.0, True]
+    assert [one["held"] for one in document["rates"]] == [True, False]
+
+
+@pytest.mark.slow
+def test_a_rack_is_run_at_every_rate_and_who_is_absent_is_named(
+    waves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
+    found = measure(str(waves), (800, 400), Runs(0.8, 1, True), Progress())
+    assert [one.rate_hz for one in found.rates] == [400, 800]
+    assert [sample.case for sample in found.samples] == ["400 Hz", "800 Hz"]
+    for one, sample in zip(found.rates, found.samples, strict=True):
+        assert 0 < sample.count <= one.cycles <= 0.8 * one.rate_hz
+        assert (one.late, one.failure) == (None, "")
+    absent = {one.who: one.line for one in found.absent}
+    assert "apt-get install rt-tests" in absent[CYCLICTEST]
+    assert "missing cannot be opened" in absent[found.who + AWAKE]
+    assert found.conclusion == ""
+    # Without its baseline a case has no ratios.
+    assert all(found.ratio(sample) is None for sample in found.samples)
+
+
+@pytest.mark.slow
+def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
+    waves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
+    monkeypatch.setattr("rack.tools.lab.benches.cyclictest.permits_fifo", lambda: True)
+    device = tmp_path / "cpu_dma_latency"
+    device.touch()
+    monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
+    held = []
+
+    def look(
+        config: RackConfig, seconds: float | None, folder: Path, share: bool = True
+    ) -> Recorded:
+        fds = [one.readlink() for one in Path("/proc/self/fd").iterdir() if one.is_symlink()]
+        held.append(device in fds)
+        return record(config, seconds, folder, share)
+
+    monkeypatch.setattr(machine, "record", look)
+    found = measure(str(waves), (400,), Runs(0.3, 2, True), Progress())
+    # Of 120 wakes two rounds have two at 2.5 ms and four at 150 ms: 1 and 60 points of this grid.
+    assert found.rates[0].late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
+    assert {sample.who for sample in found.samples} == {found.who, found.who + AWAKE, CYCLICTEST}
+    assert sorted(held) == [False, False, True, True]
+    own = found.sample("400 Hz", found.who)
+    assert own is not None
+    assert found.ratio(own) == pytest.approx(own.median / 12.0)
+    assert list(found.lines())[-1] == found.conclusion != ""
+
+
+@pytest.mark.slow
+def test_the_command_prints_one_document_and_its_status_is_the_verdict(waves: Path) -> None:
+    options = ("--rate", 400, "--seconds", 0.2, "--rounds", 1, "--share")
+    done = rack("bench", "machine", "--config", waves, *options, "--json")
+    found = json.loads(done.stdout)
+    assert [one["rate_hz"] for one in found["rates"]] == [400]
+    assert done.returncode == (0 if found["fit"] else 1), done.stderr
+    refused = rack("bench", "machine", "--config", waves.parent / "none.toml")
+    assert refused.returncode == 2
+    assert "no such file" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("asleep", "awake", "suits"),
+    [
+        # Ten lost cycles at 400 Hz outweigh every lateness within one, also a worse one.
+        ((60.0,) * 11 + (2400.0,), (20.0, 20.0) + (2500.0,) * 10, "sleep"),
+        ((9000.0,) * 10 + (60.0, 60.0), (20.0,) * 11 + (9001.0,), "awake"),
+        # One more may be chance: then the worst wake-up decides, never the median.
+        ((60.0,) * 11 + (900.0,), (20.0,) * 11 + (2500.0,), "sleep"),
+        ((60.0,) * 11 + (900.0,), (20.0,) * 11 + (300.0,), "awake"),
+        ((20.0,) * 11 + (900.0,), (60.0,) * 11 + (300.0,), "awake"),
+    ],
+)
+def test_the_setting_with_fewer_lost_cycles_suits_then_the_one_with_the_better_worst_wake_up(
+    asleep: tuple[float, ...], awake: tuple[float, ...], suits: str
+) -> None:
+    own = [
+        Sample("400 Hz", WHO, asleep, "us"),
+        Sample("400 Hz", WHO + AWAKE, awake, "us"),
+        # However late it is, it decides nothing.
+        Sample("400 Hz", CYCLICTEST, (50_000.0,), "us"),
+    ]
+    line = compare_idle_cores(own, WHO)
+    assert line.startswith(f'clock.idle_cores that suits this machine: "{suits}", ')
+    for times_us in (asleep, awake):
+        assert f"{sum(us >= 2500.0 for us in times_us)} wake-ups late by a period" in line
+        assert f"worst {max(times_us):.0f} us" in line
+    assert compare_idle_cores(own[::2], WHO) == ""

@@ -1,0 +1,249 @@
+"""Rules and the table of claims: every section, equation and figure of the paper is in it, and
+every rule gives each of its rulings on records made up for it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.levels.timing.verdicts import EquationVerdict
+from rack.tools.console.answer import Failure
+from rack.tools.lab.reproduction.experiments.deadline import GotoRun, GotoRuns
+from rack.tools.lab.reproduction.experiments.determinism import ComparedRun, ComparedRuns
+from rack.tools.lab.reproduction.experiments.experiment import Kept, Workshop
+from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    MeasuredVerdict,
+    NasremRun,
+    Percentiles,
+    SystemResponse,
+    WayResponse,
+)
+from rack.tools.lab.reproduction.experiments.partition import (
+    LevelFigures,
+    PartitionFigures,
+    Partitions,
+    TaskFigures,
+)
+from rack.tools.lab.reproduction.experiments.sharing import ChainRun, Chains
+from rack.tools.lab.reproduction.experiments.switch import SwitchCost, SwitchRun
+from rack.tools.lab.reproduction.experiments.tables import FiredRow, TableRun, TableRuns
+from rack.tools.lab.reproduction.experiments.tasks import NetworkRun
+from rack.tools.lab.reproduction.reproduction import SECTIONS, list_experiments, select_sections
+from rack.tools.lab.reproduction.rules import DONE
+from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
+from rack.tools.recording.divergence import Difference
+from rack.tools.timing.charts.panel import Count
+
+CLAIMS = {claim.name: claim for section in SECTIONS for claim in section.claims}
+NUMBERS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
+EQUATIONS = [f"equation-3.{number}" for number in range(1, 11)]
+HOLDS, BOUNDED, FAILS = Ruling.HOLDS, Ruling.BOUNDED, Ruling.FAILS
+NO_TIMES = Percentiles(1.0, 3.0)
+WAY = WayResponse(NO_TIMES, ())
+RUN = NasremRun("task done", 800, (), {}, SystemResponse(4.0, WAY, WAY), (), {})
+
+
+def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_order() -> None:
+    assert [section.name for section in SECTIONS] == NUMBERS
+    assert sum(len(section.claims) for section in SECTIONS) == len(CLAIMS)
+    assert [name for name in CLAIMS if name.startswith("equation-")] == EQUATIONS
+    assert {f"figure-{n}" for n in range(1, 6)} <= CLAIMS.keys()
+    found = list_experiments(SECTIONS)
+    assert len({one.name for one in found}) == len(found)
+    assert sum(one.seconds for one in found) < 15 * 60
+    with pytest.raises(Failure, match=r"--only 6: no such section; permitted: abstract, 1, 2"):
+        select_sections(["6"])
+
+
+@pytest.mark.parametrize("name", EQUATIONS)
+def test_each_equation_holds_in_nasrem_and_fails_in_the_rack_that_is_to_show_it(
+    name: str, tmp_path: Path
+) -> None:
+    nasrem, failing = CLAIMS[name].predict(Workshop(tmp_path, share=True))
+    assert nasrem.checks
+    assert describe_unmet(nasrem.checks) == ""
+    if name == "equation-3.7":
+        assert "60 Hz does not divide the 400 Hz clock" in failing.text
+    else:
+        assert describe_unmet(failing.checks)
+
+
+def rule_on(name: str, *found: Any) -> ClaimVerdict:
+    """Return the verdict on a claim by results as they are read from their files."""
+    claim = CLAIMS[name]
+    pairs = list(zip(claim.experiments, found, strict=True))
+    return claim.judge(
+        *(one.record(json.loads(json.dumps(one.document(run)))) for one, run in pairs)
+    )
+
+
+def compared(mode: str, digest: str, miss: int | None = None, differs: int | None = None) -> Any:
+    """Return a run of which the digest counts."""
+    difference = None if differs is None else Difference(differs, "servo.status")
+    return ComparedRun(mode, digest, miss, difference)
+
+
+def determined(*runs: ComparedRun, second: str = "a") -> ComparedRuns:
+    """Return runs in real time after two in lockstep."""
+    differs = None if second == "a" else 1
+    return ComparedRuns(
+        (compared("lockstep", "a"), compared("lockstep", second, differs=differs), *runs)
+    )
+
+
+EQUAL = compared("realtime", "a")
+EMPTY = ChainRun(5, 9, 0, {})
+
+
+def chains(lockstep: dict[int, int], realtime: dict[int, int]) -> Chains:
+    """Return chains by the cycles that messages took."""
+    return Chains(replace(EMPTY, took=lockstep), replace(EMPTY, took=realtime), EMPTY, EMPTY)
+
+
+def goto(refused: bool, done_s: float) -> GotoRuns:
+    """Return runs with a time that is too early, and by 10 s."""
+    soft = GotoRun(None, 9.0, None, True, "task done", "")
+    early = replace(soft, by_s=4.0, done_s=None if refused else 5.0, moved=not refused)
+    return GotoRuns((0.0, 0.0, 0.0), soft, early, replace(soft, by_s=10.0, done_s=done_s))
+
+
+def tables(*rows: str, worked: bool = True) -> TableRuns:
+    """Return runs of which the undisturbed one fires the row "pick" alone."""
+    disturbed, calm = (
+        TableRun({"elemental_move": tuple(FiredRow(name, 1, 1.0) for name in names)}, done)
+        for names, done in ((rows, worked), (("pick",), True))
+    )
+    return TableRuns(disturbed, calm)
+
+
+def background(late: int, blocks: int, in_line: int) -> tuple[FigureRun, FigureRun]:
+    """Return a level of 100 cycles that stores blocks in the background, and in the cycle."""
+    behind, line = (
+        FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, 0, 0, {})
+        for bad in (late, in_line)
+    )
+    return behind, line
+
+
+def networks(
+    missed: float, response_ms: float | None, ended: str = DONE
+) -> tuple[NetworkRun, NetworkRun]:
+    """Return a run of two racks, and one with a network slower by 100 ms."""
+    plain = NetworkRun(DONE, 8.0, 0.0, {}, 0.0, 50.0)
+    return plain, replace(plain, ended=ended, servo_missed=missed, response_ms=response_ms)
+
+
+def switch(assumed_us: float) -> SwitchRun:
+    """Return a context switch of 5 us."""
+    times = {"min": 4.0, "p50": 5.0, "p99": 9.0, "p99_9": 9.0, "max": 12.0}
+    return SwitchRun(SwitchCost(1, 1000, times, times, times), assumed_us)
+
+
+def partitions(slow: int, fast: int, plans: int) -> Partitions:
+    """Return what levels miss of 100 cycles: a slow one, and a fast one on one processor."""
+
+    def figures(partition: str, missed: dict[str, int]) -> PartitionFigures:
+        planner = TaskFigures(plans, 0, 0, None)
+        levels = (
+            LevelFigures(level, TaskFigures(100, bad, 0, None), planner, None)
+            for level, bad in missed.items()
+        )
+        return PartitionFigures(partition, tuple(levels), {0: 0.5})
+
+    tight = figures("tight, 1 core", {"task": slow, "servo": fast})
+    loose = figures("loose, 2 cores", {"task": slow, "servo": 0})
+    return Partitions(4.0, (tight, loose))
+
+
+def equation(holds: bool, mostly: bool) -> NasremRun:
+    """Return a run with equation 3.1 measured for one level."""
+    left = 1e6 if holds else 3e6
+    measured = EquationVerdict("3.1", "servo", left, "<=", 2.5e6, holds, "")
+    return replace(RUN, verdicts=(MeasuredVerdict(measured, mostly),))
+
+
+def response(*delays: str) -> NasremRun:
+    """Return a run in which commands took 6 ms instead of the 4 ms of equation 3.3, with responses
+    beyond the grid, if any, delayed by these."""
+    beyond = tuple({"delayed_by": [delay]} for delay in delays)
+    late = WayResponse(replace(NO_TIMES, max=6.0), beyond)
+    return replace(RUN, response=replace(RUN.response, command=late))
+
+
+RULINGS = [
+    ("determinism", [determined(EQUAL)], HOLDS),
+    ("determinism", [determined(compared("realtime", "b", 4, 5), EQUAL)], HOLDS),
+    ("determinism", [determined(compared("realtime", "b", 4, 5))], BOUNDED),
+    ("determinism", [determined(compared("realtime", "b", 6, 5))], FAILS),
+    ("determinism", [determined(compared("realtime", "b", None, 5))], FAILS),
+    ("determinism", [determined(EQUAL, second="b")], FAILS),
+    ("pipeline", [chains({5: 9}, {5: 9})], HOLDS),
+    ("pipeline", [chains({5: 9}, {5: 98, 6: 2})], BOUNDED),
+    ("pipeline", [chains({5: 9}, {5: 8, 6: 1})], FAILS),
+    ("pipeline", [chains({5: 8, 6: 1}, {5: 9})], FAILS),
+    ("pipeline", [chains({5: 9}, {4: 1, 5: 8})], FAILS),
+    ("pipeline", [chains({5: 9}, {})], Ruling.UNTESTABLE),
+    ("soft-and-real-time", [goto(True, 9.9)], HOLDS),
+    ("soft-and-real-time", [goto(True, 10.2)], FAILS),
+    ("soft-and-real-time", [goto(False, 9.9)], FAILS),
+    ("state-tables", [tables("pick", "aim again")], HOLDS),
+    ("state-tables", [tables("pick")], FAILS),
+    ("state-tables", [tables("pick", "aim again", worked=False)], FAILS),
+    ("background", background(0, 9, 99), HOLDS),
+    ("background", background(2, 9, 99), BOUNDED),
+    ("background", background(3, 9, 99), FAILS),
+    ("background", background(0, 0, 99), FAILS),
+    ("background", background(0, 9, 9), FAILS),
+    ("loosely-coupled", networks(0.0, 150.0), HOLDS),
+    ("loosely-coupled", networks(0.01, 150.0), BOUNDED),
+    ("loosely-coupled", networks(0.03, 150.0), FAILS),
+    ("loosely-coupled", networks(0.0, 60.0), FAILS),
+    ("loosely-coupled", networks(0.0, 250.0), FAILS),
+    ("loosely-coupled", networks(0.0, None), FAILS),
+    ("loosely-coupled", networks(0.0, 150.0, "time over"), FAILS),
+    ("context-switch", [switch(50.0)], BOUNDED),
+    ("context-switch", [switch(8.0)], FAILS),
+    ("figure-5", [partitions(0, 0, 1)], BOUNDED),
+    ("figure-5", [partitions(0, 50, 1)], HOLDS),
+    ("figure-5", [partitions(50, 50, 1)], FAILS),
+    ("figure-5", [partitions(0, 50, 0)], Ruling.UNTESTABLE),
+    ("equation-3.1", [equation(True, True)], HOLDS),
+    ("equation-3.1", [equation(False, True)], BOUNDED),
+    ("equation-3.1", [equation(False, False)], FAILS),
+    ("equation-3.1", [RUN], Ruling.UNTESTABLE),
+    ("equation-3.3", [RUN], HOLDS),
+    ("equation-3.3", [response("task missed 1 cycle")], BOUNDED),
+    ("equation-3.3", [response("task: waited")], FAILS),
+    ("replication", [], Ruling.UNTESTABLE),
+]
+
+
+@pytest.mark.parametrize(("name", "found", "ruling"), RULINGS)
+def test_a_rule_gives_each_of_its_rulings(name: str, found: Any, ruling: Ruling) -> None:
+    verdict = rule_on(name, *found)
+    assert verdict.ruling is ruling
+    is_met = (name, ruling) == ("context-switch", BOUNDED) or ruling is HOLDS
+    assert (describe_unmet(verdict.checks) == "") == is_met
+
+
+def test_what_is_not_met_is_said_with_its_numbers() -> None:
+    unmet = describe_unmet(rule_on("context-switch", switch(8.0)).checks)
+    assert unmet == "switch_p99_us 9, not <= 8"
+
+
+def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None:
+    workshop = Workshop(tmp_path, share=True)
+    lacking = Kept({}, 1.0, "now", "this machine has one processor")
+    for results, ruling, why in (
+        ({}, Ruling.UNMADE, "nasrem: not run yet"),
+        ({"nasrem": "the rack did not run"}, Ruling.UNMADE, "nasrem: the rack did not run"),
+        ({"nasrem": lacking}, Ruling.UNTESTABLE, "this machine has one processor"),
+    ):
+        judged = CLAIMS["equation-3.1"].judge_by(workshop, results)
+        assert (judged.ruling, judged.why) == (ruling, why)
+        assert judged.predicted

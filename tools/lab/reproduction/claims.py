@@ -1,0 +1,576 @@
+"""The claims of the paper, section by section: its sentence, the experiments and the rule that
+judge it, and the reason of the ruling if it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from rack.tools.lab.reproduction import predictions, rules
+from rack.tools.lab.reproduction.experiments import (
+    deadline,
+    determinism,
+    losses,
+    partition,
+    response,
+    sharing,
+    switch,
+    systems,
+    tables,
+    tasks,
+)
+from rack.tools.lab.reproduction.experiments.experiment import Workshop
+from rack.tools.lab.reproduction.experiments.figures import (
+    BEHIND,
+    BUFFERED,
+    FIG2,
+    FIG3,
+    FIG4,
+    IN_LINE,
+    LONG_2,
+    OVERLOAD,
+    SHORT_2,
+    SHORT_3,
+    FigureRack,
+    settings_of,
+)
+from rack.tools.lab.reproduction.experiments.nasrem import NASREM, NasremRun
+from rack.tools.lab.reproduction.page import Evidence, PaperClaim, Section
+from rack.tools.lab.reproduction.verdict import ClaimVerdict
+
+
+def _equation(
+    number: str,
+    form: str,
+    quote: str,
+    config: str,
+    settings: tuple[str, ...] = (),
+    judge: Callable[[NasremRun], ClaimVerdict] | None = None,
+    is_pictured: bool = False,
+) -> PaperClaim:
+    """Return an equation as a claim; it fails in this config with these settings."""
+    return PaperClaim(
+        f"equation-{number}",
+        f"Equation {number}: {form}",
+        quote,
+        "It holds for every level, in the worst cycle too.",
+        (NASREM,),
+        judge or partial(rules.judge_equation, number),
+        partial(predictions.predict_equation, number, config, settings),
+        is_pictured,
+    )
+
+
+def _figure(
+    name: str,
+    title: str,
+    quote: str,
+    why: str,
+    racks: tuple[FigureRack, ...],
+    judge: Callable[..., ClaimVerdict],
+    predict: Callable[[Workshop], tuple[Evidence, ...]] = lambda workshop: (),
+) -> PaperClaim:
+    """Return a claim on runs of figures, which the page shows."""
+    return PaperClaim(
+        name,
+        title,
+        quote,
+        why,
+        tuple(rack.experiment for rack in racks),
+        judge,
+        predict,
+        True,
+    )
+
+
+def _system(
+    name: str,
+    title: str,
+    quote: str,
+    rates_hz: dict[str, int],
+    judge: Callable[..., ClaimVerdict] = rules.judge_links,
+    rack: str = "",
+) -> PaperClaim:
+    """Return a claim on one of the paper's systems, judged by the messages between its sides."""
+    why = "Both sides worked together until the task was done."
+    experiments = (tasks.TASKS[rack or name],)
+    return PaperClaim(name, title, quote, why, experiments, partial(judge, rates_hz))
+
+
+HURRIED = ("timing.response_ms=1000",)
+"""A response within 1 s is demanded of NASREM's four levels."""
+SECTIONS = (
+    Section(
+        "abstract",
+        "",
+        (
+            PaperClaim(
+                "determinism",
+                "Determinism is the measure",
+                "Determinism, not performance, is the key element in assessing a control model.",
+                "Two runs in lockstep and one in real time wrote the same messages, bit for bit.",
+                (determinism.DETERMINISM,),
+                rules.judge_determinism,
+            ),
+        ),
+    ),
+    Section(
+        "1",
+        "Introduction",
+        (
+            _figure(
+                "speedup",
+                "Speedup by processors",
+                "A robot controller will be characterized as a speedup-oriented multiprocessing"
+                " application.",
+                "A level makes more plans on two processors than on one.",
+                (FIG3, FIG4),
+                rules.judge_speedup,
+            ),
+            PaperClaim(
+                "growth",
+                "Modular growth",
+                "Multiprocessor systems are beneficial for many reasons, including ... modular"
+                " growth.",
+                "After five boards were added to five, all cycles were in time.",
+                (sharing.CHAINS,),
+                rules.judge_growth,
+            ),
+            PaperClaim(
+                "replication",
+                "Reliability through replication",
+                "... reliability through replication ...",
+                "",
+                (),
+                rules.judge_replication,
+            ),
+            PaperClaim(
+                "communication",
+                "The cost of communication",
+                "The cost of communications must not negate the time savings obtained by parallel"
+                " execution on the different processors.",
+                "Communication takes less processor time than a second processor saves.",
+                (NASREM, partition.PARTITION),
+                rules.judge_communication,
+            ),
+        ),
+    ),
+    Section(
+        "2",
+        "Concurrent Hierarchical Real-Time Control",
+        (
+            PaperClaim(
+                "figure-1",
+                "Figure 1: information flow",
+                "Figure 1 illustrates the information flow in the concurrent hierarchical model.",
+                "Commands went down and statuses up in every cycle of every level.",
+                (NASREM,),
+                rules.judge_flow,
+            ),
+            PaperClaim(
+                "virtual-control-loop",
+                "The virtual control loop",
+                "Virtual control ... consists of the following periodic actions: 1) inputting"
+                " status and commands ..., 2) producing a goal-directed output ..., and 3)"
+                " outputting an action ... and a status.",
+                "All cycles of all levels ended within their bound.",
+                (NASREM,),
+                rules.judge_loop,
+            ),
+            PaperClaim(
+                "locks",
+                "lock; read; unlock",
+                "... lock and unlock are primitives that guarantee mutual exclusion.",
+                "Boards that lock every mailbox for each access kept all their cycles.",
+                (sharing.CHAINS,),
+                rules.judge_locks,
+            ),
+            _figure(
+                "planner-and-executor",
+                "Planner and executor run at once",
+                "The planner and executor can run concurrently within a level, thus insuring a"
+                " predictable level response.",
+                "No cycle of an executor was late while its planner computed.",
+                (FIG2, FIG4),
+                rules.judge_both,
+            ),
+            PaperClaim(
+                "bounded-waits",
+                "A dead board or sensor does not stall the system",
+                "A level awaiting a reading from a failed sensor could loop forever.",
+                "Every loss was detected and over within its bounds, and the tasks were done.",
+                (losses.KILLS, losses.SENSORS),
+                rules.judge_losses,
+            ),
+            PaperClaim(
+                "pipeline",
+                "Five levels take five cycles",
+                "It would take 5 control cycles for information from the top level to filter down"
+                " to the bottom level in a five layer hierarchy.",
+                "Every message took five cycles.",
+                (sharing.CHAINS,),
+                rules.judge_pipeline,
+            ),
+        ),
+    ),
+    Section(
+        "3",
+        "Timing Analysis",
+        (
+            PaperClaim(
+                "soft-and-real-time",
+                "GOTO A, and GOTO A BY t",
+                "GOTO A BY t_i, GOTO B BY t_i+1 ... demands real time handling.",
+                "A time that is too early is refused before anything moves; one that is promised"
+                " is met.",
+                (deadline.DEADLINE,),
+                rules.judge_goto,
+            ),
+        ),
+    ),
+    Section(
+        "3.1",
+        "System Response Time",
+        (
+            _equation(
+                "3.1",
+                "t_proc + t_c = R_i ≤ R_max",
+                "... the ith level spends t_c seconds communicating/waiting for commands and"
+                " status, and t_proc processing.",
+                "fig4-overload",
+            ),
+            _equation(
+                "3.2",
+                "R_s ≤ n R_max",
+                "An upper bound to the system response time R_s can be calculated.",
+                "nasrem",
+                HURRIED,
+            ),
+            _equation(
+                "3.3",
+                "R_s = Σ R_i + Σ R_j",
+                "This leads to a definition of R_s, system response time, as the sum of R_i"
+                " response times tied to the machine update rate, and the sum of R_j response"
+                " times arbitrarily set.",
+                "nasrem",
+                HURRIED,
+                rules.judge_sum,
+            ),
+        ),
+    ),
+    Section(
+        "3.2",
+        "Low-Level Timing Requirements",
+        (
+            _equation(
+                "3.4",
+                "t_exec < R_max",
+                "t_exec, the time the executor runs each cycle, is less than the level response"
+                " time limit maximum.",
+                "fig4-overload",
+                settings_of("fig4-overload", 6.0),
+            ),
+            _equation(
+                "3.5",
+                "R_i = t_exec + t_comm + t_residual",
+                "R_i is composed of t_exec, ... t_comm, ... and t_residual, time remaining before"
+                " the next cycle.",
+                "fig4-overload",
+            ),
+            _equation(
+                "3.6",
+                "0 < t_residual ≤ R_i - max t_exec - max t_comm",
+                "[The residual] must be bounded by a sum of the worst case times for both"
+                " processing and communication.",
+                "fig4",
+                settings_of("fig4", 3.0),
+                is_pictured=True,
+            ),
+        ),
+    ),
+    Section(
+        "3.3",
+        "Higher-Level Timing Requirements",
+        (
+            _figure(
+                "background",
+                "Background input and output",
+                "Increased time at higher levels allows slower options to execute in the"
+                " background, such as secondary data storage.",
+                "Data stored in the background made no cycle late; stored in the cycle they do.",
+                (BEHIND, IN_LINE),
+                rules.judge_background,
+            ),
+            PaperClaim(
+                "loosely-coupled",
+                "Loosely coupled machines above",
+                "Loosely-coupled machines could conceivably link together in a distributed"
+                " control system at the very highest levels.",
+                "The servo rack kept its cycles, and responded as much later as the network was"
+                " slower.",
+                (tasks.NETWORK, tasks.LATER),
+                rules.judge_loose,
+            ),
+            _equation(
+                "3.7",
+                "t_i+1 = t_i + c",
+                "Levels execute every cycle and these cycles are of fixed time c.",
+                "nasrem",
+                ("board.primitive.rate_hz=60",),
+            ),
+            PaperClaim(
+                "waiting",
+                "Blocking, and polling the clock",
+                "The executor could busy/wait and poll on a system clock ... where the time for a"
+                " context switch ... may be too large.",
+                "A board that polls starts its cycles sooner.",
+                (sharing.WAITS,),
+                rules.judge_waits,
+            ),
+            _equation(
+                "3.8",
+                "t_plan / d < t_residual - 2 t_cs",
+                "The planner must finish any plan within d cycles.",
+                "fig3",
+            ),
+            _equation(
+                "3.9",
+                "R_i = t_exec + t_comm + t_plan+residual + 2 t_cs",
+                "Including the planner on the same processor adds two extra context switches to a"
+                " cycle.",
+                "fig3",
+                settings_of("fig3", 3.0),
+            ),
+            _figure(
+                "update",
+                "The update of the plan is not preempted",
+                "Mutual exclusion requires a non-preemptable multitasking scheduler to prevent"
+                " preemption of the lower priority planner in its critical section.",
+                "An executor released during the update of its plan waited for the end of it.",
+                (FIG3,),
+                rules.judge_update,
+            ),
+            _equation(
+                "3.10",
+                "t_e,p-comm ≪ R_i",
+                "The planner to executor communication is small.",
+                "fig2",
+                ("timing.small_share=0.1",),
+            ),
+            _figure(
+                "slices-and-buffers",
+                "Time slices and double buffers",
+                "... interprocessor communication ... should use a scheme that incorporates time"
+                " slices or double-buffers for plan update.",
+                "With either no cycle of the executor was late.",
+                (FIG4, BUFFERED),
+                rules.judge_both,
+            ),
+        ),
+    ),
+    Section(
+        "3.4",
+        "Algorithm Timing Analysis",
+        (
+            _figure(
+                "figure-2",
+                "Figure 2: one processor, 8 ms",
+                "All the functions can run tightly-coupled on one processor in one cycle, with"
+                " sufficient residual processing time.",
+                "It works, as the paper says (C: communicate, R: read, X: execute, W: write, P:"
+                " plan, U: update).",
+                (FIG2,),
+                rules.judge_working,
+                partial(predictions.predict_figure, FIG2),
+            ),
+            _figure(
+                "figure-2-x",
+                "Figure 2 with X from 1 to 3 ms",
+                "X ... will range from 1 to 3 ms ... The planner runs at least 3 ms. each cycle"
+                " which implies that after two cycles 6 ms. will have been allotted to the"
+                " planner.",
+                "With the longest X both sentences exclude each other. Runs agree.",
+                (SHORT_2, LONG_2),
+                rules.judge_sweep,
+                predictions.predict_sweep,
+            ),
+            _figure(
+                "figure-3",
+                "Figure 3: one processor, 6 ms",
+                "A 6 ms. response time allows insufficient time for planning, so that within 3"
+                " cycles no updated plan exists.",
+                "It fails with every X, as the paper says.",
+                (FIG3, SHORT_3),
+                rules.judge_failing,
+                partial(predictions.predict_figure, FIG3),
+            ),
+            _figure(
+                "figure-4",
+                "Figure 4: two processors, 6 ms",
+                "The control level effectively meets all timing constraints with some"
+                " computational waste.",
+                "It works, as the paper says.",
+                (FIG4,),
+                rules.judge_working,
+                partial(predictions.predict_figure, FIG4),
+            ),
+            _figure(
+                "figure-4-overload",
+                "Figure 4 with X = 4 ms",
+                "If the function X is replaced by a newer version which requires 4 ms. a cycle,"
+                " then the above functional allocation across processors will not work.",
+                "It fails, as the paper says.",
+                (OVERLOAD,),
+                rules.judge_failing,
+                partial(predictions.predict_figure, OVERLOAD),
+            ),
+        ),
+    ),
+    Section(
+        "4",
+        "Application of Concurrent Hierarchical Control",
+        (
+            PaperClaim(
+                "state-tables",
+                "The earlier controller: executors and state tables",
+                "The flow of control featured state-table transitions.",
+                "The task was done with and without a disturbance; own transitions answered it.",
+                (tables.TABLES,),
+                rules.judge_tables,
+            ),
+            PaperClaim(
+                "nasrem",
+                "NASREM: four levels, 400 and 50 Hz",
+                "The executor [of the primitive level] runs at 50Hz ... the robot receives torque"
+                " commands at updates of 400 Hz.",
+                "All levels kept their rates, and no cycle was left out.",
+                (NASREM,),
+                rules.judge_levels,
+            ),
+            PaperClaim(
+                "context-switch",
+                "The context switch",
+                "Task-switching is approximately 100 microseconds.",
+                "NIST's boards cannot be measured any more; this machine is faster.",
+                (switch.SWITCH,),
+                rules.judge_switch,
+            ),
+            _system(
+                "host-services",
+                "Services of hosts, over the adapter",
+                "The hosts provide non-real-time services.",
+                {"workstation.plan": 1, "adapter.hand": 50, "adapter.world": 50},
+                rack="condor",
+            ),
+            PaperClaim(
+                "figure-5",
+                "Figure 5: concurrency by cycle time",
+                "Multitasking on a single processor supplies enough processing power for both the"
+                " planner and executor [at higher levels].",
+                "Slow levels do with multitasking, and fast ones do not.",
+                (partition.PARTITION,),
+                rules.judge_figure_5,
+                predictions.predict_figure_5,
+            ),
+        ),
+    ),
+    Section(
+        "4.1",
+        "Comparison of Concurrent Hierarchical Control to Other Models",
+        (
+            PaperClaim(
+                "systems",
+                "The systems next to each other",
+                "These architectures share common characteristics with the concurrent,"
+                " hierarchical control model.",
+                "All systems do their tasks on one set of mechanisms, within their bounds.",
+                (*systems.SYSTEMS, *tasks.TASKS.values()),
+                rules.judge_systems,
+            ),
+            PaperClaim(
+                "two-levels",
+                "At least two levels",
+                "Most systems have at least a two-level hierarchy.",
+                "From the configs alone: no level is faster than one below it.",
+                (),
+                lambda: rules.judge_layers(predictions.promise_systems()),
+            ),
+            _system(
+                "rccl",
+                "RCCL: a processor a joint",
+                "The joint control level operates at 1 kHz and assigns 1 processor per joint.",
+                {
+                    "planning.plan": 1,
+                    "trajectory.command": 50,
+                    **{f"joint{number}.command": 1000 for number in range(1, 7)},
+                },
+                rules.judge_rccl,
+            ),
+            _system(
+                "hic",
+                "HIC: layers of servo loops",
+                "This model emphasis layers of servo loops with deterministic scheduling.",
+                {"tendon.command": 500, "joint.command": 500, "fingertip.command": 125},
+            ),
+            _system(
+                "condor",
+                "CONDOR: boards, an adapter and a workstation",
+                "... Motorola 68020 based boards connected by VME bus to VME bus adapter to a"
+                " SUN-3 workstation controlling the Utah/MIT hand.",
+                {"workstation.plan": 1, "adapter.plan": 1},
+            ),
+            _system(
+                "ibm",
+                "IBM: a real-time bridge",
+                "IBM extends the exchange of commands and status to include varying frequencies.",
+                {"bridge.requests": 1, "bridge.sensors": 50, "bridge.motion": 200},
+            ),
+            _system(
+                "chimera",
+                "CHIMERA: motion control and commands",
+                "... low-level real-time motion control connected to a non-real-time AML/X"
+                " command environment.",
+                {"command.requests": 1, "bridge.requests": 1},
+            ),
+            _system(
+                "penn",
+                "Pennsylvania: a server of forces and motions",
+                "... a robot coordinator issue force and motion commands to a real-time robot"
+                " force and motion server.",
+                {"coordinator.requests": 1, "bridge.requests": 1},
+            ),
+            # The servo rack begins later: of it and of the network, four messages of five.
+            _system(
+                "brown",
+                "Brown: servo systems on a network",
+                "... high-speed networks connecting a real-time servo systems and general"
+                " computing resources.",
+                {
+                    "planning.plan": 1,
+                    "trajectory.command": 50,
+                    "lan.reference": 40,
+                    "lan.joints": 40,
+                    "supervisor.command": 400,
+                },
+            ),
+        ),
+    ),
+    Section(
+        "5",
+        "Conclusion",
+        (
+            PaperClaim(
+                "predictable-response",
+                "Predictable response",
+                "The regulated and predictable behavior of the virtual control loop leads to"
+                " timing metrics guaranteeing performance.",
+                "Commands took effect at the predicted tick, in real time within equations 3.2"
+                " and 3.3.",
+                (response.RESPONSE,),
+                rules.judge_predictable,
+                is_pictured=True,
+            ),
+        ),
+    ),
+)
+"""The sections of the page, in the paper's order."""

@@ -1,0 +1,186 @@
+"""The context switch t_cs of eqs 3.8 and 3.9: an executor wakes up while its planner computes on
+the same core.
+
+The planner reads the clock in a loop until it sees a gap; the executor notes when it was awake. The
+gap without the executor's time is the two switches.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from multiprocessing.synchronize import Barrier, Semaphore
+from threading import BrokenBarrierError
+from time import monotonic_ns
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rack.backplane.process import die_with_parent, pin, set_priority
+from rack.levels.timing.trace_times import Distribution, distribution
+from rack.tools.console.answer import Failure
+from rack.tools.lab.benches.harness import pinned
+from rack.tools.lab.reproduction.experiments.experiment import (
+    Experiment,
+    Workshop,
+    need_real_time,
+)
+
+NAME = "nasrem"
+PAPER_US = 100.0
+"""Task switch on NIST's boards (NISTIR 90-4251, section 4)."""
+WAKES = 1000
+PERIOD_S = 0.002
+HEAD_START_S = 0.0005
+EXECUTOR = 80
+PLANNER = 1
+"""SCHED_FIFO priorities: no task under ordinary scheduling runs between the two."""
+PATIENCE_NS = 20_000_000
+READY_S = 20.0
+LAUNCH_S = 3.0
+
+
+@dataclass(frozen=True)
+class SwitchCost:
+    """Times in us over `wakes` wake-ups on `core`.
+
+    `in_us` is from planner to executor, `out_us` back; `switch_us`, t_cs, is half of both together.
+    """
+
+    core: int
+    wakes: int
+    in_us: Distribution
+    out_us: Distribution
+    switch_us: Distribution
+
+
+@dataclass(frozen=True)
+class SwitchRun:
+    """The context switch of this machine, and the one that the config assumes, us."""
+
+    cost: SwitchCost
+    assumed_us: float
+
+
+def _run(workshop: Workshop) -> SwitchRun:
+    need_real_time(cores=2)
+    assumed_us = 1e3 * workshop.config(NAME).timing.context_switch_ms
+    return SwitchRun(measure(), assumed_us)
+
+
+SWITCH = Experiment("switch", "the context switch", WAKES * PERIOD_S + LAUNCH_S, SwitchRun, _run)
+
+
+class _Shared(NamedTuple):
+    """Shared by both processes. `gaps` and `awake` hold two times per wake-up, ns."""
+
+    parent: int
+    core: int
+    wakes: int
+    gaps: Any
+    awake: Any
+    start: Barrier
+
+
+def measure() -> SwitchCost:
+    """Measure on the last core of this machine, woken from the first. Raises `Failure` if the
+    processes cannot run at real-time priorities."""
+    cores = sorted(os.sched_getaffinity(0))
+    spawn = multiprocessing.get_context("spawn")
+    gaps, awake = spawn.RawArray("q", 2 * WAKES), spawn.RawArray("q", 2 * WAKES)
+    shared = _Shared(os.getpid(), cores[-1], WAKES, gaps, awake, spawn.Barrier(3))
+    wake, work = spawn.Semaphore(0), spawn.Semaphore(0)
+    with ExitStack() as stack:
+        processes = []
+        for loop, semaphore in ((_execute, wake), (_plan, work)):
+            process = spawn.Process(target=_start, args=(loop, semaphore, shared), daemon=True)
+            process.start()
+            stack.callback(process.join)
+            stack.callback(process.kill)
+            processes.append(process)
+        # This process is kept off the measured core.
+        stack.enter_context(pinned(cores[0]))
+        try:
+            shared.start.wait(READY_S)
+        except BrokenBarrierError:
+            raise Failure(
+                "a process of the measurement did not start, or SCHED_FIFO is refused"
+            ) from None
+        for _ in range(WAKES):
+            work.release()
+            time.sleep(HEAD_START_S)
+            wake.release()
+            time.sleep(PERIOD_S - HEAD_START_S)
+        for process in processes:
+            process.join(READY_S)
+    return cost_of(cores[-1], np.reshape(gaps, (-1, 2)), np.reshape(awake, (-1, 2)))
+
+
+def _start(
+    loop: Callable[[Semaphore, _Shared], None], semaphore: Semaphore, shared: _Shared
+) -> None:
+    """Pin this process, set its priority, wait for the other one, and run its loop."""
+    die_with_parent(shared.parent)
+    pin(shared.core)
+    if not set_priority(EXECUTOR if loop is _execute else PLANNER):
+        shared.start.abort()
+    shared.start.wait(READY_S)
+    loop(semaphore, shared)
+
+
+def _execute(semaphore: Semaphore, shared: _Shared) -> None:
+    """Wake up and wait again: an executor with nothing to do."""
+    awake = shared.awake
+    for at in range(shared.wakes):
+        semaphore.acquire()
+        awake[2 * at] = monotonic_ns()
+        awake[2 * at + 1] = monotonic_ns()
+
+
+def _plan(semaphore: Semaphore, shared: _Shared) -> None:
+    """Compute when there is work, until the executor has interrupted; keep the longest gap."""
+    gaps = shared.gaps
+    awake = shared.awake
+    for at in range(shared.wakes):
+        semaphore.acquire()
+        begin = last = monotonic_ns()
+        longest = 0
+        over = 2 * at + 1
+        seen = 0
+        while not seen and last - begin < PATIENCE_NS:
+            # Read before the clock: wherever in this loop the executor interrupts, the next clock
+            # value shows it.
+            seen = awake[over]
+            now = monotonic_ns()
+            if now - last > longest:
+                longest = now - last
+                gaps[2 * at] = last
+                gaps[over] = now
+                now = monotonic_ns()
+            last = now
+
+
+def cost_of(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
+    """Return the cost over the wake-ups that interrupted the planner.
+
+    Args:
+        core: Core of both processes.
+        gaps: Begin and end of the planner's longest gap by wake-up, ns, shape (n, 2).
+        awake: Begin and end of the executor's time awake, ns, shape (n, 2).
+
+    Raises:
+        Failure: If no wake-up interrupted the planner.
+    """
+    found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
+    if not found.any():
+        raise Failure("no wake-up interrupted the planner: the machine is too busy to measure")
+    into = (awake - gaps)[found, 0] * 1e-3
+    back = (gaps - awake)[found, 1] * 1e-3
+    in_us, out_us, switch_us = (
+        distribution(times) or {} for times in (into, back, (into + back) / 2)
+    )
+    return SwitchCost(core, int(found.sum()), in_us, out_us, switch_us)
