@@ -12,22 +12,17 @@ from rack.backplane.json_text import encode_json
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, System
+from rack.backplane.words import System
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console, fitted
-from rack.tools.live.message_text import MessageText
+from rack.tools.live.message_text import DROPPED, MessageText, list_mailboxes
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import mailbox_of
 
 LOOK_S = 0.1
 PLAIN_S = 1.0
 """Times between looks, real time: on a terminal or as JSON, and as plain text."""
-COLUMNS = ("mailbox", "message", "writer", "readers", "protocol", "period_ms", "bytes", "written")
-"""Of the list of mailboxes, as in its JSON."""
-DROPPED = ("bytes", "message", "protocol", "readers")
-"""Columns that a narrow terminal leaves out, in this order."""
-
 Name = Annotated[
     str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
 ]
@@ -54,9 +49,9 @@ def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Js
     if name is None:
         if watch:
             raise Failure("--watch needs the NAME of a mailbox", 2)
-        rows = [_row(segment, box) for box in segment.layout.mailboxes]
-        cells = [[str(row[column]) for column in COLUMNS] for row in rows]
-        print_answer(rows, fitted(COLUMNS, cells, DROPPED), as_json)
+        rows = list_mailboxes(segment)
+        cells = [[*map(str, row.values())] for row in rows]
+        print_answer(rows, fitted([*rows[0]], cells, DROPPED), as_json)
         return
     messages = Messages(segment, mailbox_of(name, segment.layout.mailboxes))
     if watch:
@@ -87,19 +82,6 @@ def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
                 live.update(Text("\n".join(messages.lines(found[-1]))), refresh=True)
             elif found:
                 print(*messages.lines(found[-1]), "", sep="\n", flush=True)
-
-
-def _row(segment: Segment, box: MailboxSpec) -> Document:
-    return {
-        "mailbox": box.name,
-        "message": f"{box.message} {box.version}",
-        "writer": box.writer,
-        "readers": ", ".join(box.readers) or "-",
-        "protocol": box.protocol,
-        "period_ms": round(box.every * segment.layout.clock_ns * 1e-6, 6),
-        "bytes": box.size,
-        "written": segment.words[segment.map.mailboxes[box.name] // 8 + Box.HEAD],
-    }
 
 
 class Messages:

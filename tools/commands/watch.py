@@ -18,7 +18,7 @@ from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console
-from rack.tools.live.signals import Lines, Plot, SignalTap, Strip, Written, cell
+from rack.tools.live.signals import Lines, Plot, Rows, Strip, cell
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import Signal, Trigger
 
@@ -97,14 +97,19 @@ def watch(
         _show(segment, shown, every_s, as_json)
         return
     _check_writable(out or Path(f"{rack}.csv"))
-    capture = Capture(segment, shown, Trigger.of(when, boxes), before_s, after_s)
-    capture.wait()
-    path = out or Path(f"{rack}-{capture.tick}.csv")
-    rows = capture.save(path)
-    time_s = capture.strip.time_s(capture.tick)
+    trigger = Trigger.of(when, boxes)
+    ticks_before, ticks_after = (
+        round(s * 1e9 / segment.layout.clock_ns) for s in (before_s, after_s)
+    )
+    strip = Strip(segment, shown, ticks_before + ticks_after, [trigger.signal])
+    tick = _await_moment(segment, strip, trigger, ticks_after)
+    path = out or Path(f"{rack}-{tick}.csv")
+    rows = strip.table(tick - ticks_before, tick + ticks_after)
+    _save(path, strip, rows)
+    time_s = strip.time_s(tick)
     print_answer(
-        {"file": str(path), "tick": capture.tick, "time_s": time_s, "rows": rows},
-        f"{when}: held first at {time_s:g} s, tick {capture.tick}; {rows} rows around it: {path}",
+        {"file": str(path), "tick": tick, "time_s": time_s, "rows": len(rows)},
+        f"{when}: held first at {time_s:g} s, tick {tick}; {len(rows)} rows around it: {path}",
         as_json,
     )
 
@@ -132,10 +137,6 @@ def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: 
     """Show signals until the run is over."""
     span = round(SHOWN_S * 1e9 / segment.layout.clock_ns)
     strip = Strip(segment, signals, span)
-    tap = SignalTap(segment, signals)
-    lost = 0
-    for written in tap.take():
-        strip.add(written)
     first = segment.words[System.TICK]
     view: Lines | Plot = Lines(strip, first, round(every_s / strip.tick_s), as_json)
     terminal = console()
@@ -146,77 +147,38 @@ def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: 
             except ImportError:
                 print("no curves without plotext: pip install 'nasrem-rack[live]'", file=sys.stderr)
         for is_over in looks(segment, LOOK_S):
-            for written in tap.take():
-                strip.add(written)
-                lost += written.lost
+            strip.take()
             settles = 0 if is_over else strip.settles
             view.show(segment.words[System.TICK] - settles)
-    if lost:
-        raise Failure(f"{lost} messages were overwritten before they could be shown")
+    if strip.lost:
+        raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 
 
-class Capture:
-    """The tick at which a condition first holds, and the signals around it."""
+def _await_moment(segment: Segment, strip: Strip, trigger: Trigger, after: int) -> int:
+    """Return the tick at which a condition first holds, once the `after` ticks behind it are there.
+    Raises `Failure` when the run ends before."""
+    tick = -1
+    for _ in looks(segment, LOOK_S):
+        for written in strip.take():
+            if tick < 0 and written.mailbox == trigger.signal.mailbox:
+                held = written.ticks[trigger.holds(written.messages)]
+                tick = int(held[0]) if len(held) else -1
+        if tick >= 0 and segment.words[System.TICK] > tick + after + strip.settles:
+            break
+    if tick < 0:
+        why = "was interrupted" if INTERRUPT.number else "the run is over"
+        raise Failure(f"rack '{segment.rack}': the condition has not held; {why}")
+    return tick
 
-    def __init__(
-        self,
-        segment: Segment,
-        signals: Sequence[Signal],
-        condition: Trigger,
-        before_s: float,
-        after_s: float,
-    ) -> None:
-        tick_s = segment.layout.clock_ns * 1e-9
-        self._segment = segment
-        self._condition = condition
-        self._before = round(before_s / tick_s)
-        self._after = round(after_s / tick_s)
-        self._tap = SignalTap(segment, [condition.signal, *signals])
-        self._lost = 0
-        self.strip = Strip(segment, signals, self._before + self._after)
-        self.tick = -1  # -1: it has not held yet
 
-    def wait(self) -> None:
-        """Wait until everything around the moment is there. Raises `Failure` when the run ends
-        before the moment."""
-        for written in self._tap.take():
-            # Written before anyone asked: it does not count, but may be around the moment.
-            self.strip.add(written)
-        for _ in looks(self._segment, LOOK_S):
-            for written in self._tap.take():
-                self._look(written)
-            if self._is_complete():
-                break
-        if self.tick < 0:
-            why = "was interrupted" if INTERRUPT.number else "the run is over"
-            raise Failure(f"rack '{self._segment.rack}': the condition has not held; {why}")
-
-    def _look(self, written: Written) -> None:
-        self._lost += written.lost
-        self.strip.add(written)
-        if self.tick < 0 and written.mailbox == self._condition.signal.mailbox:
-            held = written.ticks[self._condition.holds(written.messages)]
-            if len(held):
-                self.tick = int(held[0])
-
-    def _is_complete(self) -> bool:
-        last = self.tick + self._after + self.strip.settles
-        return self.tick >= 0 and self._segment.words[System.TICK] > last
-
-    def save(self, path: Path) -> int:
-        """Write the CSV file; return its number of rows. Raises `Failure` when messages are
-        missing."""
-        rows = self.strip.table(self.tick - self._before, self.tick + self._after)
-        try:
-            with path.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file)
-                heads = (signal.head for signal in self.strip.signals)
-                writer.writerow(["time, s", "tick", *heads])
-                writer.writerows(
-                    [self.strip.time_s(tick), tick, *map(cell, values)] for tick, values in rows
-                )
-        except OSError as error:
-            raise Failure(f"{path}: {error.strerror}: cut off") from None
-        if self._lost:
-            raise Failure(f"{path}: {self._lost} messages were overwritten before they were taken")
-        return len(rows)
+def _save(path: Path, strip: Strip, rows: Rows) -> None:
+    """Write the CSV file. Raises `Failure` when messages are missing."""
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time, s", "tick", *(signal.head for signal in strip.signals)])
+            writer.writerows([strip.time_s(tick), tick, *map(cell, row)] for tick, row in rows)
+    except OSError as error:
+        raise Failure(f"{path}: {error.strerror}: cut off") from None
+    if strip.lost:
+        raise Failure(f"{path}: {strip.lost} messages were overwritten before they were taken")

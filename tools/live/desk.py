@@ -164,16 +164,13 @@ class LiveDesk:
         ticket = entry[RequestWord.TICKET]
         text = describe(message_of(entry, self._segment.layout))
         about = f"'{level}', {text}"
-        patience = _Patience(
-            self._rack, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}"
-        )
-        while entry[RequestWord.TICKET] == ticket:
+        for is_over in self._looks(about, f"waiting for tick {max(0, entry[RequestWord.TICK])}"):
+            if entry[RequestWord.TICKET] != ticket:
+                break
             if entry.stage == RequestStage.GIVEN:
                 return Reply(entry[RequestWord.SERIAL], level, text, entry[RequestWord.GIVEN_TICK])
-            if patience.is_in_vain:
+            if is_over:
                 raise Failure(f"{about}: the run ended before it was given")
-            if not patience.look_again():
-                raise Failure(f"{about}: not given, the clock has not ticked for {SILENT_S:g} s")
         raise Failure(f"{about}: given, but its reply is lost: too many commands followed")
 
     def _await_reply(self, reply: Reply, wait: bool, timeout_s: float | None) -> Reply:
@@ -183,26 +180,44 @@ class LiveDesk:
             return reply
         replies = Replies(self._segment, status, reply)
         last = LastCycle(self._segment, status)
-        about = f"command {reply.serial}: "
-        patience = _Patience(
-            self._rack, f"{about}waiting for '{reply.level}', which runs every {status.every} ticks"
-        )
-        while True:
-            # Before the look: a reply written just before the run ended still counts.
-            in_vain = patience.is_in_vain
+        about = f"command {reply.serial}"
+        awaited = f"waiting for '{reply.level}', which runs every {status.every} ticks"
+        for is_over in self._looks(about, awaited):
             late = last.passed(self._segment.words[System.TICK])
             reply = replies.look()
             if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
-                return reply
-            if in_vain:
+                break
+            if is_over:
                 raise Failure(f"{reply.line}; the run ended")
             if reply.fate == "given" and late:
-                raise Failure(f"{about}'{reply.level}' {late}")
+                raise Failure(f"{about}: '{reply.level}' {late}")
             if time.monotonic() > deadline:
                 still = f"in force until: {resume_command(self._segment.rack, reply.level)}"
                 raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
-            if not patience.look_again():
-                raise Failure(f"{about}the clock has not ticked for {SILENT_S:g} s")
+        return reply
+
+    def _looks(self, about: str, awaited: str) -> Iterator[bool]:
+        """Yield again and again whether the run is over, for as long as the clock ticks or the rack
+        is held; explain a long wait on stderr, once."""
+        words = self._segment.words
+        tick = words[System.TICK]
+        changed = time.monotonic()
+        note_at = changed + NOTE_S
+        while True:
+            # Asked before the look: a reply written just before the run ended still counts.
+            yield self._segment.run_is_over
+            self._rack.refresh()
+            now = time.monotonic()
+            if tick != words[System.TICK] or words[System.HELD]:
+                tick = words[System.TICK]
+                changed = now
+            if now > note_at:
+                note_at = math.inf
+                print(
+                    f"{about}: {awaited}; the rack is at tick {tick}", file=sys.stderr, flush=True
+                )
+            if now - changed >= SILENT_S:
+                raise Failure(f"{about}: not answered, the clock has not ticked for {SILENT_S:g} s")
 
     def _in_force(self, level: str) -> str:
         """Return the operator's command in force at a level; empty: none."""
@@ -250,33 +265,3 @@ def _number(text: str, word: str) -> float:
             " joints=0,0.5,1"
         )
         raise Failure(f"'{word}': {why}", 2) from None
-
-
-class _Patience:
-    """Waits as long as the rack's clock ticks, or is held; explains a long wait on stderr, once."""
-
-    def __init__(self, rack: WatchedRack, what: str) -> None:
-        self._rack = rack
-        self._words = rack.segment.words
-        self._what = what
-        self._tick = self._words[System.TICK]
-        self._changed = time.monotonic()
-        self._note_at: float | None = self._changed + NOTE_S
-
-    def look_again(self) -> bool:
-        """Wait a moment; return False when the clock has not ticked for too long."""
-        self._rack.refresh()
-        now = time.monotonic()
-        tick = self._words[System.TICK]
-        if tick != self._tick or self._words[System.HELD]:
-            self._tick = tick
-            self._changed = now
-        if self._note_at is not None and now > self._note_at:
-            self._note_at = None
-            print(f"{self._what}; the rack is at tick {tick}", file=sys.stderr, flush=True)
-        return now - self._changed < SILENT_S
-
-    @property
-    def is_in_vain(self) -> bool:
-        """Whether the run is over."""
-        return self._rack.segment.run_is_over

@@ -17,6 +17,9 @@ from rack.tools.recording.signal import Signal
 if TYPE_CHECKING:
     from rich.console import Console
 
+Rows = list[tuple[int, list[Any]]]
+"""Ticks, and the value of each signal at each; None before a signal's first one."""
+
 
 class Written(NamedTuple):
     """Messages of one mailbox, oldest first, with the ticks at which they were released; before
@@ -45,10 +48,22 @@ class SignalTap:
 
 
 class Strip:
-    """The last values of some signals by tick. A signal keeps its value until its next message."""
+    """The last values of some signals by tick. A signal keeps its value until its next message.
 
-    def __init__(self, segment: Segment, signals: Sequence[Signal], span: int) -> None:
-        """Keep `span` ticks, and for each mailbox the message before them."""
+    Attributes:
+        settles: Ticks after which everything released at a tick has been written.
+        lost: Messages that were overwritten before they were taken.
+    """
+
+    def __init__(
+        self,
+        segment: Segment,
+        signals: Sequence[Signal],
+        span: int,
+        followed: Sequence[Signal] = (),
+    ) -> None:
+        """Keep `span` ticks, and for each mailbox the message before them; of signals that are only
+        `followed`, nothing."""
         specs = [segment.layout.mailbox(signal.mailbox) for signal in signals]
         self.signals = signals
         self.tick_s = segment.layout.clock_ns * 1e-9
@@ -57,21 +72,29 @@ class Strip:
         # One look may bring as much as a ring holds.
         self._span = span + self.settles + max(spec.every * spec.depth for spec in specs)
         self._rows: dict[str, deque[tuple[int, list[Any]]]] = defaultdict(deque)
+        self._tap = SignalTap(segment, [*signals, *followed])
+        self.lost = 0
+        self.take()
+        # What was overwritten before anyone asked does not count.
+        self.lost = 0
 
-    def add(self, written: Written) -> None:
-        """Add messages of a mailbox, if it is one of the signals'."""
-        own = [signal for signal in self.signals if signal.mailbox == written.mailbox]
-        if not own:
-            return
-        values = map(list, zip(*(signal.plain(written.messages) for signal in own), strict=True))
-        rows = self._rows[written.mailbox]
-        rows.extend(zip(written.ticks.tolist(), values, strict=True))
-        while len(rows) > 1 and rows[1][0] < rows[-1][0] - self._span:
-            rows.popleft()
+    def take(self) -> list[Written]:
+        """Take what was written since the last call, and return it."""
+        found = [*self._tap.take()]
+        for written in found:
+            self.lost += written.lost
+            own = [signal for signal in self.signals if signal.mailbox == written.mailbox]
+            if own:
+                values = zip(*(signal.plain(written.messages) for signal in own), strict=True)
+                rows = self._rows[written.mailbox]
+                rows.extend(zip(written.ticks.tolist(), map(list, values), strict=True))
+                while len(rows) > 1 and rows[1][0] < rows[-1][0] - self._span:
+                    rows.popleft()
+        return found
 
-    def table(self, first: int, last: int) -> list[tuple[int, list[Any]]]:
+    def table(self, first: int, last: int) -> Rows:
         """Return a row for each tick from `first` to `last` at which one of the signals was
-        released: the tick, and the value of each; None before a signal's first one."""
+        released."""
         changes = [
             (tick, mailbox, values)
             for mailbox, rows in self._rows.items()
@@ -167,7 +190,7 @@ class Plot:
             plot.plot(times, values, label=name, marker="braille")
         self._live.update(Text.from_ansi(plot.build()), refresh=True)
 
-    def _curves(self, rows: list[tuple[int, list[Any]]]) -> dict[str, list[tuple[float, float]]]:
+    def _curves(self, rows: Rows) -> dict[str, list[tuple[float, float]]]:
         """Return points by the name of the curve: a signal with several numbers has one for
         each."""
         curves = defaultdict(list)

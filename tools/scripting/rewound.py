@@ -22,7 +22,7 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.tables import fitted
 from rack.tools.live.continued import KeptStates, branched, state_at, tick_in
-from rack.tools.live.display import Display, event_line
+from rack.tools.live.display import Display, event_text
 from rack.tools.live.folder import folder_of
 from rack.tools.live.launch import run_rack
 from rack.tools.live.message_text import MessageText
@@ -159,7 +159,7 @@ class RewoundRun:
         span = around_s * 1e9 / self._layout.clock_ns
         events = (event for event in self.recording.events if event.get("tick", -1) >= 0)
         found = [event for event in events if abs(event["tick"] - self.tick) <= span]
-        lines = [f"{self.time_s(one['tick']):g} s  {event_line(Event(**one))}" for one in found]
+        lines = [f"{self.time_s(one['tick']):g} s  {event_text(Event(**one))}" for one in found]
         nothing = f"no events within {around_s:g} s of {self._now}"
         return Glance({"tick": self.tick, "events": found}, lines or [nothing])
 

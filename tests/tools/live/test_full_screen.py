@@ -67,11 +67,11 @@ async def write(pilot: Pilot[None], text: str) -> None:
 
 def test_the_panes_show_boards_mailboxes_events_and_lateness(running: str) -> None:
     async def act(pilot: Pilot[None]) -> None:
-        await shows(pilot, running, "upper", "lower", "missed", "slice", "executing")
+        await shows(pilot, running, "upper", "lower", "missed", "late ms", "executing")
         await pilot.press("2")
-        await shows(pilot, "upper.command", "readers", "50.", "400.")
+        await shows(pilot, "upper.command", "period_ms", "2.5", "20.0", "written")
         await pilot.press("4")
-        await shows(pilot, "late us", "upper", "█")
+        await shows(pilot, "late us", "upper", "< inf")
         await pilot.press("l")
         await shows(pilot, "lower")
         await write(pilot, "lower modify twice on")
