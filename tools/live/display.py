@@ -192,8 +192,10 @@ class RackView:
         yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
-            is_short = len(hold.line) <= width
-            yield Text(hold.line if is_short else "\n  ".join(hold.parts), style=HELD)
+            # In two lines where it is long: a command must not be wrapped.
+            is_long = len(hold.line) > width
+            shown = hold.line.replace("; to release", "\n  to release") if is_long else hold.line
+            yield Text(shown, style=HELD)
         if snapshot.progress is not None:
             yield Text(_progress(snapshot.progress))
 

@@ -44,13 +44,8 @@ class Hold:
     @property
     def line(self) -> str:
         """All of it as readable text."""
-        return "; ".join(self.parts)
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The same in one or two parts, for two lines: a command must not be wrapped."""
-        how = (f"to release: {self.release}",) if self.release else ()
-        return (f"{self.level} {self.why}, since {self.since_s:.2f} s", *how)
+        how = f"; to release: {self.release}" if self.release else ""
+        return f"{self.level} {self.why}, since {self.since_s:.2f} s{how}"
 
 
 def resume_command(rack: str, level: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rack.backplane.checked import as_named
-from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.layout import Layout
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Box, TaskState
@@ -49,25 +49,18 @@ class EntryRow:
 
 def host_rows(segment: Segment) -> tuple[HostRow, ...]:
     """Return the host boards."""
-    return tuple(_host_row(segment, host) for host in segment.layout.hosts)
-
-
-def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
-    block = segment.block(host.name)
-    # The process that runs a host board locks this word, and the kernel unlocks it.
-    runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
-    state = as_named(TaskState, block[Block.STATE])
-    shown = state.name.lower() if runs else AWAY
-    if state == TaskState.ENDED:
-        shown = DONE
-    pid = block[Block.PID] if runs else 0
-    return HostRow(
-        board=host.name,
-        pid=pid,
-        state=shown,
-        sent=sum(head[Box.HEAD] for head in _heads(segment, host.name)),
-        restarts=restarts(segment, host.name),
-    )
+    found = []
+    for host in segment.layout.hosts:
+        block = segment.block(host.name)
+        # The process that runs a host board locks this word, and the kernel unlocks it.
+        runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
+        state = as_named(TaskState, block[Block.STATE]).name.lower() if runs else AWAY
+        if block[Block.STATE] == TaskState.ENDED:
+            state = DONE
+        sent = sum(head[Box.HEAD] for head in _heads(segment, host.name))
+        pid = block[Block.PID] if runs else 0
+        found.append(HostRow(host.name, pid, state, sent, restarts(segment, host.name)))
+    return tuple(found)
 
 
 def restarts(segment: Segment, writer: str) -> int:
@@ -91,14 +84,9 @@ def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
             counts = getattr(status.value, entry)
             age = int(counts["age"])
             age_ms = None if age < 0 else age * tick_ms
-            found.append(
-                EntryRow(
-                    entry=f"{mailbox.partition('.')[0]}.{entry}",
-                    source=source,
-                    **{name: int(counts[name]) for name in ENTRY_COUNTS},
-                    age_ms=age_ms,
-                )
-            )
+            numbers = [int(counts[name]) for name in ENTRY_COUNTS]
+            board = mailbox.partition(".")[0]
+            found.append(EntryRow(f"{board}.{entry}", source, *numbers, age_ms))
     return tuple(found)
 
 

@@ -111,15 +111,9 @@ def import_rows(segment: Segment) -> tuple[ImportRow, ...]:
     found = []
     for port, source, counts in _groups(segment, "import", _entries(segment).imports):
         age = int(counts["age"])
-        found.append(
-            ImportRow(
-                f"{BOARD}.{port}",
-                source,
-                **{name: int(counts[name]) for name in COUNTS},
-                age_ticks=None if age < 0 else age,
-                age_s=None if age < 0 else float(counts["age_s"]),
-            )
-        )
+        ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
+        numbers = [int(counts[name]) for name in COUNTS]
+        found.append(ImportRow(f"{BOARD}.{port}", source, *numbers, *ages))
     return tuple(found)
 
 
@@ -141,16 +135,7 @@ def _groups(
 
 
 def _peer(rack: str, at: Any) -> PeerRow:
-    clock_ms = within_ms = None
-    if at.uncertainty > 0.0:
-        clock_ms = at.offset * 1e3
-        within_ms = at.uncertainty * 1e3
-    return PeerRow(
-        peer=rack,
-        state=Presence(at.presence).name.lower(),
-        since_tick=at.since,
-        launches=at.launches,
-        losses=at.losses,
-        clock_ms=clock_ms,
-        within_ms=within_ms,
-    )
+    is_known = at.uncertainty > 0.0
+    clock = (at.offset * 1e3, at.uncertainty * 1e3) if is_known else (None, None)
+    state = Presence(at.presence).name.lower()
+    return PeerRow(rack, state, at.since, at.launches, at.losses, *clock)

@@ -273,9 +273,8 @@ def _progress(segment: Segment) -> TaskProgress | None:
 
 def mode_of(status: Message) -> str:
     """Return by whose commands a level works, as in `TaskRow`."""
-    if "standing" not in (status.record.dtype.names or ()):
-        return ""
-    return "operator" if status.standing else "automatic"
+    standing = getattr(status, "standing", None)
+    return "" if standing is None else "operator" if standing else "automatic"
 
 
 def fired(status: Message) -> str:
