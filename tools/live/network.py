@@ -112,8 +112,9 @@ def import_rows(segment: Segment) -> tuple[ImportRow, ...]:
     for port, source, counts in _groups(segment, "import", _entries(segment).imports):
         age = int(counts["age"])
         ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
-        numbers = [int(counts[name]) for name in COUNTS]
-        found.append(ImportRow(f"{BOARD}.{port}", source, *numbers, *ages))
+        numbers = {name: int(counts[name]) for name in COUNTS}
+        entry = f"{BOARD}.{port}"
+        found.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
     return tuple(found)
 
 
