@@ -93,7 +93,7 @@ class LiveDesk:
             reply = self._await_giving(entry, command.level)
         return self._await_reply(reply, wait, timeout_s)
 
-    def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> Reply:
+    def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
         """Give a command under a lease, `tell` its reply, and stay until a newer one is in force or
         the run is over: if this process ends or falls silent before, its level holds.
 
@@ -112,13 +112,11 @@ class LiveDesk:
         with self._claimed(command.level, wanted, Client.LEASES) as entry:
             ticket = entry[RequestWord.TICKET]
             reply = self._await_reply(self._await_giving(entry, command.level), False, None)
-            if reply.worked:
-                tell(reply)
+            tell(reply)
             while reply.worked and table.hear(entry, ticket) and not segment.run_is_over:
                 if not self._rack.refresh():
                     why = f"'{command.level}' holds within 2 s, if it still runs"
                     raise Failure(f"rack '{segment.rack}' is out of reach: {why}")
-        return reply
 
     def _takes_hold(self, level: str) -> bool:
         return Operation.HOLD in (self._levels[level].commands)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,6 @@ from rack.backplane.message import text_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.levels.operator import DRIVES, SETTINGS, Answer
-from rack.tools.console.answer import Document
 
 REPLY_CYCLES = 4
 """Cycles that a level does within which it replies: one to read, one to become visible, one for an
@@ -52,10 +51,6 @@ class Reply:
     def is_standing(self) -> bool:
         """Whether it is in force, as far as is known."""
         return self.fate in ("taken", "done")
-
-    def document(self) -> Document:
-        """Return everything as plain data."""
-        return {**asdict(self), "worked": self.worked}
 
     @property
     def line(self) -> str:

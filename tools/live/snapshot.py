@@ -127,7 +127,8 @@ class RackMonitor:
         self._segment = segment
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
-        self._joints = joint_names(segment.config)
+        robot = tomllib.loads(segment.config).get("robot", {})
+        self._joints = tuple(robot.get("joints", ()))
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self.cycles: dict[str, np.ndarray] = {}
         """Trace records of each task that the last look took."""
@@ -212,7 +213,8 @@ class RackMonitor:
             state = state_name(getattr(status, "state", None), state)
             reason = reason_of(status)
             row = fired(status)
-            mode = mode_of(status)
+            standing = getattr(status, "standing", None)
+            mode = "" if standing is None else "operator" if standing else "automatic"
         return TaskRow(
             task=task.name,
             slot=task.slot,
@@ -271,12 +273,6 @@ def _progress(segment: Segment) -> TaskProgress | None:
     return None
 
 
-def mode_of(status: Message) -> str:
-    """Return by whose commands a level works, as in `TaskRow`."""
-    standing = getattr(status, "standing", None)
-    return "" if standing is None else "operator" if standing else "automatic"
-
-
 def fired(status: Message) -> str:
     """Return what fired of a state table in a level's newest cycle, as text; empty for a level
     without one."""
@@ -284,9 +280,3 @@ def fired(status: Message) -> str:
         return ""
     what = f"row {status.row} '{status.fired}'" if status.row else "no row"
     return f"{what}, now in '{status.in_state}', table {status.table}"
-
-
-def joint_names(config: str) -> tuple[str, ...]:
-    """Return the joints of the arm in a resolved config, from base to tool; empty without an
-    arm."""
-    return tuple(tomllib.loads(config).get("robot", {}).get("joints", ()))

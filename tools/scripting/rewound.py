@@ -108,6 +108,10 @@ class RewoundRun:
         raise Failure(f'"{condition}": does not begin to hold {where} {self._now}', 2)
 
     @property
+    def _moment(self) -> RecordedMoment:
+        return RecordedMoment(self.recording, self._in_force, self.tick)
+
+    @property
     def _now(self) -> str:
         return f"{self.time_s(self.tick):g} s, tick {self.tick}"
 
@@ -125,7 +129,7 @@ class RewoundRun:
             return self._message(name)
         if whole in self._signals:
             signal = Signal.of(name, self._layout.timed)
-            value = signal.plain(self._row(signal.mailbox)["message"][None])[0]
+            value = signal.plain(self._moment.row(signal.mailbox)["message"][None])[0]
             return self._shown(name, value, [f"{name} = {cell(value)} {signal.unit}".rstrip()])
         near = get_close_matches(whole, self.names, NEAREST) or [*self._tasks, *self._boxes]
         raise Failure(f"{name}: no such level, mailbox or signal; nearest: {', '.join(near)}", 2)
@@ -134,22 +138,15 @@ class RewoundRun:
         where = {"tick": self.tick, "time_s": self.time_s(self.tick)}
         return Glance({**where, "name": name, "value": value}, lines)
 
-    def _row(self, mailbox: str) -> Any:
-        row = self._in_force.row(mailbox, self.tick)
-        if row is None:
-            raise Failure(f"{mailbox}: no message yet at {self._now}", 2)
-        return row
-
     def _message(self, mailbox: str) -> Glance:
         text = MessageText(self._boxes[mailbox], self._layout.clock_ns)
-        document = text.document(self._row(mailbox), self.tick)
+        document = text.document(self._moment.row(mailbox), self.tick)
         return self._shown(mailbox, document, text.lines(document))
 
     def _level(self, task: str) -> Glance:
         tick, levels = self._levels
         if tick != self.tick:
-            moment = RecordedMoment(self.recording, self._in_force, self.tick)
-            levels = moment.levels(self._ready(), self._states)
+            levels = self._moment.levels(self._ready(), self._states)
             self._levels = self.tick, levels
         rows = [[name, cell(value)] for name, value in _flat(levels[task])]
         return self._shown(task, levels[task], fitted(("attribute", "value"), rows))
