@@ -57,10 +57,10 @@ def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Js
     if watch:
         _watch(segment, ring, text, as_json)
         return
-    rows = ring.drain().rows
-    if not len(rows):
+    messages = ring.drain().rows
+    if not len(messages):
         raise Failure(f"mailbox '{name}' has no message yet")
-    newest = text.document(rows[-1], segment.words[System.TICK])
+    newest = text.document(messages[-1], segment.words[System.TICK])
     print_answer(newest, text.lines(newest), as_json)
 
 

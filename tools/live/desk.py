@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import (
     Client,
     OperatorTable,
@@ -31,6 +30,7 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.console.held import waits
 from rack.tools.console.tables import fitted
 from rack.tools.live.holds import resume_command
+from rack.tools.live.newest import Newest
 from rack.tools.live.replies import LastCycle, Replies, Reply, answering
 from rack.tools.live.watched import WatchedRack
 
@@ -219,11 +219,9 @@ class LiveDesk:
 
     def _in_force(self, level: str) -> str:
         """Return the operator's command in force at a level; empty: none."""
-        box = answering(self._segment, level)
-        seen = open_observer(self._segment, box.name).peek() if box is not None else None
-        if seen is None or not seen.is_there or not seen.value.standing:
-            return ""
-        return Operation(seen.value.standing).name.lower()
+        status = Newest(self._segment).message(f"{level}.status")
+        standing = getattr(status, "standing", 0)
+        return Operation(standing).name.lower() if standing else ""
 
 
 def goal_of(what: str, words: Sequence[str]) -> Document:

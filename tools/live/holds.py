@@ -13,11 +13,12 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.message import Message, State, reason_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
-from rack.boards.events import Event, statuses
+from rack.boards.events import Event
 from rack.boards.lan.awaited import awaited
 from rack.boards.operator import describe
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation, answered
+from rack.tools.live.newest import Newest
 
 STILL_S = 5.0
 """Simulated time without motion after which a held rack reports it as an event."""
@@ -63,16 +64,18 @@ def is_news(reason: str, shown: list[str]) -> bool:
     return True
 
 
-def find_holds(segment: Segment) -> tuple[Hold, ...]:
+def find_holds(newest: Newest) -> tuple[Hold, ...]:
     """Return what holds a rack now, the hold of its arm first; nothing once its run is over."""
-    return () if segment.run_is_over else tuple(_find_holds(segment))
+    return () if newest.segment.run_is_over else tuple(_find_holds(newest))
 
 
-def _find_holds(segment: Segment) -> Iterator[Hold]:
+def _find_holds(newest: Newest) -> Iterator[Hold]:
+    segment = newest.segment
+
     def hold(level: str, since: int, why: str, release: str = "") -> Hold:
         return Hold(level, since, since * segment.layout.clock_ns * 1e-9, why, release)
 
-    arm, driving = next(statuses(segment, "demand"), ("", None))
+    arm, driving = next(newest.statuses("demand"), ("", None))
     if UtilityLines(segment).emergency_stop:
         is_arm = driving is None or "braked" in _fields(driving)
         what, how = ("arm", "braked") if is_arm else ("hand", "valves closed")
@@ -84,7 +87,7 @@ def _find_holds(segment: Segment) -> Iterator[Hold]:
         yield hold(board, segment.block(board)[Block.RELEASED], why)
     tasks = {task.name for task in segment.layout.tasks}
     shown: list[str] = []
-    for level, status in statuses(segment, "state"):
+    for level, status in newest.statuses("state"):
         if level not in tasks:
             continue
         if _fields(status) >= OPERATED and status.standing:
@@ -127,6 +130,7 @@ class Standstill:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
+        self._newest = Newest(segment)
         self._still_since: int | None = None
         self._reported: set[tuple[str, int]] = set()
 
@@ -137,7 +141,7 @@ class Standstill:
         from rack.tools.faults.ending import arm_of
 
         tick = self._segment.words[System.TICK]
-        kept = [hold for hold in find_holds(self._segment) if hold.release]
+        kept = [hold for hold in find_holds(self._newest) if hold.release]
         if not kept or not arm_of(self._segment).is_at_rest:
             self._still_since = None
             return

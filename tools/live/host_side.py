@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from rack.backplane.checked import as_named
 from rack.backplane.layout import Layout
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Box, TaskState
+from rack.tools.live.newest import Newest
 
 ADAPTER_STATUS = "adapter_status"
 """Message type of the status of a bus adapter: a group of counts for each entry."""
@@ -74,14 +74,14 @@ def _heads(segment: Segment, writer: str) -> list[memoryview]:
     return [segment.box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
-def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
+def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
     """Return the entries of all bus adapters."""
     found: list[EntryRow] = []
+    segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6
     for mailbox, entry, source in entries_of(segment.layout, segment.config):
-        status = open_observer(segment, mailbox).peek()
-        if status.is_there:
-            counts = getattr(status.value, entry)
+        if (status := newest.message(mailbox)) is not None:
+            counts = getattr(status, entry)
             age = int(counts["age"])
             age_ms = None if age < 0 else age * tick_ms
             numbers = {name: int(counts[name]) for name in ENTRY_COUNTS}

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.levels.peer import Presence, peer_port
+from rack.tools.live.newest import Newest
 
 BOARD = "lan"
 STATUS = f"{BOARD}.status"
@@ -98,18 +98,17 @@ def _entries(segment: Segment) -> Entries:
     return (exchanged(segment.config) if has_adapter else None) or Entries({}, {}, ())
 
 
-def peer_rows(segment: Segment) -> tuple[PeerRow, ...]:
+def peer_rows(newest: Newest) -> tuple[PeerRow, ...]:
     """Return the other racks."""
-    racks = _entries(segment).peers
-    readings = [open_observer(segment, f"{BOARD}.{peer_port(rack)}").peek() for rack in racks]
-    seen = zip(racks, readings, strict=True)
-    return tuple(_peer(rack, reading.value) for rack, reading in seen if reading.is_there)
+    racks = _entries(newest.segment).peers
+    seen = ((rack, newest.message(f"{BOARD}.{peer_port(rack)}")) for rack in racks)
+    return tuple(_peer(rack, message) for rack, message in seen if message is not None)
 
 
-def import_rows(segment: Segment) -> tuple[ImportRow, ...]:
+def import_rows(newest: Newest) -> tuple[ImportRow, ...]:
     """Return the imports."""
     found = []
-    for port, source, counts in _groups(segment, "import", _entries(segment).imports):
+    for port, source, counts in _groups(newest, "import", _entries(newest.segment).imports):
         age = int(counts["age"])
         ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
         numbers = {name: int(counts[name]) for name in COUNTS}
@@ -118,21 +117,21 @@ def import_rows(segment: Segment) -> tuple[ImportRow, ...]:
     return tuple(found)
 
 
-def export_rows(segment: Segment) -> tuple[ExportRow, ...]:
+def export_rows(newest: Newest) -> tuple[ExportRow, ...]:
     """Return the exports."""
     return tuple(
         ExportRow(f"{BOARD}.{port}", source, int(counts["sent"]))
-        for port, source, counts in _groups(segment, "export", _entries(segment).exports)
+        for port, source, counts in _groups(newest, "export", _entries(newest.segment).exports)
     )
 
 
 def _groups(
-    segment: Segment, kind: str, sources: Mapping[str, str]
+    newest: Newest, kind: str, sources: Mapping[str, str]
 ) -> Iterator[tuple[str, str, Any]]:
     """Yield port, source and counts of all imports or exports, once the adapter has counted."""
-    if sources and (status := open_observer(segment, STATUS).peek()).is_there:
+    if (status := newest.message(STATUS)) is not None:
         for port, source in sources.items():
-            yield port, source, getattr(status.value, f"{kind}_{port}")
+            yield port, source, getattr(status, f"{kind}_{port}")
 
 
 def _peer(rack: str, at: Any) -> PeerRow:

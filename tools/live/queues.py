@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.queue import queues_of, taken_name
-from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 from rack.tools.console.answer import Document
+from rack.tools.live.newest import Newest
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
@@ -34,14 +33,14 @@ class QueueFill:
         return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
 
 
-def queue_fills(segment: Segment) -> tuple[QueueFill, ...]:
+def queue_fills(newest: Newest) -> tuple[QueueFill, ...]:
     """Return every queue of a rack as it is now."""
     found = []
-    for box in queues_of(segment.layout):
+    for box in queues_of(newest.segment.layout):
         # The position first: what is taken meanwhile was in the queue.
-        taken = int(open_observer(segment, taken_name(box.name)).peek().value.taken)
-        words = segment.box(box.name)
-        unread = words[Box.SENT] - taken
+        position = newest.message(taken_name(box.name))
+        words = newest.segment.box(box.name)
+        unread = words[Box.SENT] - (0 if position is None else position.taken)
         found.append(QueueFill(box.name, unread, box.capacity, words[Box.REFUSED]))
     return tuple(found)
 

@@ -13,7 +13,6 @@ from rack.backplane.checked import as_named
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
@@ -31,6 +30,7 @@ from rack.tools.live.network import (
     import_rows,
     peer_rows,
 )
+from rack.tools.live.newest import Newest
 from rack.tools.live.queues import QueueFill, queue_fills
 
 LOST = "lost"
@@ -125,6 +125,7 @@ class RackMonitor:
 
     def __init__(self, segment: Segment, keeps_longest: bool = False) -> None:
         self._segment = segment
+        self._newest = Newest(segment)
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
         robot = tomllib.loads(segment.config).get("robot", {})
@@ -156,16 +157,16 @@ class RackMonitor:
             tasks=tuple(
                 self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
             ),
-            progress=_progress(segment),
-            holds=find_holds(segment),
+            progress=self._progress(),
+            holds=find_holds(self._newest),
             hosts=host_rows(segment),
-            entries=entry_rows(segment),
-            queues=queue_fills(segment),
+            entries=entry_rows(self._newest),
+            queues=queue_fills(self._newest),
             inboxes=inbox_fills(segment),
-            peers=peer_rows(segment),
-            imports=import_rows(segment),
-            exports=export_rows(segment),
-            exchanges={board: ages_of(message) for board, message in _newest(segment, EXCHANGE)},
+            peers=peer_rows(self._newest),
+            imports=import_rows(self._newest),
+            exports=export_rows(self._newest),
+            exchanges={board: ages_of(message) for board, message in self._of_type(EXCHANGE)},
         )
 
     def _active_faults(self) -> Iterator[str]:
@@ -208,7 +209,7 @@ class RackMonitor:
         reason = row = mode = ""
         if block[Block.LOST]:
             state = LOST
-        elif (status := self._status(task.name)) is not None:
+        elif (status := self._newest.message(f"{task.name}.status")) is not None:
             # Of a user's level without a state, or with others, it is that of its process.
             state = state_name(getattr(status, "state", None), state)
             reason = reason_of(status)
@@ -235,13 +236,6 @@ class RackMonitor:
             mode=mode,
         )
 
-    def _status(self, task: str) -> Message | None:
-        """Return the newest status of a task, if it has written one."""
-        if f"{task}.status" not in self._segment.map.mailboxes:
-            return None
-        reading = open_observer(self._segment, f"{task}.status").peek()
-        return reading.value if reading.is_there else None
-
     def forget_times(self) -> None:
         """Begin again with the longest times."""
         self._longest_ns.clear()
@@ -258,19 +252,15 @@ class RackMonitor:
             longest = self._longest_ns[task] = newest
         return [None, None] if longest is None else (longest * 1e-6).tolist()
 
+    def _of_type(self, message: str) -> Iterator[tuple[str, Message]]:
+        """Yield the newest message in every mailbox of a message type, with its writer."""
+        return self._newest.messages(lambda box: box.message == message)
 
-def _newest(segment: Segment, kind: str) -> Iterator[tuple[str, Message]]:
-    """Yield the newest message in every mailbox with messages of a kind, with its writer."""
-    for box in segment.layout.mailboxes:
-        if box.message == kind and (reading := open_observer(segment, box.name).peek()).is_there:
-            yield box.writer, reading.value
-
-
-def _progress(segment: Segment) -> TaskProgress | None:
-    for _, at in _newest(segment, TASK_STATUS):
-        state = state_name(at.state)
-        return TaskProgress(at.moves_done, at.moves, at.action, at.actions, state, at.reason)
-    return None
+    def _progress(self) -> TaskProgress | None:
+        for _, at in self._of_type(TASK_STATUS):
+            state = state_name(at.state)
+            return TaskProgress(at.moves_done, at.moves, at.action, at.actions, state, at.reason)
+        return None
 
 
 def fired(status: Message) -> str:
