@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -26,24 +25,16 @@ class Ring:
     """A ring of fixed records that another process writes; `head` holds the number of records
     written.
 
-    `oldest` returns the number of the oldest record in `memory`, where that is a mirror without the
-    others. The first `before` records were written in a run that this one continues: they are not
-    read.
+    The first `before` records were written in a run that this one continues: they are not read.
     """
 
     def __init__(
-        self,
-        memory: memoryview,
-        dtype: np.dtype,
-        head: memoryview,
-        oldest: Callable[[], int] = lambda: 0,
-        before: int = 0,
+        self, memory: memoryview, dtype: np.dtype, head: memoryview, before: int = 0
     ) -> None:
         # As plain bytes: copying by field would skip the padding, and checksums would not match.
         self._rows = np.frombuffer(memory, dtype=f"V{dtype.itemsize}")
         self._dtype = dtype
         self._head = head
-        self._oldest = oldest
         self._depth = len(self._rows)
         self.before = self._taken = before
 
@@ -66,7 +57,7 @@ class Ring:
     def drain(self) -> Drained:
         """Read every record written since the last call."""
         head = self._written
-        first = max(self._taken + 1, head - self._depth + 1, self._oldest())
+        first = max(self._taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
         # Rows that the writer reached during the copy.
         torn = max(0, oldest_kept(self._written, self._depth) - first)

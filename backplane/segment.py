@@ -91,12 +91,7 @@ class CycleCounts(NamedTuple):
 class Segment:
     """An attached segment: `layout`, `config` (TOML text), `published` (JSON text: the facts about
     its levels), `map`, and its memory as `words` and `bytes`.
-
-    A mirror of one on another machine has no file, thus no `fd`: it learns who is alive there by
-    other ways.
     """
-
-    is_mirror = False
 
     def __init__(self, rack: str, memory: mmap.mmap, fd: int = -1) -> None:
         self.rack = rack
@@ -291,15 +286,6 @@ class Segment:
         """Say whether a process holds the lock on the byte at a bus address: see
         `rack.backplane.byte_lock`."""
         return is_locked(self.fd, address)
-
-    def oldest(self, ring: int) -> int:
-        """Return the number of the oldest record that is here of the ring whose head word is at a
-        bus address; 0: all.
-
-        A mirror lacks records: those that it did not fetch, or that were overwritten before it
-        could.
-        """
-        return 0
 
     @property
     def launch(self) -> Launch:

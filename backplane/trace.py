@@ -13,7 +13,6 @@ back. Age alone proves nothing, since the task may have been preempted.
 from __future__ import annotations
 
 from enum import IntFlag
-from functools import partial
 from struct import Struct
 
 import numpy as np
@@ -90,7 +89,6 @@ def trace_ring(segment: Segment, task: str) -> Ring:
         memory,
         RECORD,
         block[Block.TRACE_HEAD : Block.TRACE_HEAD + 1],
-        partial(segment.oldest, segment.map.blocks[task] + 8 * Block.TRACE_HEAD),
         block[Block.TRACE_FIRST],
     )
 

@@ -355,7 +355,7 @@ def test_with_the_cable_pulled_the_arm_holds_and_goes_on_when_it_is_back(
     servo_config, general_config = configs(rack_name, tmp_path)
     with Lab(2) as lab:
         endpoint = f"tcp/{lab.address(0)}:7447"
-        nobody = "adapter.lan.permit.operator=[]"
+        nobody = "adapter.lan.estop_from=[]"
         listen, connect = (f'adapter.lan.{key}=["{endpoint}"]' for key in ("listen", "connect"))
         servo = OnMachine(servo_config, partial(lab.popen, 0), nobody, listen)
         general = OnMachine(general_config, partial(lab.popen, 1), nobody, connect)

@@ -34,7 +34,7 @@ ELSEWHERE = re.compile(
     r" (status|top|watch|mailbox|stop|pause|resume|set|record|replay|rewind|inject|estop)"
     r"|rack (command|prompt)"
     r"|kill-each-board|--view|--step"
-    r"|bench (response|systems)|rack run (cell|brown)|--lan|rack lan"
+    r"|bench (response|systems)|rack run (cell|brown)|rack lan"
 )
 """Commands that need a run, or a running rack, of another line: they have tests of their own in
 tests/tools."""

@@ -43,7 +43,7 @@ COMMANDS = (
     (
         "list",
         "rack.tools.commands.list:list_racks",
-        "List the racks on this machine, or on others.",
+        "List the racks on this machine.",
     ),
     ("status", "rack.tools.commands.status:status", "Show a running rack once."),
     ("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
@@ -261,7 +261,7 @@ def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
             from rack.tools.commands.answers import list_racks
 
             return partial(list_racks, as_json)
-        case "status", [] | [_]:
+        case "status", [] | [_] if "/" not in "".join(names):
             from rack.tools.commands.answers import show_status
 
             name = names[0] if names else None

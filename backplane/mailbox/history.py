@@ -9,7 +9,6 @@ mailboxes of host boards do not count either: they are not written at ticks.
 
 from __future__ import annotations
 
-from functools import partial
 from hashlib import blake2b
 
 import numpy as np
@@ -35,9 +34,8 @@ class MailboxRing(Ring):
         self._stride = slot_stride(spec)
         self._box = segment.box(name)
         memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
-        oldest = partial(segment.oldest, address + 8 * Box.HEAD)
         head = self._box[Box.HEAD : Box.HEAD + 1]
-        super().__init__(memory, row_dtype(spec), head, oldest, self._box[Box.FIRST])
+        super().__init__(memory, row_dtype(spec), head, self._box[Box.FIRST])
         self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
     def drain(self) -> Drained:

@@ -7,7 +7,6 @@ An alarm is raised once per episode: when a condition is found, not in every cyc
 from __future__ import annotations
 
 from enum import IntEnum
-from functools import partial
 from os import eventfd_write
 from time import monotonic_ns
 
@@ -160,7 +159,7 @@ def alarm_ring(segment: Segment, task: str) -> Ring:
     address = segment.map.alarms[task]
     head = segment.words[address // 8 : address // 8 + 1]
     memory = segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE)
-    return Ring(memory, RECORD, head, partial(segment.oldest, address))
+    return Ring(memory, RECORD, head)
 
 
 CLEAN_READS = 20

@@ -1,9 +1,9 @@
 """The network adapter: a bus adapter whose other side is the network, on eclipse-zenoh.
 
 It is an ordinary board with a rate, and a priority above its neighbours'. In its cycles it sends
-what it exports, takes what has come of its imports, notes who is there, and answers questions; in
-between only the network's own threads run, which have its core and priority. Nothing here waits,
-but in lockstep, where time stands still meanwhile.
+what it exports, takes what has come of its imports, notes who is there, and sets the emergency stop
+for those who may; in between only the network's own threads run, which have its core and priority.
+Nothing here waits, but in lockstep, where time stands still meanwhile.
 
 A restarted adapter continues from its own mailboxes. The status is written before the messages that
 it counts: an adapter killed in between has lost a message, but none is passed twice.
@@ -26,7 +26,7 @@ from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanParams
-from rack.boards.lan.desk import Desk, Permit
+from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
@@ -65,9 +65,10 @@ class LanAdapter(Adapter):
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the other racks, and those who may ask questions: alarms name them by number."""
+        """Return the other racks, and those who may set the emergency stop: alarms name them by
+        number."""
         table = LanParams.found_in(params)
-        return () if table is None else tuple(dict.fromkeys([*table.racks, *table.permit]))
+        return () if table is None else tuple(dict.fromkeys([*table.racks, *table.estop_from]))
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
@@ -126,8 +127,9 @@ class LanAdapter(Adapter):
             port: Export(segment, entry, launch, self._grid)
             for port, entry in table.exports.items()
         }
-        permit = Permit(table.permit, self.names(self.context.params))
-        self._desk = Desk(segment, self._grid, permit, self.findings)
+        names = self.names(self.context.params)
+        subjects = {name: names.index(name) for name in table.estop_from}
+        self._desk = Desk(segment, self._grid, subjects, self.findings)
         status = open_observer(segment, f"{board}.{STATUS}")
         if (before := status.peek()).is_there:
             for port, export in self._exports.items():
@@ -250,5 +252,4 @@ class LanAdapter(Adapter):
         if self._barrier is not None:
             self._barrier.close()
         if self._link is not None:
-            self._desk.close()
             self._link.close()

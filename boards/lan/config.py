@@ -4,9 +4,10 @@ rules."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, ValidationError
+from pydantic import AfterValidator, Field, StringConstraints, ValidationError
 
 from rack.backplane.message import MessageType
 from rack.backplane.rack_name import RACK_NAME
@@ -16,12 +17,9 @@ from rack.levels.tables import Positive, Table
 
 FASTEST_HZ = 50.0
 """Fastest exchange over a network."""
+MOST_CHAIN = 8192
+"""Bytes of a rack's certificates in DER form, as they travel with its seals."""
 OnPeerLoss = Literal["hold", "stop", "go on"]
-Right = Literal["watch", "command", "stop"]
-Rights = Annotated[
-    tuple[Right, ...],
-    BeforeValidator(lambda given: tuple(given) if isinstance(given, list) else given),
-]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
 EndpointText = Annotated[str, AfterValidator(proper)]
@@ -33,6 +31,15 @@ TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]
 ENDPOINT_NOTE = (
     "as in tls/192.168.1.5:7447, or on one machine unix/cell: a socket that only this user reaches"
 )
+
+
+class Credential(Exception):
+    """A file of `certificates` that cannot be used: its path, and why."""
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(f"{path}: {why}")
+        self.path = path
+        self.why = why
 
 
 class ExportConfig(Table):
@@ -102,9 +109,9 @@ class LanTable(Table):
     launch: tuple[str, ...] = ()
     """configs of racks that `rack run` launches with this one, on this machine; each in a process
     of its own"""
-    permit: dict[PeerName, Rights] = {}
-    """what others may do besides exchanging mailboxes, by name, which certificates prove; watch:
-    read status and signals; command: command levels; stop: set the emergency stop"""
+    estop_from: tuple[PeerName, ...] = ()
+    """names, proved by certificates, that may set the emergency stop from another machine, with
+    rack estop HOST/RACK"""
     most_bytes: int = Field(16_384, ge=64, le=1 << 20)
     """length of the longest message taken; bytes"""
     exports: dict[PortName, ExportConfig] = Field({}, alias="export")

@@ -13,37 +13,50 @@ from __future__ import annotations
 import stat
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeGuard
+from typing import NamedTuple, TypeGuard
+
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ec import (
+    ECDSA,
+    SECP256R1,
+    EllipticCurvePrivateKey,
+    EllipticCurvePublicKey,
+)
+from cryptography.hazmat.primitives.asymmetric.utils import Prehashed
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import Encoding, load_pem_private_key
+from cryptography.x509 import (
+    BasicConstraints,
+    Certificate,
+    DNSName,
+    ExtensionNotFound,
+    InvalidVersion,
+    IPAddress,
+    SubjectAlternativeName,
+    load_der_x509_certificate,
+    load_pem_x509_certificates,
+)
+from cryptography.x509.oid import NameOID
+from cryptography.x509.verification import (
+    Criticality,
+    ExtensionPolicy,
+    PolicyBuilder,
+    Store,
+    VerificationError,
+)
 
 from rack.backplane.regular_file import read_regular_file
-
-if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ec import (
-        ECDSA,
-        EllipticCurvePrivateKey,
-        EllipticCurvePublicKey,
-    )
-    from cryptography.x509 import Certificate
+from rack.boards.lan.config import MOST_CHAIN, Credential
 
 AUTHORITY = "authority.pem"
 MAX_CREDENTIAL_BYTES = 100_000
-MOST_CHAIN = 8192
-"""Bytes of a rack's certificates in DER form, as they travel with its seals."""
 MOST_KNOWN = 1024
 """Certificates of others that are remembered."""
 OTHERS = stat.S_IRWXG | stat.S_IRWXO
 OWNER_ONLY = 0o600
-
-
-class Credential(Exception):
-    """A file that cannot be used: its path, and why."""
-
-    def __init__(self, path: Path, why: str) -> None:
-        super().__init__(f"{path}: {why}")
-        self.path = path
-        self.why = why
+_ALGORITHM = ECDSA(Prehashed(SHA256()))
 
 
 class KeyPair(NamedTuple):
@@ -54,7 +67,7 @@ class KeyPair(NamedTuple):
 
     def sign(self, digest: bytes) -> bytes:
         """Return the signature of 32 bytes."""
-        return self.key.sign(digest, _algorithm())
+        return self.key.sign(digest, _ALGORITHM)
 
 
 class Identity(NamedTuple):
@@ -66,10 +79,8 @@ class Identity(NamedTuple):
 
     def has_signed(self, digest: bytes, signature: bytes) -> bool:
         """Say whether it has made a signature of 32 bytes."""
-        from cryptography.exceptions import InvalidSignature
-
         try:
-            self.key.verify(signature, digest, _algorithm())
+            self.key.verify(signature, digest, _ALGORITHM)
         except InvalidSignature:
             return False
         return True
@@ -88,13 +99,11 @@ class Credentials:
     @cached_property
     def pair(self) -> KeyPair:
         """What it seals with. Raises `Credential`."""
-        chain = _certificates(self.certificate)
-        from cryptography.hazmat.primitives.serialization import Encoding
-
+        chain = load_certificates(self.certificate)
         content = b"".join(one.public_bytes(Encoding.DER) for one in chain)
         if len(content) > MOST_CHAIN:
             raise Credential(self.certificate, f"{len(content)} bytes; permitted: {MOST_CHAIN}")
-        key = _private_key(self.key)
+        key = load_private_key(self.key)
         if key.public_key() != chain[0].public_key():
             raise Credential(self.key, f"not the key of {self.certificate.name}")
         return KeyPair(content, key)
@@ -113,7 +122,7 @@ class Credentials:
 
     @cached_property
     def _authorities(self) -> list[Certificate]:
-        return _certificates(self.authority)
+        return load_certificates(self.authority)
 
     @property
     def expires(self) -> datetime:
@@ -121,7 +130,7 @@ class Credentials:
         return min(
             one.not_valid_after_utc
             for path in (self.authority, self.certificate)
-            for one in _certificates(path)
+            for one in load_certificates(path)
         )
 
     def flaws(self, addresses: Iterable[str] = ()) -> Iterator[Credential]:
@@ -130,7 +139,7 @@ class Credentials:
         found: dict[Path, list[Certificate]] = {self.authority: [], self.certificate: []}
         for path in found:
             try:
-                found[path] = _certificates(path)
+                found[path] = load_certificates(path)
             except Credential as flaw:
                 yield flaw
         chain = found[self.certificate]
@@ -140,7 +149,7 @@ class Credentials:
             if chain:
                 _ = self.pair
             else:
-                _private_key(self.key)
+                load_private_key(self.key)
         except Credential as flaw:
             yield flaw
 
@@ -173,16 +182,9 @@ def _content(path: Path, is_private: bool = False) -> bytes:
         raise Credential(path, f"cannot be read: {error.strerror}") from None
 
 
-def _certificates(path: Path) -> list[Certificate]:
+def load_certificates(path: Path) -> list[Certificate]:
     """Return the certificates of a PEM file that are valid now. Raises `Credential`."""
     content = _content(path)
-    # Here: a rack without TLS does without this package.
-    try:
-        from cryptography.x509 import InvalidVersion, load_pem_x509_certificates
-    except ImportError:
-        raise Credential(
-            path, "cannot be checked without 'cryptography': install nasrem-rack[lan]"
-        ) from None
     try:
         found = load_pem_x509_certificates(content)
     except (ValueError, InvalidVersion):
@@ -200,12 +202,9 @@ def _certificates(path: Path) -> list[Certificate]:
     return found
 
 
-def _private_key(path: Path) -> EllipticCurvePrivateKey:
+def load_private_key(path: Path) -> EllipticCurvePrivateKey:
+    """Return the key of a PEM file. Raises `Credential`."""
     content = _content(path, is_private=True)
-    from cryptography.exceptions import UnsupportedAlgorithm
-    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
-    from cryptography.hazmat.primitives.serialization import load_pem_private_key
-
     try:
         key = load_pem_private_key(content, None)
     except TypeError:
@@ -219,24 +218,11 @@ def _private_key(path: Path) -> EllipticCurvePrivateKey:
 
 def _is_p256(key: object) -> TypeGuard[EllipticCurvePublicKey]:
     """Say whether a key is on the curve whose signatures are short and quick to check."""
-    from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePublicKey
-
     return isinstance(key, EllipticCurvePublicKey) and isinstance(key.curve, SECP256R1)
-
-
-@cache
-def _algorithm() -> ECDSA:
-    from cryptography.hazmat.primitives.asymmetric.ec import ECDSA
-    from cryptography.hazmat.primitives.asymmetric.utils import Prehashed
-    from cryptography.hazmat.primitives.hashes import SHA256
-
-    return ECDSA(Prehashed(SHA256()))
 
 
 def _identified(chain: bytes, authorities: list[Certificate]) -> Identity | None:
     """Return whom certificates in DER form name; None: they do not lead to an authority."""
-    from cryptography.x509 import load_der_x509_certificate
-
     found = []
     try:
         while chain:
@@ -256,15 +242,11 @@ def _identified(chain: bytes, authorities: list[Certificate]) -> Identity | None
 
 
 def _common_name(certificate: Certificate) -> str:
-    from cryptography.x509.oid import NameOID
-
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
 
 def _addresses(certificate: Certificate) -> list[str]:
-    from cryptography.x509 import DNSName, ExtensionNotFound, IPAddress, SubjectAlternativeName
-
     try:
         found = certificate.extensions.get_extension_for_class(SubjectAlternativeName).value
     except (ExtensionNotFound, ValueError):
@@ -275,15 +257,6 @@ def _addresses(certificate: Certificate) -> list[str]:
 def _path(chain: list[Certificate], authorities: list[Certificate]) -> list[Certificate]:
     """Return the certificates from the first of a chain to an authority; empty: it does not lead
     there, as where the certificate of a rack has signed another one."""
-    from cryptography.x509 import BasicConstraints
-    from cryptography.x509.verification import (
-        Criticality,
-        ExtensionPolicy,
-        PolicyBuilder,
-        Store,
-        VerificationError,
-    )
-
     # As TLS does: of an authority that it says to be one, of a rack or person no more than that.
     any_kind = ExtensionPolicy.permit_all()
     authority = any_kind.require_present(BasicConstraints, Criticality.AGNOSTIC, None)

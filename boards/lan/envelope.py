@@ -18,13 +18,16 @@ from enum import IntEnum
 from hashlib import sha256
 from hmac import compare_digest
 from struct import Struct
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
 
-from rack.boards.lan.credentials import MOST_CHAIN, Credentials
+from rack.boards.lan.config import MOST_CHAIN
 from rack.boards.lan.keys import sender_of
+
+if TYPE_CHECKING:
+    from rack.boards.lan.credentials import Credentials
 
 _HEAD = Struct("<4sIHQQQQqqq")
 _MAGIC = b"RLN2"

@@ -1,4 +1,4 @@
-"""Key expressions on the network; R is the name of the rack that sends, or that is asked.
+"""Key expressions on the network; R is the name of the rack, or operator, that sends.
 
     rack/R/alive/<launch>          liveliness token: gone when the adapter's process ends or is
                                    silent for the lease; in lockstep its cycle follows,
@@ -6,33 +6,24 @@
     rack/R/out/<board>/<port>      an exported mailbox
     rack/R/step                    lockstep: a cycle of R's adapter, with all that it exports
     rack/R/ping/<to>, .../pong/<to>   round trips between clocks
-    rack/R/ask/<what>/<from>       a question to R, answered in its adapter's cycles to those who
-                                   have the right
+    rack/R/estop/<to>              a query that sets the emergency stop of rack <to>
 
-All begin with a rack's name, so that access control can hold each rack to its own.
+All begin with the sender's name, so that access control can hold each sender to its own.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-
-from rack.boards.lan.config import Right
 
 ALL_ALIVE = "rack/*/alive/*"
 _ALIVE = re.compile(r"rack/[^/]+/alive/([0-9a-f]{16})(?:-([0-9]{1,18}))?")
-ASKED: Mapping[Right, str] = {"watch": "read", "command": "command", "stop": "stop"}
-"""What those may ask who have a right, as in its key."""
-_SENDER = re.compile(r"rack/([^/]+)/(?:ask/[^/]+/([^/]+)/[^/]+\Z)?")
+_SENDER = re.compile(r"rack/([^/]+)/")
 
 
 def sender_of(key: str) -> str:
-    """Return in whose name something comes under a key expression: the rack's, but for a question;
-    empty: nobody's."""
-    if (found := _SENDER.match(key)) is None:
-        return ""
-    rack, asker = found.groups()
-    return asker or rack
+    """Return the name of the sender under a key expression, or an empty string if it has none."""
+    found = _SENDER.match(key)
+    return found[1] if found else ""
 
 
 def out_key(rack: str, mailbox: str) -> str:
@@ -78,7 +69,12 @@ def pong_key(rack: str, to: str) -> str:
     return f"rack/{rack}/pong/{to}"
 
 
-def ask_keys(rack: str, what: str = "", asker: str = "") -> str:
-    """Return the key expression of all questions to a rack, or of those of one asker about one
-    thing."""
-    return f"rack/{rack}/ask/{what}/{asker}/**" if asker else f"rack/{rack}/ask/**"
+def estop_key(sender: str, to: str) -> str:
+    """Return the key expression under which a sender sets the emergency stop of rack `to`."""
+    return f"rack/{sender}/estop/{to}"
+
+
+def estop_answer_key(rack: str, to: str) -> str:
+    """Return the key under which rack `rack` seals its answer, so that no request passes for an
+    answer."""
+    return f"rack/{rack}/estop-answer/{to}"

@@ -16,18 +16,20 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 
 import zenoh
 
 from rack.backplane.json_text import encode_json
 from rack.boards.lan.access import access_control
-from rack.boards.lan.config import LanTable
-from rack.boards.lan.credentials import OTHERS, Credential, Credentials
+from rack.boards.lan.config import Credential, LanTable
 from rack.boards.lan.endpoint import Endpoint
 from rack.boards.lan.envelope import MOST_ENVELOPE, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
+
+if TYPE_CHECKING:
+    from rack.boards.lan.credentials import Credentials
 
 UNREAD = 32
 """Messages of one import that wait for a cycle, at most; a newer one overwrites the oldest."""
@@ -37,8 +39,8 @@ KEEP_ALIVES = 4
 """Signs of life within a lease."""
 HANDSHAKE_MS = 3000
 """Longest time to open a connection."""
-MOST_ANSWER = 65_536 + 1024
-"""Length of the longest answer to a question: 64 KiB, and what says what they are."""
+MOST_STEP = 65_536
+"""Length of the longest step in lockstep, bytes."""
 ZENOH_BYTES = 1024
 """What zenoh adds to the content of a message, at most: key expression, lengths, options."""
 SOCKET = "unixsock-stream"
@@ -71,10 +73,9 @@ class Carrier(Protocol):
 
 
 class Question(NamedTuple):
-    """A question that has come. `reply` sends one answer, a payload and its envelope.
+    """A query that has come. `reply` sends an answer, a payload and its envelope.
 
-    Several answers reach only those who ask with `ConsolidationMode.NONE`. The asker is done when
-    the next question is taken, or none is left.
+    The asker is done when the next question is taken, or none is left.
     """
 
     key: str
@@ -84,21 +85,23 @@ class Question(NamedTuple):
 
 
 class LanLink:
-    """One open session of `rack`, or of a tool that `asks` racks and is known by that name.
+    """One open session of `rack`, or of an operator of that name.
 
     Raises `LevelError` if an endpoint cannot be opened, or the credentials cannot be used.
     """
 
-    def __init__(self, rack: str, table: LanTable, asks: bool = False) -> None:
+    def __init__(self, rack: str, table: LanTable, is_operator: bool = False) -> None:
         self.rack = rack
-        credentials = (
-            None if table.certificates is None else Credentials(Path(table.certificates), rack)
-        )
+        credentials = None
+        if table.certificates is not None:
+            # Only here: a rack without certificates does without the package for them.
+            from rack.boards.lan.credentials import Credentials
+
+            credentials = Credentials(Path(table.certificates), rack)
         try:
-            most = MOST_ANSWER if asks else table.most_bytes
-            self.sealer = Sealer(credentials, most)
+            self.sealer = Sealer(credentials, table.most_bytes)
             """Seals and opens what this rack sends and receives."""
-            self.session = zenoh.open(_settings(rack, table, credentials, asks))
+            self.session = zenoh.open(_settings(rack, table, credentials, is_operator))
         except zenoh.ZError as error:
             why = " ".join(str(error).split())
             raise LevelError(
@@ -206,7 +209,7 @@ def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
 
 
 def _settings(
-    rack: str, table: LanTable, credentials: Credentials | None, asks: bool
+    rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
     shortest, longest = RETRY_MS
@@ -232,13 +235,13 @@ def _settings(
             "period_max_ms": longest,
             "period_increase_factor": 1,
         },
-        "access_control": access_control(rack, table, asks),
+        "access_control": access_control(rack, table, is_operator),
         "transport/link/protocols": sorted(protocols) or ["tcp"],
         # Whoever opens a connection and says no more is forgotten; these many at once are borne.
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/link/rx/max_message_size": (
-            max(table.most_bytes, MOST_ANSWER) + MOST_ENVELOPE + ZENOH_BYTES
+            max(table.most_bytes, MOST_STEP) + MOST_ENVELOPE + ZENOH_BYTES
         ),
         "transport/link/tx/lease": round(table.lease_ms),
         "transport/link/tx/keep_alive": KEEP_ALIVES,
@@ -272,7 +275,11 @@ def _locator(text: str) -> str:
     except OSError as error:
         raise LevelError(f"adapter.lan: {folder}: {error.strerror}") from None
     is_folder = stat.S_ISDIR(about.st_mode)
-    if not is_folder or about.st_uid != os.getuid() or about.st_mode & OTHERS:
+    if (
+        not is_folder
+        or about.st_uid != os.getuid()
+        or about.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+    ):
         raise LevelError(
             f"adapter.lan: {folder}: others may enter it; permitted: a folder of this user, mode"
             " 0700"

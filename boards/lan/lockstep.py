@@ -33,9 +33,9 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.lan.awaited import GIVE_UP_S, Why, word_of
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle, step_key
-from rack.boards.lan.link import Arrived, LanLink
+from rack.boards.lan.link import MOST_STEP, Arrived, LanLink
 from rack.boards.lan.peers import NONE
-from rack.boards.lan.step import MOST_STEP, STEP_KIND, Step, StepFlag, pack_step, unpack_step
+from rack.boards.lan.step import STEP_KIND, Step, StepFlag, pack_step, unpack_step
 from rack.levels.errors import CannotGoOn
 
 LOOK_S = 0.1

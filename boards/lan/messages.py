@@ -72,9 +72,9 @@ DESK = MessageType(
     "lan_desk",
     1,
     _counts(
-        answered="questions from other machines that were answered; in lockstep always 0",
-        refused="questions refused: not permitted, or not to be done; likewise",
-        dropped="questions dropped: malformed, unsigned or oversized; likewise",
+        answered="emergency stops from other machines that were set; in lockstep always 0",
+        refused="emergency stops refused: not permitted; likewise",
+        dropped="requests dropped: malformed, unsigned or oversized; likewise",
     ),
 )
 
@@ -87,6 +87,6 @@ def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
         Field("clocks", CLOCKS, "1", "round trips to compare clocks; none in lockstep"),
         *(Field(f"export_{port}", EXPORT, "1", f"export {port}") for port in exports),
         *(Field(f"import_{port}", IMPORT, "1", f"import {port}") for port in imports),
-        Field("desk", DESK, "1", "questions from other machines"),
+        Field("desk", DESK, "1", "emergency stops from other machines"),
         Field("flaws", FLAWS, "1", "all that came and was dropped unread, by cause"),
     )

@@ -3,21 +3,20 @@ exports then."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Sequence
 from enum import IntFlag
 from typing import NamedTuple
 
 from xxhash import xxh3_64_intdigest as xxh3
+from zenoh import ZBytes
+from zenoh.ext import Int64, ZDeserializeError, z_deserialize, z_serialize
 
 from rack.boards.lan.envelope import Envelope
 from rack.boards.lan.link import Arrived
 
-MOST_STEP = 65_536
-"""Length of the longest step, as of an answer."""
-STEP_KIND = xxh3(b"rack step 1")
-_HEAD = struct.Struct("<qHH")
-_PART = struct.Struct("<HHI")
+STEP_KIND = xxh3(b"rack step 2")
+_CONTENT = tuple[Int64, list[str], list[tuple[str, bytes, bytes]]]
+"""Length of the cycle, racks, and of each export the key, the envelope and the payload."""
 
 
 class StepFlag(IntFlag):
@@ -41,18 +40,8 @@ class Step(NamedTuple):
 
 def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[Arrived]) -> bytes:
     """Return the content of a step."""
-    names = "\n".join(racks).encode()
-    parts = [_HEAD.pack(cycle_ns, len(names), len(exports)), names]
-    for export in exports:
-        key = export.key.encode()
-        envelope = export.envelope or b""
-        parts += [
-            _PART.pack(len(key), len(envelope), len(export.payload)),
-            key,
-            envelope,
-            export.payload,
-        ]
-    return b"".join(parts)
+    parts = [(export.key, export.envelope or b"", export.payload) for export in exports]
+    return z_serialize((Int64(cycle_ns), list(racks), parts)).to_bytes()
 
 
 def unpack_step(head: Envelope, content: bytes) -> Step | None:
@@ -60,21 +49,11 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
     if head.kind != STEP_KIND:
         return None
     try:
-        cycle_ns, length, count = _HEAD.unpack_from(content)
-        at = _HEAD.size + length
-        racks = content[_HEAD.size : at].decode().split("\n")
-        exports = []
-        for _ in range(count):
-            lengths = _PART.unpack_from(content, at)
-            start = at + _PART.size
-            key = start + lengths[0]
-            envelope = start + sum(lengths[:2])
-            at = start + sum(lengths)
-            exports.append(
-                Arrived(content[start:key].decode(), content[key:envelope], content[envelope:at])
-            )
-    except (struct.error, UnicodeDecodeError):
+        cycle_ns, racks, parts = z_deserialize(_CONTENT, ZBytes(content))
+    except ZDeserializeError:
         return None
-    if at != len(content):
+    exports = tuple(Arrived(*part) for part in parts)
+    # What is left behind the last part would be ignored.
+    if pack_step(cycle_ns, racks, exports) != content:
         return None
-    return Step(head.launch, head.time_ns, head.flags, cycle_ns, tuple(racks), tuple(exports))
+    return Step(head.launch, head.time_ns, head.flags, cycle_ns, tuple(racks), exports)

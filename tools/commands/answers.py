@@ -5,12 +5,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
 from rack.tools.console.answer import Failure, print_answer, print_json
-
-if TYPE_CHECKING:
-    from rack.tools.console.address import Asker
 
 
 def list_racks(as_json: bool) -> None:
@@ -61,14 +57,14 @@ def describe(name: str) -> dict[str, str | int | float | None]:
     }
 
 
-def show_status(rack: str | None, as_json: bool, asker: Asker | None = None) -> None:
+def show_status(rack: str | None, as_json: bool) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly
     one."""
     from rack.tools.live.snapshot import RackMonitor
-    from rack.tools.live.watched import watched
+    from rack.tools.live.watched import LocalRack
     from rack.tools.recording.recorder_process import recorded_by, size_of, size_text
 
-    with watched(rack or only_rack(), asker) as one:
+    with LocalRack(rack or only_rack()) as one:
         segment = one.segment
         found = RackMonitor(segment).look()
         run = recorded_by(segment)

@@ -9,17 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import (
-    AnyRackName,
-    AskAs,
-    Certificates,
-    Json,
-    Timeout,
-    check_timeout,
-)
+from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 
 if TYPE_CHECKING:
     from rack.tools.live.replies import Reply
@@ -70,7 +62,7 @@ List = Annotated[
 
 
 def command(
-    rack: AnyRackName,
+    rack: RackName,
     level: Level = None,
     what: What = None,
     goal: Goals = None,
@@ -80,8 +72,6 @@ def command(
     timeout: Timeout = None,
     lease: Lease = False,
     is_list: List = False,
-    certificates: Certificates = "",
-    name: AskAs = OPERATOR,
     as_json: Json = False,
 ) -> None:
     """Command one level of a running rack, overriding the level above it.
@@ -105,9 +95,9 @@ def command(
     `hold`, `setpoint`, `goto` and `do` stay in force until `resume`, and the mode of the level is
     "operator", otherwise "automatic": see 'rack status'. They survive a restart of the level's
     board. With --lease they are in force while this command lasts: Ctrl-C, a closed terminal or
-    SIGKILL make the level hold; from afar also a lost connection, within 2 s. --wait only watches:
-    where it ends before, the command goes on. An emergency stop takes precedence. On a rack that is
-    held a command waits for the next step: it is given then, and this returns at once.
+    SIGKILL make the level hold. --wait only watches: where it ends before, the command goes on. An
+    emergency stop takes precedence. On a rack that is held a command waits for the next step: it is
+    given then, and this returns at once.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
     not answer in time; 2 usage.
@@ -125,17 +115,16 @@ def command(
       rack command brown modifications modify wrist.deadzone on --at 2.5
       rack command nist-state-table task table careful
       rack command nist-state-table elemental_move do pick block1 --wait
-      rack command 192.168.1.5/cell task hold --certificates ~/cell
     """
     from rack.tools.live.desk import LiveDesk, goal_of
     from rack.tools.live.holds import resume_command
-    from rack.tools.live.watched import watched
+    from rack.tools.live.watched import LocalRack
 
     check_timeout(timeout, wait)
     if lease and wait:
         raise Failure("--lease, --wait: a lease stays anyway", 2)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
-    with INTERRUPT.raising(), watched(rack, Asker.of(name, certificates)) as one:
+    with INTERRUPT.raising(), LocalRack(rack) as one:
         desk = LiveDesk(one)
         if is_list:
             print_answer(desk.levels(), desk.text(), as_json)

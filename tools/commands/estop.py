@@ -12,11 +12,36 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.process import readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, Run, System
-from rack.tools.console.address import AT_THE_RACK, OPERATOR, Asker, RackAddress, needing_zenoh
+from rack.tools.console.address import OPERATOR, Operator, RackAddress
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.held import waits
-from rack.tools.console.parameters import AnyRackName, AskAs, Certificates, Json
+from rack.tools.console.parameters import Json, named, rack_names
 
+AnyRack = Annotated[
+    str,
+    typer.Argument(
+        metavar="RACK",
+        help="running rack by name, as 'rack list' shows it; on another machine: HOST[:PORT]/RACK",
+        autocompletion=rack_names,
+        callback=named,
+    ),
+]
+Certificates = Annotated[
+    str,
+    typer.Option(
+        metavar="DIR",
+        envvar="RACK_CERTIFICATES",
+        help="for HOST/RACK: folder with certificates; see rack lan certificates --help",
+    ),
+]
+Name = Annotated[
+    str,
+    typer.Option(
+        "--as",
+        metavar="NAME",
+        help="for HOST/RACK: your name, as in adapter.lan.estop_from of that rack",
+    ),
+]
 Reset = Annotated[
     bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")
 ]
@@ -30,21 +55,21 @@ OBEY_S = 2.0
 
 
 def estop(
-    rack: AnyRackName,
+    rack: AnyRack,
     reset: Reset = False,
     ready: Ready = False,
     certificates: Certificates = "",
-    name: AskAs = OPERATOR,
+    name: Name = OPERATOR,
     as_json: Json = False,
 ) -> None:
     """Engage the brakes of the arm at once, and keep them engaged until --reset.
 
     The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or
-    ACFAIL is asserted. On another machine's rack, HOST/RACK, it may be set by who has the right
-    there, and never reset. Where strangers reach the port of a rack, they can delay new
-    connections: with --ready the connection is there before it is needed. It says on stderr
-    whenever that changes. Enter, or any line on stdin, sets the stop, at once or as soon as the
-    rack can be reached. Ctrl-C leaves without one.
+    ACFAIL is asserted. On another machine's rack, HOST/RACK, those may set it whom its config names
+    in adapter.lan.estop_from; it is reset at the rack. Where strangers reach the port of a rack,
+    they can delay new connections: with --ready the connection is there before it is needed. It
+    says on stderr whenever that changes. Enter, or any line on stdin, sets the stop, at once or as
+    soon as the rack can be reached. Ctrl-C leaves without one.
 
     The arm of a rack that is held brakes when the rack goes on.
 
@@ -62,7 +87,7 @@ def estop(
         other = "--reset" if reset else rack
         raise Failure(f"--ready, {other}: it waits to stop a rack of another machine, HOST/RACK", 2)
     if "/" in rack:
-        tick = _stop_from_afar(RackAddress.of(rack), reset, ready, Asker.of(name, certificates))
+        tick = _stop_from_afar(RackAddress.of(rack), reset, ready, Operator.of(name, certificates))
         own = rack.partition("/")[2]
         held = ""
     else:
@@ -78,14 +103,22 @@ def estop(
     print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)
 
 
-def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, asker: Asker) -> int:
+def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, operator: Operator) -> int:
     """Set the latch of a rack on another machine, at once or when Enter is pressed; return the tick
     at which it was set. Raises `Failure`."""
     if reset:
-        raise Failure(f"rack '{address.rack}' {AT_THE_RACK.format(address.rack)}")
-    with needing_zenoh():
-        from rack.tools.network.remote import stop, stop_when
-    return stop_when(_pressed, address, asker, _Teller()) if ready else stop(address, asker)
+        rack = address.rack
+        why = f"resets an emergency stop on its own machine alone: rack estop {rack} --reset"
+        raise Failure(f"rack '{rack}' {why}")
+    try:
+        from rack.tools.network.estop import stop, stop_when
+    except ImportError as error:
+        if error.name != "zenoh":
+            raise
+        raise Failure(
+            "racks on other machines need eclipse-zenoh: pip install nasrem-rack[lan]"
+        ) from None
+    return stop_when(_pressed, address, operator, _Teller()) if ready else stop(address, operator)
 
 
 class _Teller:

@@ -12,15 +12,15 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.commands.replay import merge
-from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.answer import Document, Failure, fail, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import AskAs, Certificates, Json, RackName, View
+from rack.tools.console.parameters import Json, RackName, View, named_here
 from rack.tools.live.folder import folder_of
-from rack.tools.live.watched import WatchedRack, watched
+from rack.tools.live.watched import LocalRack
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink, is_opening
 from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes, unwritable
@@ -42,10 +42,7 @@ With = Annotated[
     typer.Option(
         "--with",
         metavar="RACK",
-        help=(
-            "record this rack as well, on this machine or, by HOST[:PORT]/RACK, on another one;"
-            " repeatable"
-        ),
+        help="record this rack as well; repeatable",
     ),
 ]
 Save = Annotated[
@@ -62,8 +59,6 @@ def record(
     out: Out = None,
     view: View = False,
     save: Save = False,
-    certificates: Certificates = "",
-    name: AskAs = OPERATOR,
     as_json: Json = False,
 ) -> None:
     """Record a running rack until its run is over, or until Ctrl-C.
@@ -73,8 +68,8 @@ def record(
     end the run.
 
     With others that it works with, each is recorded into its own folder DIR/<rack>. When the runs
-    of all are over, DIR/run.rrd shows them on one time line, that of the first. A rack on another
-    machine has to permit `watch`.
+    of all are over, DIR/run.rrd shows them on one time line, that of the first. Record a rack of
+    another machine there, and join the copied folders with `rack replay`.
 
     --save writes what the recorder of `rack run` has taken so far into a folder that opens as a run
     does, and ends; run and recording go on.
@@ -84,7 +79,7 @@ def record(
       rack record nasrem
       rack record nasrem --view --out runs/look
       rack record --save nasrem
-      rack record cell-puma --with 192.168.1.5/cell-k1607 --with 192.168.1.6/cell
+      rack record cell-puma --with cell-k1607 --with cell
     """
     racks = [rack, *others]
     if others and view:
@@ -93,14 +88,13 @@ def record(
         )
     if save and (others or view):
         raise Failure(f"--save, {'--with' if others else '--view'}: give one of them", 2)
-    asker = Asker.of(name, certificates)
     with ExitStack() as stack:
-        found = [stack.enter_context(watched(each, asker)) for each in racks]
+        found = [stack.enter_context(LocalRack(str(named_here(each)))).segment for each in racks]
         folder = folder_of(out, rack)
         if save:
             print_answer(*_saved(found[0], folder), as_json)
             return
-        segment = found[0].segment
+        segment = found[0]
         clock_ns = segment.layout.clock_ns
         begun = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
         with _ending_when_full(found[0], folder):
@@ -121,12 +115,9 @@ def _end_at_once(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _saved(rack: WatchedRack, folder: Path) -> tuple[Document, str]:
+def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
     """Save what is recorded of a running rack; return the answer, as data and as a line."""
-    segment = rack.segment
     name = segment.layout.rack
-    if segment.is_mirror:
-        raise Failure(f"--save {name}: the rack is on another machine; save it there", 2)
     run = recorded_by(segment)
     if run is None:
         raise Failure(f"--save {name}: nothing records it; 'rack record {name}' begins to")
@@ -146,23 +137,20 @@ def _saved(rack: WatchedRack, folder: Path) -> tuple[Document, str]:
     return {"rack": name, "folder": str(folder), **times, "bytes": size}, line
 
 
-def _begin(rack: WatchedRack, folder: Path, notes: list[str], port: int | None = None) -> Recorder:
-    segment = rack.segment
-    for mailbox in segment.layout.mailboxes:
-        rack.follow(mailbox.name)
+def _begin(segment: Segment, folder: Path, notes: list[str], port: int | None = None) -> Recorder:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).write_text(segment.config)
     view = SafeSink.of(segment, port, lambda: ViewSink(segment, folder, port), notes.append)
-    return Recorder(segment, folder, view, rack.refresh if segment.is_mirror else None)
+    return Recorder(segment, folder, view)
 
 
-def _record(rack: WatchedRack, folder: Path, view: bool) -> list[str]:
+def _record(segment: Segment, folder: Path, view: bool) -> list[str]:
     notes: list[str] = []
     port = free_port() if view else None
     # Ctrl-C ends the recording, not the run; leaving the context finishes the files.
     with (
         INTERRUPT.orderly(),
-        _begin(rack, folder, notes, port) as recorder,
+        _begin(segment, folder, notes, port) as recorder,
         INTERRUPT.orderly(recorder.stop),
     ):
         if port is not None:
@@ -172,7 +160,7 @@ def _record(rack: WatchedRack, folder: Path, view: bool) -> list[str]:
 
 
 @contextmanager
-def _ending_when_full(rack: WatchedRack, folder: Path) -> Iterator[None]:
+def _ending_when_full(segment: Segment, folder: Path) -> Iterator[None]:
     """End the process with one line when files cannot be written: the viewer's library would wait,
     maybe for ever, for a file of its own."""
     try:
@@ -181,16 +169,16 @@ def _ending_when_full(rack: WatchedRack, folder: Path) -> Iterator[None]:
         if error.filename is not None:
             raise
         try:
-            fail(unwritable(folder, error, rack.segment.words[System.FOLLOWER_TICK]), 1)
+            fail(unwritable(folder, error, segment.words[System.FOLLOWER_TICK]), 1)
         finally:
             _end_at_once(1)
 
 
-def _record_together(racks: Sequence[WatchedRack], folder: Path) -> list[str]:
+def _record_together(racks: Sequence[Segment], folder: Path) -> list[str]:
     """Record each rack into its folder, then all of them into one file; return messages for the
     user."""
     notes: list[str] = []
-    names = [rack.segment.layout.rack for rack in racks]
+    names = [rack.layout.rack for rack in racks]
     if twice := [name for at, name in enumerate(names) if name in names[:at]]:
         raise Failure(f"--with {twice[0]}: this rack is to be recorded already", 2)
     folders = [folder / name for name in names]
@@ -224,7 +212,7 @@ def _follow(recorders: Sequence[Recorder], unfinished: str) -> None:
             stop()
             raise
 
-    # A thread each: a rack on another machine, slow to answer, keeps none of the others waiting.
+    # A thread each: a slow one keeps none of the others waiting.
     with INTERRUPT.orderly(stop, unfinished), ThreadPoolExecutor(len(recorders)) as pool:
         following = [pool.submit(follow, recorder) for recorder in recorders]
         # A signal that the kernel gives to another thread does not wake this one to handle it.

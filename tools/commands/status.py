@@ -7,29 +7,20 @@ from typing import Annotated
 import typer
 
 from rack.tools.commands.answers import show_status
-from rack.tools.console.address import OPERATOR, Asker
-from rack.tools.console.parameters import AskAs, Certificates, Json, named, rack_names
+from rack.tools.console.parameters import Json, named_here, rack_names
 
 OnlyRack = Annotated[
     str | None,
     typer.Argument(
         metavar="RACK",
-        help=(
-            "running rack by name; not needed when only one is running; on another machine:"
-            " HOST[:PORT]/RACK"
-        ),
+        help="running rack by name; not needed when only one is running",
         autocompletion=rack_names,
-        callback=named,
+        callback=named_here,
     ),
 ]
 
 
-def status(
-    rack: OnlyRack = None,
-    certificates: Certificates = "",
-    name: AskAs = OPERATOR,
-    as_json: Json = False,
-) -> None:
+def status(rack: OnlyRack = None, as_json: Json = False) -> None:
     """Show a running rack once: every task, its faults, what holds it, and its progress.
 
     Each task has a line with its cycles, misses, longest times and state. A hold is shown with its
@@ -42,6 +33,5 @@ def status(
     Examples:
       rack status
       rack status nasrem --json
-      rack status 192.168.1.5/cell --certificates ~/cell
     """
-    show_status(rack, as_json, Asker.of(name, certificates))
+    show_status(rack, as_json)

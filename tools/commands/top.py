@@ -8,21 +8,20 @@ from importlib.util import find_spec
 
 from rack.tools.commands.answers import only_rack
 from rack.tools.commands.status import OnlyRack
-from rack.tools.console.address import OPERATOR, Asker
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import AskAs, Certificates
 
 LOOK_S = 0.2
-"""Time from look to look: short, so that the end of a run on another machine is still seen."""
+"""Time from look to look."""
 
 
-def top(rack: OnlyRack = None, certificates: Certificates = "", name: AskAs = OPERATOR) -> None:
+def top(rack: OnlyRack = None) -> None:
     """Watch a running rack until its run is over, or until Ctrl-C.
 
     On a terminal it fills the screen, if textual is there (pip install 'nasrem-rack[live]'), and
-    keys command the rack; a rack of another machine, HOST/RACK, has the table of `rack status`,
-    which changes in place. Elsewhere one line a second is printed. Watching costs the rack no
+    keys command the rack. Elsewhere one line a second is printed. Watching costs the rack no
     deadline. Where it ends the run goes on, and the commands that it has given stay in force.
+
+    A rack on another machine: ssh -t HOST rack top.
 
     \b
     1 2 3 4  boards, mailboxes, events, lateness
@@ -37,19 +36,15 @@ def top(rack: OnlyRack = None, certificates: Certificates = "", name: AskAs = OP
     Examples:
       rack top
       rack top nasrem
-      rack top 192.168.1.5/cell --certificates ~/cell
     """
     from rack.tools.console.tables import console
     from rack.tools.live.display import display_for
     from rack.tools.live.snapshot import RackMonitor
-    from rack.tools.live.watched import LocalRack, watched
+    from rack.tools.live.watched import LocalRack
 
     ended = threading.Event()
-    with (
-        INTERRUPT.orderly(ended.set),
-        watched(rack or only_rack(), Asker.of(name, certificates)) as one,
-    ):
-        if isinstance(one, LocalRack) and console().is_terminal and sys.stdin.isatty():
+    with INTERRUPT.orderly(ended.set), LocalRack(rack or only_rack()) as one:
+        if console().is_terminal and sys.stdin.isatty():
             if find_spec("textual") is not None:
                 from rack.tools.live.full_screen import RackScreen
 
@@ -63,5 +58,4 @@ def top(rack: OnlyRack = None, certificates: Certificates = "", name: AskAs = OP
         with display_for(silent=False) as display:
             display.show(monitor.look())
             while not one.segment.run_is_over and not ended.wait(LOOK_S):
-                one.refresh()
                 display.show(monitor.look())

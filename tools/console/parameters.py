@@ -13,9 +13,6 @@ import typer
 
 from rack.tools.console.answer import Failure
 
-CERTIFICATES = "RACK_CERTIFICATES"
-"""Environment variable with the default of --certificates."""
-
 
 def config_names(start: str) -> list[str]:
     """Return the shipped configs whose names begin with `start`, for shell completion."""
@@ -38,7 +35,7 @@ def check_timeout(timeout: float | None, wait: bool) -> None:
 
 
 def named(rack: str | None) -> str | None:
-    """Return the name of a rack, or HOST/RACK. Raises `Failure` when it is empty."""
+    """Return the name of a rack. Raises `Failure` when it is empty."""
     if rack == "":
         raise Failure(
             'RACK = "": empty; permitted: a running rack by name, as "rack list" shows it', 2
@@ -50,9 +47,10 @@ def named_here(rack: str | None) -> str | None:
     """Return the name of a rack on this machine. Raises `Failure` for one on another, where this
     command is needed."""
     if rack is not None and "/" in rack:
-        from_afar = "permitted from afar: list --lan, status, top, command, estop"
         raise Failure(
-            f"RACK = {rack}: this command works on the rack's own machine alone; {from_afar}", 2
+            f"RACK = {rack}: this command works on the rack's own machine alone, as in: ssh HOST"
+            " rack status; from another machine only: rack estop",
+            2,
         )
     return named(rack)
 
@@ -75,33 +73,6 @@ RackName = Annotated[
         help="running rack by name, as 'rack list' shows it",
         autocompletion=rack_names,
         callback=named_here,
-    ),
-]
-"""A rack on this machine."""
-AnyRackName = Annotated[
-    str,
-    typer.Argument(
-        metavar="RACK",
-        help="running rack by name, as 'rack list' shows it; on another machine: HOST[:PORT]/RACK",
-        autocompletion=rack_names,
-        callback=named,
-    ),
-]
-"""A rack on this machine or another one."""
-Certificates = Annotated[
-    str,
-    typer.Option(
-        metavar="DIR",
-        envvar=CERTIFICATES,
-        help="for HOST/RACK: folder with certificates; see rack lan certificates --help",
-    ),
-]
-AskAs = Annotated[
-    str,
-    typer.Option(
-        "--as",
-        metavar="NAME",
-        help="for HOST/RACK: name under which to ask, as in adapter.lan.permit of that rack",
     ),
 ]
 RunFolder = Annotated[

@@ -7,7 +7,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any
 
 from rack.backplane.operator_table import (
@@ -18,6 +17,7 @@ from rack.backplane.operator_table import (
     RequestStage,
     RequestWord,
 )
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import read_stored
 from rack.boards.config.commands import asked, request, takes
@@ -32,20 +32,21 @@ from rack.tools.console.tables import fitted
 from rack.tools.live.holds import resume_command
 from rack.tools.live.newest import Newest
 from rack.tools.live.replies import LastCycle, Replies, Reply, answering
-from rack.tools.live.watched import WatchedRack
+from rack.tools.live.watched import LocalRack
 
 SILENT_S = 5.0
 """Time without a tick after which a wait is given up."""
 NOTE_S = 1.5
 """Time after which a wait is explained on stderr."""
+LOOK_S = 0.001
+"""Time between two looks at the rack."""
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 
 
 class LiveDesk:
     """The desk of one rack."""
 
-    def __init__(self, rack: WatchedRack) -> None:
-        self._rack = rack
+    def __init__(self, rack: LocalRack) -> None:
         self._segment = rack.segment
         self._config = read_stored(self._segment.config)
         levels = PublishedRack.of_rack(self._segment).levels
@@ -89,7 +90,7 @@ class LiveDesk:
             text = describe(message_of(entry, segment.layout))
             return Reply(0, command.level, text, -1, "waiting", waits=held)
         # However the wait ends, leaving the claim withdraws a request that has not been given.
-        with self._claimed(command.level, wanted, Client.WAITS) as entry:
+        with OperatorTable(segment).claim(wanted) as entry:
             reply = self._await_giving(entry, command.level)
         return self._await_reply(reply, wait, timeout_s)
 
@@ -97,8 +98,7 @@ class LiveDesk:
         """Give a command under a lease, `tell` its reply, and stay until a newer one is in force or
         the run is over: if this process ends or falls silent before, its level holds.
 
-        Raises as `give` does, for a command that leaves none in force, and when the rack is out of
-        reach.
+        Raises as `give` does, and for a command that leaves none in force.
         """
         command, wanted = self._request(given)
         segment = self._segment
@@ -109,26 +109,15 @@ class LiveDesk:
         if held := waits(segment):
             raise Failure(f"--lease: the rack is held: {held}")
         table = OperatorTable(segment)
-        with self._claimed(command.level, wanted, Client.LEASES) as entry:
+        with table.claim(wanted, Client.LEASES) as entry:
             ticket = entry[RequestWord.TICKET]
             reply = self._await_reply(self._await_giving(entry, command.level), False, None)
             tell(reply)
             while reply.worked and table.hear(entry, ticket) and not segment.run_is_over:
-                if not self._rack.refresh():
-                    why = f"'{command.level}' holds within 2 s, if it still runs"
-                    raise Failure(f"rack '{segment.rack}' is out of reach: {why}")
+                time.sleep(LOOK_S)
 
     def _takes_hold(self, level: str) -> bool:
         return Operation.HOLD in (self._levels[level].commands)
-
-    def _claimed(
-        self, level: str, wanted: Request, client: Client
-    ) -> AbstractContextManager[RequestEntry]:
-        """Claim a request, from a rack that lets no answer of the level be missing."""
-        if (status := answering(self._segment, level)) is not None:
-            self._rack.follow(status.name)
-            self._rack.follow(f"{level}.operator")
-        return self._rack.claim(wanted, client)
 
     def _request(self, given: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
         """Return a command and what asks the clock for it. Raises as `give` does."""
@@ -204,7 +193,7 @@ class LiveDesk:
         while True:
             # Asked before the look: a reply written just before the run ended still counts.
             yield self._segment.run_is_over
-            self._rack.refresh()
+            time.sleep(LOOK_S)
             now = time.monotonic()
             if tick != words[System.TICK] or words[System.HELD]:
                 tick = words[System.TICK]

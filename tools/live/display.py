@@ -23,7 +23,7 @@ from rack.tools.console.tables import console, decimal, grid
 from rack.tools.live.holds import is_news
 from rack.tools.live.host_side import EntryRow, HostRow
 from rack.tools.live.network import ExportRow, ImportRow, PeerRow
-from rack.tools.live.snapshot import DEAD, GONE, LOST, Snapshot, TaskProgress, TaskRow
+from rack.tools.live.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -218,7 +218,7 @@ def line_of(snapshot: Snapshot) -> str:
         "faults": len(snapshot.faults),
     }
     parts = [f"{snapshot.rack} {snapshot.time_s:.2f} s", f"tick {snapshot.tick}"]
-    parts += [snapshot.run] if snapshot.run in (DEAD, GONE) else []
+    parts += [snapshot.run] if snapshot.run == DEAD else []
     parts += [f"{name} {n}" for name, n in counts.items() if n or name in LOSSES]
     at = snapshot.progress
     parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
@@ -234,8 +234,6 @@ def _head(snapshot: Snapshot) -> Text:
     )
     if snapshot.run == DEAD:
         line.append("; its launcher is gone: 'rack clean' removes it", style="bold red")
-    if snapshot.run == GONE:
-        line.append("; it does not answer any more", style="bold red")
     if snapshot.clock_skipped:
         line.append(f", clock skipped {snapshot.clock_skipped} ticks", style="yellow")
     for name in [*snapshot.lines, *_demanded(snapshot)]:

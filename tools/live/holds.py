@@ -80,8 +80,7 @@ def _find_holds(newest: Newest) -> Iterator[Hold]:
         is_arm = driving is None or "braked" in _fields(driving)
         what, how = ("arm", "braked") if is_arm else ("hand", "valves closed")
         since = segment.block(arm)[Block.LEVEL_SINCE] if arm else 0
-        where = ", on its own machine" if segment.is_mirror else ""
-        release = f"rack estop {segment.layout.rack} --reset{where}"
+        release = f"rack estop {segment.layout.rack} --reset"
         yield hold(what, since, f"{how}: emergency stop", release)
     for board, why in awaited(segment):
         yield hold(board, segment.block(board)[Block.RELEASED], why)

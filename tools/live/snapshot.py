@@ -37,8 +37,6 @@ LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
 DEAD = "dead"
 """State of a run whose launcher is gone: 'rack clean' removes it."""
-GONE = "gone"
-"""State of a run on another machine that does not answer any more."""
 HELD = "HELD: 'rack step {}' lets it go on"
 """Line of a rack in lockstep that is single-stepped."""
 TASK_STATUS = "task_status"
@@ -141,7 +139,7 @@ class RackMonitor:
         segment = self._segment
         words = segment.words
         layout = segment.layout
-        run = GONE if segment.is_mirror else DEAD
+        run = DEAD
         if segment.launcher_is_alive:
             run = as_named(Run, words[System.STATE]).name.lower()
         tick = words[System.TICK]

@@ -1,1 +1,1 @@
-"""Racks of other machines, and the credentials of racks that work together."""
+"""The emergency stop of racks on other machines, and credentials of racks that work together."""

@@ -7,6 +7,7 @@ certificate serves both sides of a connection: racks listen and connect.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -17,15 +18,19 @@ from typing import NamedTuple
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    NoEncryption,
-    PrivateFormat,
-    load_pem_private_key,
-)
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.x509.oid import NameOID
 
-from rack.boards.lan.credentials import AUTHORITY, OWNER_ONLY, Credentials
+from rack.backplane.rack_name import RACK_NAME
+from rack.boards.lan.config import Credential
+from rack.boards.lan.credentials import (
+    AUTHORITY,
+    OWNER_ONLY,
+    Credentials,
+    load_certificates,
+    load_private_key,
+)
+from rack.boards.lan.endpoint import Endpoint
 from rack.tools.console.answer import Failure
 
 AUTHORITY_KEY = "authority-key.pem"
@@ -42,7 +47,9 @@ class Made:
     expires: datetime
 
 
-class _Authority(NamedTuple):
+class Authority(NamedTuple):
+    """The certificate of an authority, and its key."""
+
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
@@ -51,125 +58,90 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
     """Write a certificate and key for each name with its addresses; a new authority, if there
     is none.
 
-    Raises `Failure`: a file is there already, the set there is not whole, or its authority has
-    expired.
+    Raises `Failure`: a file is there already, or the authority there cannot be used.
     """
-    now = datetime.now(UTC)
     wanted = [Credentials(folder, name) for name in names]
     pairs = [path for own in wanted for path in (own.certificate, own.key)]
     if taken := [path.name for path in pairs if os.path.lexists(path)]:
         raise Failure(f"{folder}: {', '.join(taken)} exist already; nothing is overwritten", 2)
-    shared = (AUTHORITY, AUTHORITY_KEY)
-    there = [name for name in shared if os.path.lexists(folder / name)]
-    if there and len(there) < len(shared):
-        lost = ", ".join(name for name in shared if name not in there)
-        raise Failure(
-            f"{folder}: {lost} missing; a set is added to where its authority and its key are", 2
-        )
     files: dict[str, bytes] = {}
-    expires = now + timedelta(days=days)
-    if there:
-        authority = _found(folder, now)
+    expires = datetime.now(UTC) + timedelta(days=days)
+    if any(os.path.lexists(folder / name) for name in (AUTHORITY, AUTHORITY_KEY)):
+        authority = _load_authority(folder)
     else:
-        authority = _made(now, expires)
-        files |= {AUTHORITY: _pem(authority.certificate), AUTHORITY_KEY: _key_pem(authority.key)}
-    expires = min(expires, authority.certificate.not_valid_after_utc)
-    for name, addresses in names.items():
         key = ec.generate_private_key(ec.SECP256R1())
-        certificate = _for_rack(name, addresses, key, authority, now, expires)
-        own = Credentials(folder, name)
-        files |= {own.certificate.name: _pem(certificate), own.key.name: _key_pem(key)}
-    _write(folder, files)
+        authority = Authority(sign_certificate(AUTHORITY_NAME, key, None, expires), key)
+        files |= {AUTHORITY: pem_of(authority.certificate), AUTHORITY_KEY: pem_of_key(key)}
+    expires = min(expires, authority.certificate.not_valid_after_utc)
+    for own, addresses in zip(wanted, names.values(), strict=True):
+        key = ec.generate_private_key(ec.SECP256R1())
+        certificate = sign_certificate(own.rack, key, authority, expires, addresses)
+        files |= {own.certificate.name: pem_of(certificate), own.key.name: pem_of_key(key)}
+    write_credentials(folder, files)
     return Made(files, expires)
 
 
-def _made(now: datetime, expires: datetime) -> _Authority:
-    key = ec.generate_private_key(ec.SECP256R1())
-    own = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
-    name = _named(AUTHORITY_NAME)
-    builder = _builder(name, key, name, now, expires, signs_certificates=True)
-    builder = builder.add_extension(own, critical=False)
-    return _Authority(builder.sign(key, hashes.SHA256()), key)
-
-
-def _found(folder: Path, now: datetime) -> _Authority:
+def _load_authority(folder: Path) -> Authority:
     """Return the authority of a set. Raises `Failure`."""
     try:
-        certificate = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes())
-        key = load_pem_private_key((folder / AUTHORITY_KEY).read_bytes(), None)
-    except (ValueError, TypeError):
-        raise Failure(
-            f"{folder}: {AUTHORITY} or {AUTHORITY_KEY} is not in PEM form, or has a password", 2
-        ) from None
-    if (
-        not isinstance(key, ec.EllipticCurvePrivateKey)
-        or key.public_key() != certificate.public_key()
-    ):
+        certificate, *_ = load_certificates(folder / AUTHORITY)
+        key = load_private_key(folder / AUTHORITY_KEY)
+    except Credential as flaw:
+        raise Failure(str(flaw), 2) from None
+    if key.public_key() != certificate.public_key():
         raise Failure(f"{folder}: {AUTHORITY_KEY} is not the key of {AUTHORITY}", 2)
-    if certificate.not_valid_after_utc <= now:
-        raise Failure(
-            f"{folder}: {AUTHORITY} expired on {certificate.not_valid_after_utc:%Y-%m-%d}; make a"
-            " new set",
-            2,
-        )
-    return _Authority(certificate, key)
+    return Authority(certificate, key)
 
 
-def _for_rack(
+def sign_certificate(
     name: str,
-    addresses: Sequence[str],
     key: ec.EllipticCurvePrivateKey,
-    authority: _Authority,
-    now: datetime,
+    authority: Authority | None,
     expires: datetime,
+    addresses: Sequence[str] = (),
 ) -> x509.Certificate:
-    issuer = authority.certificate.subject
-    builder = _builder(_named(name), key, issuer, now, expires, signs_certificates=False)
-    both = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
-    signer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key())
-    builder = builder.add_extension(both, critical=False).add_extension(signer, critical=False)
-    if addresses:
-        names = x509.SubjectAlternativeName(map(_address, addresses))
-        builder = builder.add_extension(names, critical=False)
-    return builder.sign(authority.key, hashes.SHA256())
+    """Return a certificate.
 
-
-def _builder(
-    name: x509.Name,
-    key: ec.EllipticCurvePrivateKey,
-    issuer: x509.Name,
-    now: datetime,
-    expires: datetime,
-    signs_certificates: bool,
-) -> x509.CertificateBuilder:
-    path_length = 0 if signs_certificates else None
-    constraints = x509.BasicConstraints(ca=signs_certificates, path_length=path_length)
+    Args:
+        name: Its common name.
+        key: The key that it certifies.
+        authority: The authority that signs it. None: it is that of a new authority.
+        expires: Its end.
+        addresses: The host names and addresses of a rack that listens.
+    """
+    own = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    is_authority = authority is None
+    issuer, signer = (own, key) if authority is None else (authority[0].subject, authority.key)
     usage = x509.KeyUsage(
-        digital_signature=not signs_certificates,
+        digital_signature=not is_authority,
         content_commitment=False,
         key_encipherment=False,
         data_encipherment=False,
         key_agreement=False,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
+        key_cert_sign=is_authority,
+        crl_sign=is_authority,
         encipher_only=False,
         decipher_only=False,
     )
-    return (
+    builder = (
         x509.CertificateBuilder()
-        .subject_name(name)
+        .subject_name(own)
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - EARLIER)
+        .not_valid_before(min(datetime.now(UTC), expires) - EARLIER)
         .not_valid_after(expires)
-        .add_extension(constraints, critical=True)
-        .add_extension(usage, critical=True)
+        .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), True)
+        .add_extension(usage, True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), False
+        )
     )
-
-
-def _named(name: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    if addresses:
+        names = x509.SubjectAlternativeName(map(_address, addresses))
+        builder = builder.add_extension(names, False)
+    return builder.sign(signer, hashes.SHA256())
 
 
 def _address(text: str) -> x509.GeneralName:
@@ -179,15 +151,18 @@ def _address(text: str) -> x509.GeneralName:
         return x509.DNSName(text)
 
 
-def _pem(certificate: x509.Certificate) -> bytes:
+def pem_of(certificate: x509.Certificate) -> bytes:
+    """Return a certificate as the content of its file."""
     return certificate.public_bytes(Encoding.PEM)
 
 
-def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+def pem_of_key(key: ec.EllipticCurvePrivateKey) -> bytes:
+    """Return a key as the content of its file."""
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
 
-def _write(folder: Path, files: Mapping[str, bytes]) -> None:
+def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files by name into a folder, which is made if it does not exist."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in files.items():
         # Its owner's from the first moment on, and never through a link that somebody left.
@@ -201,34 +176,23 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
 def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
     """Return the addresses by name from texts as in cell=10.0.0.1,cell.local or operator. Raises
     `Failure`."""
-    from pydantic import TypeAdapter, ValidationError
-
-    from rack.boards.lan.config import PeerName
-    from rack.boards.lan.endpoint import Endpoint
-
-    proper_name = TypeAdapter(PeerName)
     found: dict[str, list[str]] = {}
     for entry in entries:
         name, has_addresses, rest = entry.partition("=")
         addresses = rest.split(",") if has_addresses else []
+        why = ""
+        if re.fullmatch(RACK_NAME, name) is None:
+            why = "permitted names: a-z, 0-9, _ and -, at most 40"
+        elif name in found:
+            why = f"{name} is named twice"
+        elif name == "authority" or name.endswith("-key"):
+            why = "a file of the set would have this name"
         try:
-            proper_name.validate_python(name)
             for address in addresses:
-                host = f"[{address}]" if ":" in address else address
-                Endpoint.of(f"tls/{host}:1")
-        except ValidationError:
-            raise Failure(
-                f'--for = "{entry}": permitted names: a-z, 0-9, _ and -, at most 40', 2
-            ) from None
+                Endpoint.of(f"tls/{f'[{address}]' if ':' in address else address}:1")
         except ValueError:
-            raise Failure(
-                f'--for = "{entry}": permitted: NAME, or NAME=ADDRESS,... with host names or'
-                " addresses",
-                2,
-            ) from None
-        if name in found:
-            raise Failure(f'--for = "{entry}": {name} is named twice', 2)
-        if name == "authority" or name.endswith("-key"):
-            raise Failure(f'--for = "{entry}": a file of the set would have this name', 2)
+            why = why or "permitted: NAME, or NAME=ADDRESS,... with host names or addresses"
+        if why:
+            raise Failure(f'--for = "{entry}": {why}', 2)
         found[name] = addresses
     return found

@@ -40,9 +40,9 @@ def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = 
     """Make a set of certificates for tests: an authority, and a pair for each name.
 
     Racks know each other by name: the common name of a certificate is the name of the rack, and
-    what a rack may send, read or command depends on it. Give a rack that listens the addresses or
-    host names that stand in the others' `connect`: they check them. One that only connects, or a
-    person who uses `rack status HOST/RACK` and the like, needs none.
+    what a rack may send and read depends on it. Give a rack that listens the addresses or host
+    names that stand in the others' `connect`: they check them. One that only connects, or a person
+    who uses `rack estop HOST/RACK`, needs none.
 
     In DIR it writes authority.pem and authority-key.pem, and NAME.pem and NAME-key.pem for each
     name. NAME's key seals all its messages, and nobody else can. In a folder that holds a set

@@ -219,8 +219,8 @@ class RecorderProcess:
 
 def recorded_by(segment: Segment) -> Path | None:
     """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
-    seen from this PID namespace or machine."""
-    if segment.is_mirror or not segment.launcher:
+    seen from this PID namespace."""
+    if not segment.launcher:
         return None
     pid = segment.words[System.FOLLOWER_PID]
     with suppress(OSError):

@@ -31,6 +31,9 @@ from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.recording.signal import Signal, Trigger, mailbox_of
 
+LOOK_S = 0.001
+"""Time between two looks at the rack."""
+
 
 def attach(rack: str) -> AttachedRack:
     """Return the running rack of that name on this machine. Raises `Failure`."""
@@ -163,7 +166,7 @@ class AttachedRack:
             # Asked before the look: what is written until the end counts.
             is_last = self._segment.run_is_over or time.monotonic() > deadline
             yield
-            self._rack.refresh()
+            time.sleep(LOOK_S)
 
     def _in_vain(self, awaited: str, timeout_s: float) -> Failure:
         why = "the run is over" if self._segment.run_is_over else f"not within {timeout_s:g} s"

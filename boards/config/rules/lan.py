@@ -22,7 +22,6 @@ from rack.boards.config.wiring import Wiring, is_taken
 from rack.boards.errors import Mistake
 from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
-from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.endpoint import Endpoint
 from rack.levels.peer import peer_port
 
@@ -199,15 +198,14 @@ def network(wiring: Wiring) -> Iterator[Mistake]:
     for key, endpoint in table.endpoints:
         if why := _why_not(endpoint, table, connects=key.startswith("connect")):
             yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
-    known = [name for name, rights in table.permit.items() if rights]
-    if known and (at := _open(table)):
+    if table.estop_from and (at := _open(table)):
         could = "pass for any of them"
         if table.certificates is not None:
             could = "repeat what one of them has asked"
         why = f"whoever reaches {at[0]} could {could}; permitted: tls/ or quic/ with"
         yield Mistake(
-            f"{PLACE}.permit",
-            ", ".join(known),
+            f"{PLACE}.estop_from",
+            ", ".join(table.estop_from),
             f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
         )
     if table.has_tls and table.certificates is None:
@@ -262,6 +260,12 @@ def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
     table = config.adapter.lan
     if table is None or table.certificates is None:
         return
+    try:
+        from rack.boards.lan.credentials import Credentials
+    except ImportError:
+        why = "cannot be checked without 'cryptography': install nasrem-rack[lan]"
+        yield Mistake(f"{PLACE}.certificates", table.certificates, why)
+        return
     heard = [Endpoint.of(text) for text in table.listen]
     addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
@@ -283,6 +287,8 @@ def network_notes(config: RackConfig) -> list[str]:
         may = "read what is exchanged, and feign that racks come and go"
     notes = [f"without TLS: whoever reaches {', '.join(far)} may {may}"] if far else []
     if table.certificates is not None and table.has_tls:
+        from rack.boards.lan.credentials import Credentials
+
         expires = Credentials(Path(table.certificates), config.name).expires
         if expires - datetime.now(UTC) < SOON:
             notes.append(

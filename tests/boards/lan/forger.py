@@ -39,16 +39,16 @@ def below(folder: Path, signer: str, name: str, made: Path) -> Credentials:
     issuer = load_pem_x509_certificate(own.certificate.read_bytes())
     now = datetime.now(UTC)
     key = certificates.ec.generate_private_key(certificates.ec.SECP256R1())
-    authority = certificates._Authority(issuer, own.pair.key)
-    found = certificates._for_rack(name, [], key, authority, now, now + timedelta(days=1))
+    authority = certificates.Authority(issuer, own.pair.key)
+    found = certificates.sign_certificate(name, key, authority, now + timedelta(days=1))
     of_name = Credentials(made, name)
-    chain = certificates._pem(found) + own.pair.chain
+    chain = certificates.pem_of(found) + own.pair.chain
     files = {
         "authority.pem": own.authority.read_bytes(),
         of_name.certificate.name: chain,
-        of_name.key.name: certificates._key_pem(key),
+        of_name.key.name: certificates.pem_of_key(key),
     }
-    certificates._write(made, files)
+    certificates.write_credentials(made, files)
     return of_name
 
 

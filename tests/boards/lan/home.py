@@ -17,7 +17,7 @@ from typing import Any
 
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.envelope import Envelope, Flaw
-from rack.boards.lan.keys import ask_keys, out_key
+from rack.boards.lan.keys import estop_key, out_key
 from rack.boards.lan.link import LanLink
 
 HEAD = Envelope(1, 2, 3, 4, 5, 6, 7)
@@ -36,7 +36,7 @@ class Home:
         self._arrived = [
             link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()
         ]
-        self._questions = link.answer(ask_keys(rack))
+        self._questions = link.answer(estop_key("*", rack))
         self._exports = [
             (key, link.publish(key))
             for key in (out_key(rack, e.source) for e in table.exports.values())

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, NamedTuple
 
 from rack.backplane.mailbox.protocols import open_observer
@@ -182,7 +184,11 @@ def ended(rack: Rack) -> Ended:
 
 
 class RackProcess:
-    """A rack in a process of its own, started by `popen`. `pid` is its launcher's."""
+    """A rack in a process of its own, started by `popen`. `pid` is its launcher's.
+
+    A thread takes its events as they come: on a busy machine it prints so many misses that the pipe
+    would be full, and a launcher that waits for its reader restarts no board.
+    """
 
     def __init__(
         self,
@@ -204,6 +210,15 @@ class RackProcess:
         )
         self.pid = self._process.pid
         self.events: list[dict[str, Any]] = []
+        self._unread: SimpleQueue[str | None] = SimpleQueue()
+        self._reader = Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._unread.put(line)
+        self._unread.put(None)
 
     def await_event(self, kind: str, text: str = "") -> dict[str, Any]:
         """Return the next event of a kind whose text contains this. Raises `AssertionError` if the
@@ -211,18 +226,16 @@ class RackProcess:
         for event in self._lines():
             if event.get("kind") == kind and text in event["text"]:
                 return event
-        raise AssertionError(
-            f"no event {kind} '{text}': {self.events} {self._process.communicate()[1]}"
-        )
+        raise AssertionError(f"no event {kind} '{text}': {self.events} {self._errors()}")
 
     def outcome(self) -> dict[str, Any]:
         """Wait for its end and return its outcome, as in `Outcome`, or the text of the error of its
         launch."""
         for line in self._lines():
             if "kind" not in line:
-                self._process.communicate(timeout=BOUND_S)
+                self._errors()
                 return line
-        raise AssertionError(f"no outcome: {self.events} {self._process.communicate()[1]}")
+        raise AssertionError(f"no outcome: {self.events} {self._errors()}")
 
     def send(self, number: signal.Signals) -> None:
         """Send a signal to its launcher."""
@@ -231,14 +244,19 @@ class RackProcess:
     def end(self) -> None:
         """Kill its launcher, if it still runs."""
         self._process.kill()
-        self._process.communicate(timeout=BOUND_S)
+        self._errors()
+
+    def _errors(self) -> str:
+        """Wait for its end and return what it has printed on stderr."""
+        self._reader.join(BOUND_S)
+        return self._process.communicate(timeout=BOUND_S)[1]
 
     def _lines(self) -> Iterator[dict[str, Any]]:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+        while (line := self._unread.get()) is not None:
             found = json.loads(line)
             self.events += [found] if "kind" in found else []
             yield found
+        self._unread.put(None)
 
 
 @contextmanager

@@ -7,17 +7,22 @@ from typing import Any
 
 import pytest
 
-from rack.boards.lan.access import PUT, SUBSCRIBE, TOKEN, WATCH_TOKENS, access_control
+from rack.boards.lan.access import IN, OUT, SEND, TOKENS, access_control
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.keys import alive_key, launch_and_cycle
 
 TLS, TCP = "tls/10.0.0.1:7447", "tcp/127.0.0.1:7447"
+QUERIES = ("query", "reply")
 ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
 
 
-def rules(endpoint: str, asks: bool = False, **table: Any) -> Iterator[tuple[str, str, str, str]]:
+def rules(
+    endpoint: str, is_operator: bool = False, **table: Any
+) -> Iterator[tuple[str, str, str, str]]:
     """Yield flow, message, key and common name (* for anyone) of all that is allowed."""
-    found = access_control("home", LanTable.model_validate({"listen": (endpoint,), **table}), asks)
+    found = access_control(
+        "home", LanTable.model_validate({"listen": (endpoint,), **table}), is_operator
+    )
     assert (found["enabled"], found["default_permission"]) == (True, "deny")
     subjects = {
         subject["id"]: subject.get("cert_common_names", ["*"]) for subject in found["subjects"]
@@ -39,78 +44,67 @@ def test_without_others_nothing_is_allowed() -> None:
     assert list(rules(TLS)) == []
 
 
-def test_without_tls_anyone_may_see_that_it_is_there_and_compare_clocks() -> None:
+def test_without_tls_anyone_may_see_what_it_sends_and_compare_clocks() -> None:
     found = list(rules(TCP))
-    assert {message for _, message, *_ in found} == {*WATCH_TOKENS, *TOKEN, *SUBSCRIBE, *PUT}
-    keys = {key for _, message, key, _ in found if message in (*SUBSCRIBE, *PUT)}
-    assert keys == {"rack/*/ping/home", "rack/*/pong/*", "rack/home/pong/*"}
+    assert {name for *_, name in found} == {"*"}
+    assert {key for flow, message, key, _ in found if (flow, message) == ("ingress", "put")} == {
+        "rack/*/ping/home"
+    }
+    assert not [rule for rule in found if rule[1] in (*QUERIES, "liveliness_token") and IN in rule]
 
 
 def test_over_tls_every_rule_is_for_one_certificate() -> None:
-    tables = {"export": {"pulse": {"from": "pulse.status"}}, "permit": {"anyone": ["watch"]}}
+    tables = {"export": {"pulse": {"from": "pulse.status"}}, "estop_from": ["anyone"]}
     names = {name for *_, name in rules(TLS, peers=("friend",), **tables)}
     assert names == {"friend", "anyone"}
 
 
-def test_puts_come_from_a_rack_itself_and_only_what_is_imported() -> None:
+def test_everyone_sends_under_a_name_of_their_own() -> None:
     imports = {"own": {"from": "friend/pulse.status", **ENTRY}}
-    found = {
+    found = list(rules(TLS, **{"import": imports}, peers=("other",), estop_from=["viewer"]))
+    come = {
         (key, name)
-        for flow, message, key, name in rules(TLS, **{"import": imports}, peers=("other",))
-        if (flow, message) == ("ingress", "put")
+        for flow, message, key, name in found
+        if flow == IN and message in (*SEND, *QUERIES)
     }
-    keys = ("step", "ping/home", "pong/home")
-    expected = {(f"rack/{name}/{key}", name) for name in ("friend", "other") for key in keys}
-    assert found == {*expected, ("rack/friend/out/pulse/status", "friend")}
+    senders = {(f"rack/{name}/**", name) for name in ("friend", "other")}
+    assert come == {*senders, ("rack/viewer/estop/home", "viewer")}
+    out = {key for flow, message, key, _ in found if flow == OUT and message in SEND}
+    assert out == {"rack/home/**"}
 
 
-def test_what_goes_out_is_this_racks_own() -> None:
-    exports = {"pulse": {"from": "pulse.status"}}
-    out = [
-        key
-        for flow, message, key, _ in rules(TLS, export=exports, peers=("friend",))
-        if flow == "egress" and message in ("put", "liveliness_token", "reply", "declare_queryable")
-    ]
-    assert out
-    assert all(key.startswith("rack/home/") for key in out)
-    assert "rack/home/out/pulse/status" in out
-
-
-@pytest.mark.parametrize(
-    ("right", "asked"), [("watch", "read"), ("command", "command"), ("stop", "stop")]
-)
-def test_a_right_permits_one_kind_of_question(right: str, asked: str) -> None:
-    found = list(rules(TLS, permit={"viewer": [right]}))
-    assert [key for _, message, key, _ in found if message == "query"] == [
-        f"rack/home/ask/{asked}/viewer/**"
-    ]
-    assert not [key for _, message, key, _ in found if message in ("put", "declare_subscriber")]
+def test_whoever_may_stop_it_may_do_nothing_else() -> None:
+    stop = "rack/viewer/estop/home"
+    assert {rule[:3] for rule in rules(TLS, estop_from=["viewer"])} == {
+        *((IN, token, "rack/**") for token in TOKENS),
+        (OUT, "liveliness_token", "rack/home/**"),
+        (OUT, "declare_queryable", "rack/*/estop/home"),
+        (IN, "query", stop),
+        (OUT, "reply", stop),
+    }
 
 
 def test_no_message_deletes() -> None:
-    assert not [
-        1 for _, message, *_ in rules(TCP, asks=True, peers=("friend",)) if message == "delete"
-    ]
+    assert not [rule for rule in rules(TCP, peers=("friend",)) if rule[1] == "delete"]
 
 
 def test_without_tls_rules_hold_for_anyone_but_by_the_same_keys() -> None:
     tables: dict[str, Any] = {
         "export": {"pulse": {"from": "pulse.status"}},
-        "permit": {"viewer": ["watch"]},
+        "estop_from": ["viewer"],
+        "peers": ("friend",),
     }
-    known, unknown = (
-        {rule[:3] for rule in rules(at, **tables, peers=("friend",))} for at in (TLS, TCP)
-    )
+    known, unknown = ({rule[:3] for rule in rules(at, **tables)} for at in (TLS, TCP))
     assert known <= unknown
     assert unknown - known <= {rule[:3] for rule in rules(TCP)}
-    assert {name for *_, name in rules(TCP, **tables, peers=("friend",))} == {"*"}
+    assert {name for *_, name in rules(TCP, **tables)} == {"*"}
 
 
-def test_who_asks_is_answered_and_sends_nothing() -> None:
-    found = list(rules(TLS, asks=True))
-    assert ("egress", "query", "rack/*/ask/*/home/**", "*") in found
-    assert ("ingress", "reply", "rack/*/ask/*/home/**", "*") in found
-    assert not [key for _, message, key, _ in found if message in ("put", "declare_subscriber")]
+def test_an_operator_sets_stops_and_sends_nothing_else() -> None:
+    found = list(rules(TLS, is_operator=True))
+    assert (OUT, "query", "rack/home/estop/*", "*") in found
+    assert (IN, "reply", "rack/home/estop/*", "*") in found
+    assert not [rule for rule in found if rule[1] in ("put", "declare_subscriber")]
 
 
 @pytest.mark.parametrize("cycle_ns", [0, 20_000_000])

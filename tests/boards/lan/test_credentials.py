@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.x509.oid import NameOID
 
 from rack.boards.lan.credentials import Credentials
 from rack.tools.network import certificates
@@ -128,44 +128,48 @@ def test_a_key_of_another_kind_is_refused(folder: Path) -> None:
         ]
 
 
-def signed(folder: Path, begins: timedelta, ends: timedelta) -> Iterator[str]:
-    """Put a certificate with other dates in place of the rack's."""
-    issuer = x509.load_pem_x509_certificate((folder / "authority.pem").read_bytes())
-    key = serialization.load_pem_private_key((folder / "authority-key.pem").read_bytes(), None)
-    assert isinstance(key, ec.EllipticCurvePrivateKey)
+@pytest.mark.parametrize(
+    ("begins", "ends", "why"),
+    [(-2, -1, "cell.pem: expired on 20"), (1, 2, "cell.pem: not valid before 20")],
+)
+def test_a_certificate_of_other_days_is_refused(
+    folder: Path, begins: int, ends: int, why: str
+) -> None:
     now = datetime.now(UTC)
-    own = Credentials(folder, "cell").pair.key
-    authority = certificates._Authority(issuer, key)
-    new = certificates._for_rack("cell", [], own, authority, now + begins, now + ends)
-    (folder / "cell.pem").write_bytes(certificates._pem(new))
-    yield from flaws(folder)
+    signer = serialization.load_pem_private_key((folder / "authority-key.pem").read_bytes(), None)
+    assert isinstance(signer, ec.EllipticCurvePrivateKey)
+    key = Credentials(folder, "cell").pair.key
+    dates = now + begins * DAY, now + ends * DAY
+    new = builder("cell", key, certificates.AUTHORITY_NAME, dates).sign(signer, hashes.SHA256())
+    (folder / "cell.pem").write_bytes(certificates.pem_of(new))
+    (flaw,) = flaws(folder)
+    assert flaw.startswith(why)
 
 
-def test_an_expired_certificate_is_refused(folder: Path) -> None:
-    (flaw,) = signed(folder, timedelta(days=-2), timedelta(days=-1))
-    assert flaw.startswith("cell.pem: expired on 20")
-
-
-def test_a_certificate_not_valid_yet_is_refused(folder: Path) -> None:
-    (flaw,) = signed(folder, timedelta(days=1), timedelta(days=2))
-    assert flaw.startswith("cell.pem: not valid before 20")
+def builder(
+    name: str,
+    key: ec.EllipticCurvePrivateKey,
+    above: str,
+    dates: tuple[datetime, datetime],
+    length: int | None = None,
+) -> x509.CertificateBuilder:
+    """Return a certificate with as little as the tools of others write; `length`: of the path
+    below it, None: it may sign nothing."""
+    own, issuer = (x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, n)]) for n in (name, above))
+    made = x509.CertificateBuilder(issuer, own, key.public_key(), x509.random_serial_number())
+    made = made.not_valid_before(dates[0]).not_valid_after(dates[1])
+    return made.add_extension(x509.BasicConstraints(length is not None, length), critical=True)
 
 
 def step(
     name: str, issuer: tuple[str, ec.EllipticCurvePrivateKey] | None, length: int | None
 ) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Return a certificate and its key, signed by an issuer or itself; `length`: of the path below
-    it, None: it may sign nothing."""
+    """Return a certificate and its key, signed by an issuer or itself."""
     key = ec.generate_private_key(ec.SECP256R1())
     above, signer = issuer or (name, key)
-    now, is_ca = datetime.now(UTC), length is not None
-    builder = certificates._builder(
-        certificates._named(name), key, certificates._named(above), now, now + DAY, is_ca
-    )
-    # As little as the tools of others write.
-    builder._extensions = []
-    builder = builder.add_extension(x509.BasicConstraints(is_ca, length), critical=True)
-    return builder.sign(signer, hashes.SHA256()), key
+    now = datetime.now(UTC)
+    made = builder(name, key, above, (now - DAY, now + DAY), length)
+    return made.sign(signer, hashes.SHA256()), key
 
 
 @pytest.mark.parametrize(
@@ -177,12 +181,12 @@ def test_an_authority_may_sign_through_another_but_not_through_a_rack(
     root, root_key = step("root", None, 1)
     between, between_key = step("puma", ("root", root_key), below)
     own, own_key = step("cell", ("puma", between_key), None)
-    certificates._write(
+    certificates.write_credentials(
         tmp_path,
         {
-            "authority.pem": certificates._pem(root),
-            "cell.pem": certificates._pem(own) + certificates._pem(between),
-            "cell-key.pem": certificates._key_pem(own_key),
+            "authority.pem": certificates.pem_of(root),
+            "cell.pem": certificates.pem_of(own) + certificates.pem_of(between),
+            "cell-key.pem": certificates.pem_of_key(own_key),
         },
     )
     assert flaws(tmp_path) == expected

@@ -16,8 +16,14 @@ import rack.boards.lan
 from rack.boards.lan import credentials as files
 from rack.boards.lan.credentials import Credential, Credentials, KeyPair
 from rack.boards.lan.envelope import _HEAD, MOST_ENVELOPE, Envelope, Flaw, Sealer
-from rack.boards.lan.keys import ask_keys, out_key, ping_key, sender_of, step_key
-from rack.boards.lan.questions import answer_key, question_key
+from rack.boards.lan.keys import (
+    estop_answer_key,
+    estop_key,
+    out_key,
+    ping_key,
+    sender_of,
+    step_key,
+)
 from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.forger import below
 
@@ -136,12 +142,10 @@ def test_a_spoilt_certificate_names_nobody_else(folder: Path) -> None:
 
 
 def test_each_key_is_sealed_by_the_one_in_whose_name_it_is() -> None:
-    question = question_key("cell", "stop", "operator")
-    assert sender_of(question) == "operator"
-    assert sender_of(answer_key(question)) == "cell"
-    for key in (KEY, out_key("cell", "ask.a"), step_key("cell"), ping_key("cell", "puma")):
+    assert sender_of(estop_key("operator", "cell")) == "operator"
+    answer = estop_answer_key("cell", "operator")
+    for key in (KEY, out_key("cell", "ask.a"), step_key("cell"), ping_key("cell", "puma"), answer):
         assert sender_of(key) == "cell"
-    assert sender_of(ask_keys("cell", "stop", "operator")) == "operator"
     assert [sender_of(key) for key in ("", "rack", "rack/", "rack//out/a", "other/cell/x")] == [
         ""
     ] * 5

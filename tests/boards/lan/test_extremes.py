@@ -153,7 +153,7 @@ def real(file: str, name: str, folder: Path, listen: int) -> RackConfig:
 def listening(path: Path, listen: int) -> RackConfig:
     """Return a config in lockstep, with a network of nobody but those that connect to it."""
     endpoint = f'listen=["tcp/127.0.0.1:{listen}"]'
-    own = (endpoint, "insecure=true", "connect=[]", "launch=[]", "permit.operator=[]")
+    own = (endpoint, "insecure=true", "connect=[]", "launch=[]", "estop_from=[]")
     lan = (f"adapter.lan.{setting}" for setting in own)
     return load(path, ["clock.mode=lockstep", *lan])
 

@@ -16,25 +16,25 @@ ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
 TABLES: dict[str, dict[str, Any]] = {
     "nothing": {},
     "loopback": {"listen": ("tcp/127.0.0.1:7447",), "export": {"a": {"from": "a.status"}}},
-    "beyond": {"listen": ("tcp/10.0.0.1:7447",), "insecure": True, "permit": {"x": ["stop"]}},
+    "beyond": {"listen": ("tcp/10.0.0.1:7447",), "insecure": True, "estop_from": ("x",)},
     "tls": {
         "listen": ("tls/10.0.0.1:7447",),
         "connect": ("tls/friend.example:7447",),
         "export": {"a": {"from": "a.status"}},
         "import": {"own": {"from": "friend/pulse.status", **ENTRY}},
         "peers": ("other",),
-        "permit": {"x": ["watch", "command"], "other": ["stop"]},
+        "estop_from": ("x", "other"),
         "lease_ms": 300.0,
     },
 }
 
 
-@pytest.mark.parametrize("asks", [False, True])
+@pytest.mark.parametrize("is_operator", [False, True])
 @pytest.mark.parametrize("name", TABLES)
-def test_the_network_is_permitted_what_it_was(name: str, asks: bool) -> None:
+def test_the_network_is_permitted_what_it_was(name: str, is_operator: bool) -> None:
     table = LanTable.model_validate(TABLES[name])
     parts = {
-        "access": access_control("home", table, asks),
-        "settings": str(_settings("home", table, None, asks)),
+        "access": access_control("home", table, is_operator),
+        "settings": str(_settings("home", table, None, is_operator)),
     }
-    SNAPSHOTS.check(f"{name}{', asking' if asks else ''}", parts)
+    SNAPSHOTS.check(f"{name}{', operator' if is_operator else ''}", parts)

@@ -31,8 +31,8 @@ IMPORTED = (
 )
 NAMES = ("friend", "liar", "mole", "heavy", "viewer", "nobody")
 OWN, TOKEN = "rack/home/out/pulse/status", "rack/home/alive/0000000000000007"
-READ, COMMAND, STOP = (f"rack/home/ask/{what}/viewer" for what in ("read", "command", "stop"))
-STRANGER = "rack/home/ask/read/nobody"
+STOP, STRANGER = "rack/viewer/estop/home", "rack/nobody/estop/home"
+FRIENDS_STOP = "rack/friend/estop/home"
 ROUNDS = 10
 """Rounds of sending after everyone who may connect has."""
 
@@ -116,8 +116,7 @@ class Site:
 
 @contextmanager
 def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
-    """Run a rack that imports from friend, liar, mole and heavy; viewer may watch, friend may stop
-    it."""
+    """Run a rack that imports from friend, liar, mole and heavy; viewer and friend may stop it."""
     for each in ("set", "forged"):
         addresses = {name: ["127.0.0.1"] for name in ("home", *NAMES)}
         make_credentials(folder / each, {**addresses, "impostor": ["127.9.9.9"]}, 1)
@@ -128,7 +127,7 @@ def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
         "connect": [f"{protocol}/127.0.0.1:{friends_port}"],
         "certificates": str(folder / "set"),
         "most_bytes": MOST,
-        "permit": {"viewer": ["watch"], "friend": ["stop"]},
+        "estop_from": ["viewer", "friend"],
         "export": {"pulse": {"from": "pulse.status"}},
         "import": {f"port{at}": {"from": source, **entry} for at, source in enumerate(IMPORTED)},
     }
@@ -150,7 +149,7 @@ def friend(site: Site) -> dict[str, Any]:
         "seals": site.seals("friend"),
         "puts": [(pulse("friend"), 100, pulse("friend"))],
         "listens": [OWN],
-        "asks": ["rack/home/ask/stop/friend"],
+        "asks": [FRIENDS_STOP],
         "token": "rack/friend/alive/0000000000000009",
     }
 
@@ -170,7 +169,7 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
     heavy = [(pulse("heavy"), size, pulse("heavy")) for size in (100, 1 << 20)]
     impostor = site.mutual("impostor") | {"connect/endpoints": []}
     impostor["listen/endpoints"] = [f"tls/127.0.0.1:{site.friends_port}"]
-    asks = [READ, COMMAND, STOP, "rack/home/ask/stop/friend", "rack/home/ask/**"]
+    asks = [STOP, FRIENDS_STOP, "rack/*/estop/home", "rack/viewer/estop/other"]
     return {
         "friend": friend(site),
         "bare": {"settings": site.bare("tls"), "fails": True, **eager},
@@ -220,7 +219,7 @@ def found(site: Site) -> Found:
             return (
                 all(home["came"].get(key, 0) > ROUNDS for key in senders)
                 and all(of["friend"][got] for got in ("heard", "answers", "tokens"))
-                and of["viewer"]["answers"].get(READ, 0) > 1
+                and of["viewer"]["answers"].get(STOP, 0) > 1
                 and of["nobody"]["connected"]
             )
 
@@ -255,13 +254,13 @@ def test_a_certificate_of_ours_without_a_right_gets_nothing(found: Found) -> Non
 
 
 @pytest.mark.slow
-def test_whoever_may_watch_may_do_nothing_else(found: Found) -> None:
+def test_whoever_may_stop_it_may_do_nothing_else(found: Found) -> None:
     viewer = found.of["viewer"]
-    assert set(viewer["answers"]) == {READ}
+    assert set(viewer["answers"]) == {STOP}
     assert viewer["heard"] == {}
     # That others are there only home may know.
     assert set(viewer["tokens"]) == {TOKEN}
-    assert set(found.home["asked"]) == {READ, "rack/home/ask/stop/friend"}
+    assert set(found.home["asked"]) == {STOP, FRIENDS_STOP}
 
 
 @pytest.mark.slow

@@ -23,7 +23,6 @@ from rack.boards.crate.line import CrateLine
 from rack.tools.commands.record import record
 from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
-from rack.tools.network.certificates import make_credentials
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
@@ -36,12 +35,6 @@ from tests.tools.machines import A, B, recorded
 
 pytestmark = pytest.mark.thorough
 
-WATCHED = """
-certificates = "certs"
-
-[adapter.lan.permit]
-operator = ["watch"]
-"""
 ROOT = Path(__file__).resolve().parents[2]
 WATCHDOG_S = 50.0
 
@@ -157,29 +150,13 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
     rack_name: str, tmp_path: Path
 ) -> None:
     names = [f"{rack_name}-a", f"{rack_name}-b"]
-    certificates = tmp_path / "certs"
-    at_home = {name: ["127.0.0.1"] for name in names}
-    make_credentials(certificates, {**at_home, "operator": []}, 1)
-    texts = [text.replace("tcp/", "tls/") for text in ring_texts(names, lan=WATCHED)]
-    one, other = configs(texts, tmp_path, "adapter.lan.rate_hz=100")
-    port = one.adapter.lan.listen[0].rpartition(":")[2]
+    one, other = configs(ring_texts(names), tmp_path, "adapter.lan.rate_hz=100")
     with CrateLine() as crate, Rack(one, crate=crate) as near, Rack(other) as far:
         far.start()
         near.start()
         folder = tmp_path / "run"
-        # One from its own machine, one from afar.
-        command = [
-            *RACK,
-            "record",
-            names[1],
-            "--with",
-            f"127.0.0.1:{port}/{names[0]}",
-            "--certificates",
-            str(certificates),
-            "--out",
-            str(folder),
-            "--json",
-        ]
+        words = [names[1], "--with", names[0], "--out", str(folder), "--json"]
+        command = [*RACK, "record", *words]
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT
         ) as recorder:

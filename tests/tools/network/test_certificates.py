@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -75,8 +76,18 @@ def test_a_set_that_is_not_whole_is_not_added_to(tmp_path: Path, lost: str) -> N
     (tmp_path / lost).unlink()
     done = rack("lan", "certificates", tmp_path, "--for", "puma")
     assert done.returncode == 2
-    assert f"{lost} missing" in done.stderr
+    assert done.stderr == f"{tmp_path / lost}: missing; see rack lan certificates --help\n"
     assert not (tmp_path / "puma.pem").exists()
+
+
+@pytest.mark.parametrize("name", SHARED)
+def test_a_set_whose_file_never_ends_is_not_added_to(tmp_path: Path, name: str) -> None:
+    rack("lan", "certificates", tmp_path, "--for", "cell")
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name, 0o600)
+    done = rack("lan", "certificates", tmp_path, "--for", "puma")
+    why = "cannot be read: not a regular file, but a FIFO"
+    assert (done.returncode, done.stderr) == (2, f"{tmp_path / name}: {why}\n")
 
 
 def test_another_key_does_not_sign_for_the_authority(tmp_path: Path) -> None:

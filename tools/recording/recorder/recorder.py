@@ -174,21 +174,13 @@ class Recorder:
     """Records one rack into `folder`, in a context: leaving it finishes the files. `view` takes the
     same rows.
 
-    The first recorder of a rack in lockstep is its follower: the clock waits for it. `refresh`
-    brings a mirror of a segment on another machine up to date.
+    The first recorder of a rack in lockstep is its follower: the clock waits for it.
     """
 
-    def __init__(
-        self,
-        segment: Segment,
-        folder: Path,
-        view: Sink | None = None,
-        refresh: Callable[[], object] | None = None,
-    ) -> None:
+    def __init__(self, segment: Segment, folder: Path, view: Sink | None = None) -> None:
         layout = segment.layout
         self._folder = folder
         self._view = view
-        self._refresh = refresh
         self._segment = segment
         self._words = segment.words
         # The spool first: it fails where another recorder is running, and leaves that one's files
@@ -212,9 +204,8 @@ class Recorder:
         )
         for name, taken in self._tally.taken.items():
             self._rings[name].resume(taken)
-        # Lockstep has no deadlines that the machine could break; the cores of another machine are
-        # not seen.
-        self._cores = None if self._words[System.LOCKSTEP] or refresh is not None else CoreMeter()
+        # Lockstep has no deadlines that the machine could break.
+        self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
         self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         # The clock cannot see a process of another PID namespace, so it does not wait for it.
@@ -240,8 +231,6 @@ class Recorder:
 
     def drain(self) -> None:
         """Record everything written since the last call."""
-        if self._refresh is not None:
-            self._refresh()
         tick = self._words[System.TICK]
         for name, ring in self._rings.items():
             rows, lost = ring.drain()
