@@ -17,7 +17,6 @@ from rack.backplane.operator_table import (
     RequestStage,
     RequestWord,
 )
-from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import read_stored
 from rack.boards.config.commands import asked, request, takes
