@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.tools.console.answer import Document, Failure, print_answer
+from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 
 if TYPE_CHECKING:
-    from rack.tools.live.desk import LiveDesk
     from rack.tools.live.replies import Reply
 
 DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
@@ -134,24 +135,17 @@ def command(
             )
         given = {"level": level, "what": what, "tick": tick, "at": at, **goal_of(what, goal or [])}
         if lease:
-            _attend(desk, given, as_json)
+            desk.attend(given, partial(print_reply, as_json=as_json))
             return
         reply = desk.give(given, wait, timeout)
-    print_answer(reply.document(), reply.line, as_json)
-    if not reply.worked:
-        raise typer.Exit(1)
+    print_reply(reply, as_json)
     if reply.is_standing and what not in DONE_AT_ONCE and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
 
 
-def _attend(desk: LiveDesk, given: Document, as_json: bool) -> None:
-    """Give a command under a lease, and stay while it is in force."""
-
-    def tell(reply: Reply) -> None:
-        print_answer(reply.document(), reply.line, as_json)
-        sys.stdout.flush()
-
-    reply = desk.attend(given, tell)
+def print_reply(reply: Reply, as_json: bool) -> None:
+    """Print a level's reply at once; end the command with status 1 if the level refused."""
+    print_answer(asdict(reply) | {"worked": reply.worked}, reply.line, as_json)
+    sys.stdout.flush()
     if not reply.worked:
-        tell(reply)
         raise typer.Exit(1)

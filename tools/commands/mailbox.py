@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import nullcontext
 from typing import Annotated
 
 import typer
 
 from rack.backplane.json_text import encode_json
-from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, System
-from rack.tools.console.answer import Document, Failure, print_answer
+from rack.backplane.words import System
+from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.console.tables import console, fitted
-from rack.tools.live.message_text import MessageText
+from rack.tools.live.message_text import DROPPED, MessageText, list_mailboxes
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import mailbox_of
 
 LOOK_S = 0.1
 PLAIN_S = 1.0
 """Times between looks, real time: on a terminal or as JSON, and as plain text."""
-COLUMNS = ("mailbox", "message", "writer", "readers", "protocol", "period_ms", "bytes", "written")
-"""Of the list of mailboxes, as in its JSON."""
-DROPPED = ("bytes", "message", "protocol", "readers")
-"""Columns that a narrow terminal leaves out, in this order."""
-
 Name = Annotated[
     str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
 ]
@@ -54,22 +47,26 @@ def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Js
     if name is None:
         if watch:
             raise Failure("--watch needs the NAME of a mailbox", 2)
-        rows = [_row(segment, box) for box in segment.layout.mailboxes]
-        cells = [[str(row[column]) for column in COLUMNS] for row in rows]
-        print_answer(rows, fitted(COLUMNS, cells, DROPPED), as_json)
+        rows = list_mailboxes(segment)
+        cells = [[*map(str, row.values())] for row in rows]
+        print_answer(rows, fitted([*rows[0]], cells, DROPPED), as_json)
         return
-    messages = Messages(segment, mailbox_of(name, segment.layout.mailboxes))
+    box = mailbox_of(name, segment.layout.mailboxes)
+    ring = MailboxRing(segment, box.name)
+    text = MessageText(box, segment.layout.clock_ns)
     if watch:
-        _watch(segment, messages, as_json)
+        _watch(segment, ring, text, as_json)
         return
-    for newest in messages.new():
-        print_answer(newest, messages.lines(newest), as_json)
-        return
-    raise Failure(f"mailbox '{name}' has no message yet")
+    messages = ring.drain().rows
+    if not len(messages):
+        raise Failure(f"mailbox '{name}' has no message yet")
+    newest = text.document(messages[-1], segment.words[System.TICK])
+    print_answer(newest, text.lines(newest), as_json)
 
 
-def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
-    """Show messages until the run is over: all as JSON, for people the newest of each look."""
+def _watch(segment: Segment, ring: MailboxRing, text: MessageText, as_json: bool) -> None:
+    """Show the newest message, and those that come until the run is over: all as JSON, for people
+    the newest of each look."""
     from rich.live import Live
     from rich.text import Text
 
@@ -77,46 +74,16 @@ def _watch(segment: Segment, messages: Messages, as_json: bool) -> None:
     is_drawn = terminal.is_terminal and not as_json
     live = Live(console=terminal, auto_refresh=False) if is_drawn else None
     look_s = LOOK_S if is_drawn or as_json else PLAIN_S
+    rows = ring.drain().rows[-1:]
     with live or nullcontext():
         for _ in looks(segment, look_s):
-            found = [*messages.new()]
+            tick = segment.words[System.TICK]
+            found = [text.document(row, tick) for row in (*rows, *ring.drain().rows)]
+            rows = rows[:0]
             if as_json:
                 for document in found:
                     print(encode_json(document), flush=True)
             elif live is not None and found:
-                live.update(Text("\n".join(messages.lines(found[-1]))), refresh=True)
+                live.update(Text("\n".join(text.lines(found[-1]))), refresh=True)
             elif found:
-                print(*messages.lines(found[-1]), "", sep="\n", flush=True)
-
-
-def _row(segment: Segment, box: MailboxSpec) -> Document:
-    return {
-        "mailbox": box.name,
-        "message": f"{box.message} {box.version}",
-        "writer": box.writer,
-        "readers": ", ".join(box.readers) or "-",
-        "protocol": box.protocol,
-        "period_ms": round(box.every * segment.layout.clock_ns * 1e-6, 6),
-        "bytes": box.size,
-        "written": segment.words[segment.map.mailboxes[box.name] // 8 + Box.HEAD],
-    }
-
-
-class Messages:
-    """The messages of one mailbox, as documents."""
-
-    def __init__(self, segment: Segment, box: MailboxSpec) -> None:
-        self._segment = segment
-        self._ring = MailboxRing(segment, box.name)
-        self._has_looked = False
-        self._text = MessageText(box, segment.layout.clock_ns)
-        self.lines = self._text.lines
-
-    def new(self) -> Iterator[Document]:
-        """Yield the messages written since the last look; at the first one the newest alone."""
-        rows = self._ring.drain().rows
-        if not self._has_looked:
-            rows = rows[-1:]
-        for row in rows:
-            yield self._text.document(row, self._segment.words[System.TICK])
-        self._has_looked = True
+                print(*text.lines(found[-1]), "", sep="\n", flush=True)

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from rack.tools.commands.command import At, Tick
-from rack.tools.console.answer import print_answer
+from rack.tools.commands.command import At, Tick, print_reply
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live.desk import LiveDesk
@@ -38,6 +37,4 @@ def set_param(
     """
     with INTERRUPT.raising(), LocalRack(rack) as one:
         reply = LiveDesk(one).set_param(setting, tick, at)
-    print_answer(reply.document(), reply.line, as_json)
-    if not reply.worked:
-        raise typer.Exit(1)
+    print_reply(reply, as_json)

@@ -3,6 +3,7 @@ did."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -77,4 +78,4 @@ def step(
     end = stepper.after_cycles(at, cycles or 1, until) if ticks is None else at + ticks
     stepper.go(end)
     found = stepper.look()
-    print_answer(found.document(), found.text(), as_json)
+    print_answer(asdict(found), found.lines(), as_json)

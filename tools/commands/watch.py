@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -17,15 +16,12 @@ from rack.boards.faults.config import as_seconds
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
-from rack.tools.console.tables import console
-from rack.tools.live.signals import Lines, Plot, SignalTap, Strip, Written, cell
+from rack.tools.live.signals import Lines, Rows, Strip, cell
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import Signal, Trigger
 
 LOOK_S = 0.02
 """Time between looks: rings hold 2 s, in a fast lockstep a quarter of that."""
-SHOWN_S = 10.0
-"""Simulated time that a plot shows."""
 MOST_S = 600.0
 """Longest time kept before or after a moment: all of it is in memory."""
 
@@ -67,9 +63,9 @@ def watch(
 ) -> None:
     """Show signals of a running rack until its run is over, or until Ctrl-C.
 
-    A signal is a field of a mailbox ('rack mailbox RACK' lists those), or one number of it. On a
-    terminal it is plotted, if plotext is there (pip install 'nasrem-rack[live]'). Otherwise each
-    line has the time, s, and the values; with --json each line is a document.
+    A signal is a field of a mailbox ('rack mailbox RACK' lists those), or one number of it. Each
+    line has the time, s, and the values; with --json each line is a document. The viewer shows them
+    as curves: rack record RACK --view.
 
     With --when it waits for a moment, and saves what was around it: every message, none left out.
     Watching reads the rings that the recorder reads: it costs the rack no deadline.
@@ -97,14 +93,19 @@ def watch(
         _show(segment, shown, every_s, as_json)
         return
     _check_writable(out or Path(f"{rack}.csv"))
-    capture = Capture(segment, shown, Trigger.of(when, boxes), before_s, after_s)
-    capture.wait()
-    path = out or Path(f"{rack}-{capture.tick}.csv")
-    rows = capture.save(path)
-    time_s = capture.strip.time_s(capture.tick)
+    trigger = Trigger.of(when, boxes)
+    ticks_before, ticks_after = (
+        round(s * 1e9 / segment.layout.clock_ns) for s in (before_s, after_s)
+    )
+    strip = Strip(segment, shown, ticks_before + ticks_after, [trigger.signal])
+    tick = _await_moment(segment, strip, trigger, ticks_after)
+    path = out or Path(f"{rack}-{tick}.csv")
+    rows = strip.table(tick - ticks_before, tick + ticks_after)
+    _save(path, strip, rows)
+    time_s = strip.time_s(tick)
     print_answer(
-        {"file": str(path), "tick": capture.tick, "time_s": time_s, "rows": rows},
-        f"{when}: held first at {time_s:g} s, tick {capture.tick}; {rows} rows around it: {path}",
+        {"file": str(path), "tick": tick, "time_s": time_s, "rows": len(rows)},
+        f"{when}: held first at {time_s:g} s, tick {tick}; {len(rows)} rows around it: {path}",
         as_json,
     )
 
@@ -130,93 +131,42 @@ def _check_writable(path: Path) -> None:
 
 def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: bool) -> None:
     """Show signals until the run is over."""
-    span = round(SHOWN_S * 1e9 / segment.layout.clock_ns)
-    strip = Strip(segment, signals, span)
-    tap = SignalTap(segment, signals)
-    lost = 0
-    for written in tap.take():
-        strip.add(written)
-    first = segment.words[System.TICK]
-    view: Lines | Plot = Lines(strip, first, round(every_s / strip.tick_s), as_json)
-    terminal = console()
-    with ExitStack() as stack:
-        if terminal.is_terminal and not as_json:
-            try:
-                view = stack.enter_context(Plot(strip, span, terminal))
-            except ImportError:
-                print("no curves without plotext: pip install 'nasrem-rack[live]'", file=sys.stderr)
-        for is_over in looks(segment, LOOK_S):
-            for written in tap.take():
-                strip.add(written)
-                lost += written.lost
-            settles = 0 if is_over else strip.settles
-            view.show(segment.words[System.TICK] - settles)
-    if lost:
-        raise Failure(f"{lost} messages were overwritten before they could be shown")
+    strip = Strip(segment, signals, span=0)
+    every = round(every_s / strip.tick_s)
+    lines = Lines(strip, segment.words[System.TICK], every, as_json)
+    for is_over in looks(segment, LOOK_S):
+        strip.take()
+        settles = 0 if is_over else strip.settles
+        lines.show(segment.words[System.TICK] - settles)
+    if strip.lost:
+        raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 
 
-class Capture:
-    """The tick at which a condition first holds, and the signals around it."""
+def _await_moment(segment: Segment, strip: Strip, trigger: Trigger, after: int) -> int:
+    """Return the tick at which a condition first holds, once the `after` ticks behind it are there.
+    Raises `Failure` when the run ends before."""
+    tick = -1
+    for _ in looks(segment, LOOK_S):
+        for written in strip.take():
+            if tick < 0 and written.mailbox == trigger.signal.mailbox:
+                held = written.ticks[trigger.holds(written.messages)]
+                tick = int(held[0]) if len(held) else -1
+        if tick >= 0 and segment.words[System.TICK] > tick + after + strip.settles:
+            break
+    if tick < 0:
+        why = "was interrupted" if INTERRUPT.number else "the run is over"
+        raise Failure(f"rack '{segment.rack}': the condition has not held; {why}")
+    return tick
 
-    def __init__(
-        self,
-        segment: Segment,
-        signals: Sequence[Signal],
-        condition: Trigger,
-        before_s: float,
-        after_s: float,
-    ) -> None:
-        tick_s = segment.layout.clock_ns * 1e-9
-        self._segment = segment
-        self._condition = condition
-        self._before = round(before_s / tick_s)
-        self._after = round(after_s / tick_s)
-        self._tap = SignalTap(segment, [condition.signal, *signals])
-        self._lost = 0
-        self.strip = Strip(segment, signals, self._before + self._after)
-        self.tick = -1  # -1: it has not held yet
 
-    def wait(self) -> None:
-        """Wait until everything around the moment is there. Raises `Failure` when the run ends
-        before the moment."""
-        for written in self._tap.take():
-            # Written before anyone asked: it does not count, but may be around the moment.
-            self.strip.add(written)
-        for _ in looks(self._segment, LOOK_S):
-            for written in self._tap.take():
-                self._look(written)
-            if self._is_complete():
-                break
-        if self.tick < 0:
-            why = "was interrupted" if INTERRUPT.number else "the run is over"
-            raise Failure(f"rack '{self._segment.rack}': the condition has not held; {why}")
-
-    def _look(self, written: Written) -> None:
-        self._lost += written.lost
-        self.strip.add(written)
-        if self.tick < 0 and written.mailbox == self._condition.signal.mailbox:
-            held = written.ticks[self._condition.holds(written.messages)]
-            if len(held):
-                self.tick = int(held[0])
-
-    def _is_complete(self) -> bool:
-        last = self.tick + self._after + self.strip.settles
-        return self.tick >= 0 and self._segment.words[System.TICK] > last
-
-    def save(self, path: Path) -> int:
-        """Write the CSV file; return its number of rows. Raises `Failure` when messages are
-        missing."""
-        rows = self.strip.table(self.tick - self._before, self.tick + self._after)
-        try:
-            with path.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.writer(file)
-                heads = (signal.head for signal in self.strip.signals)
-                writer.writerow(["time, s", "tick", *heads])
-                writer.writerows(
-                    [self.strip.time_s(tick), tick, *map(cell, values)] for tick, values in rows
-                )
-        except OSError as error:
-            raise Failure(f"{path}: {error.strerror}: cut off") from None
-        if self._lost:
-            raise Failure(f"{path}: {self._lost} messages were overwritten before they were taken")
-        return len(rows)
+def _save(path: Path, strip: Strip, rows: Rows) -> None:
+    """Write the CSV file. Raises `Failure` when messages are missing."""
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["time, s", "tick", *(signal.head for signal in strip.signals)])
+            writer.writerows([strip.time_s(tick), tick, *map(cell, row)] for tick, row in rows)
+    except OSError as error:
+        raise Failure(f"{path}: {error.strerror}: cut off") from None
+    if strip.lost:
+        raise Failure(f"{path}: {strip.lost} messages were overwritten before they were taken")

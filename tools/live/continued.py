@@ -264,7 +264,12 @@ def gone_on(
         repeats=ran.name,
     ) as rack:
         rack.run(until * config.clock_ns * 1e-9)
-        if keeping is not None and not _is_kept(keeping):
+        at = None if keeping is None else keeping.at
+        if (
+            keeping is not None
+            and at is not None
+            and not (keeping.folder / NAME.format(at)).is_file()
+        ):
             printed = [event.text for event in rack.events if event.kind == "printed"]
             why = (
                 printed[-1]
@@ -273,10 +278,6 @@ def gone_on(
             )
             raise Failure(f"{asked}: {why}", 2)
         yield rack
-
-
-def _is_kept(keeping: Keeping) -> bool:
-    return keeping.at is None or (keeping.folder / NAME.format(keeping.at)).is_file()
 
 
 def attributes_in(folder: Path) -> dict[str, Document]:

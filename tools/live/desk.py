@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.operator_table import (
     Client,
     OperatorTable,
@@ -18,7 +17,6 @@ from rack.backplane.operator_table import (
     RequestStage,
     RequestWord,
 )
-from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import read_stored
 from rack.boards.config.commands import asked, request, takes
@@ -31,6 +29,7 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.console.held import waits
 from rack.tools.console.tables import fitted
 from rack.tools.live.holds import resume_command
+from rack.tools.live.newest import Newest
 from rack.tools.live.replies import LastCycle, Replies, Reply, answering
 from rack.tools.live.watched import LocalRack
 
@@ -94,7 +93,7 @@ class LiveDesk:
             reply = self._await_giving(entry, command.level)
         return self._await_reply(reply, wait, timeout_s)
 
-    def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> Reply:
+    def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
         """Give a command under a lease, `tell` its reply, and stay until a newer one is in force or
         the run is over: if this process ends or falls silent before, its level holds.
 
@@ -112,11 +111,9 @@ class LiveDesk:
         with table.claim(wanted, Client.LEASES) as entry:
             ticket = entry[RequestWord.TICKET]
             reply = self._await_reply(self._await_giving(entry, command.level), False, None)
-            if reply.worked:
-                tell(reply)
+            tell(reply)
             while reply.worked and table.hear(entry, ticket) and not segment.run_is_over:
                 time.sleep(LOOK_S)
-        return reply
 
     def _takes_hold(self, level: str) -> bool:
         return Operation.HOLD in (self._levels[level].commands)
@@ -153,16 +150,13 @@ class LiveDesk:
         ticket = entry[RequestWord.TICKET]
         text = describe(message_of(entry, self._segment.layout))
         about = f"'{level}', {text}"
-        patience = _Patience(
-            self._segment, f"{about}: waiting for tick {max(0, entry[RequestWord.TICK])}"
-        )
-        while entry[RequestWord.TICKET] == ticket:
+        for is_over in self._looks(about, f"waiting for tick {max(0, entry[RequestWord.TICK])}"):
+            if entry[RequestWord.TICKET] != ticket:
+                break
             if entry.stage == RequestStage.GIVEN:
                 return Reply(entry[RequestWord.SERIAL], level, text, entry[RequestWord.GIVEN_TICK])
-            if patience.is_in_vain:
+            if is_over:
                 raise Failure(f"{about}: the run ended before it was given")
-            if not patience.look_again():
-                raise Failure(f"{about}: not given, the clock has not ticked for {SILENT_S:g} s")
         raise Failure(f"{about}: given, but its reply is lost: too many commands followed")
 
     def _await_reply(self, reply: Reply, wait: bool, timeout_s: float | None) -> Reply:
@@ -172,35 +166,50 @@ class LiveDesk:
             return reply
         replies = Replies(self._segment, status, reply)
         last = LastCycle(self._segment, status)
-        about = f"command {reply.serial}: "
-        patience = _Patience(
-            self._segment,
-            f"{about}waiting for '{reply.level}', which runs every {status.every} ticks",
-        )
-        while True:
-            # Before the look: a reply written just before the run ended still counts.
-            in_vain = patience.is_in_vain
+        about = f"command {reply.serial}"
+        awaited = f"waiting for '{reply.level}', which runs every {status.every} ticks"
+        for is_over in self._looks(about, awaited):
             late = last.passed(self._segment.words[System.TICK])
             reply = replies.look()
             if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
-                return reply
-            if in_vain:
+                break
+            if is_over:
                 raise Failure(f"{reply.line}; the run ended")
             if reply.fate == "given" and late:
-                raise Failure(f"{about}'{reply.level}' {late}")
+                raise Failure(f"{about}: '{reply.level}' {late}")
             if time.monotonic() > deadline:
                 still = f"in force until: {resume_command(self._segment.rack, reply.level)}"
                 raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
-            if not patience.look_again():
-                raise Failure(f"{about}the clock has not ticked for {SILENT_S:g} s")
+        return reply
+
+    def _looks(self, about: str, awaited: str) -> Iterator[bool]:
+        """Yield again and again whether the run is over, for as long as the clock ticks or the rack
+        is held; explain a long wait on stderr, once."""
+        words = self._segment.words
+        tick = words[System.TICK]
+        changed = time.monotonic()
+        note_at = changed + NOTE_S
+        while True:
+            # Asked before the look: a reply written just before the run ended still counts.
+            yield self._segment.run_is_over
+            time.sleep(LOOK_S)
+            now = time.monotonic()
+            if tick != words[System.TICK] or words[System.HELD]:
+                tick = words[System.TICK]
+                changed = now
+            if now > note_at:
+                note_at = math.inf
+                print(
+                    f"{about}: {awaited}; the rack is at tick {tick}", file=sys.stderr, flush=True
+                )
+            if now - changed >= SILENT_S:
+                raise Failure(f"{about}: not answered, the clock has not ticked for {SILENT_S:g} s")
 
     def _in_force(self, level: str) -> str:
         """Return the operator's command in force at a level; empty: none."""
-        box = answering(self._segment, level)
-        seen = open_observer(self._segment, box.name).peek() if box is not None else None
-        if seen is None or not seen.is_there or not seen.value.standing:
-            return ""
-        return Operation(seen.value.standing).name.lower()
+        status = Newest(self._segment).message(f"{level}.status")
+        standing = getattr(status, "standing", 0)
+        return Operation(standing).name.lower() if standing else ""
 
 
 def goal_of(what: str, words: Sequence[str]) -> Document:
@@ -240,33 +249,3 @@ def _number(text: str, word: str) -> float:
             " joints=0,0.5,1"
         )
         raise Failure(f"'{word}': {why}", 2) from None
-
-
-class _Patience:
-    """Waits as long as the rack's clock ticks, or is held; explains a long wait on stderr, once."""
-
-    def __init__(self, segment: Segment, what: str) -> None:
-        self._segment = segment
-        self._words = segment.words
-        self._what = what
-        self._tick = self._words[System.TICK]
-        self._changed = time.monotonic()
-        self._note_at: float | None = self._changed + NOTE_S
-
-    def look_again(self) -> bool:
-        """Wait a moment; return False when the clock has not ticked for too long."""
-        time.sleep(LOOK_S)
-        now = time.monotonic()
-        tick = self._words[System.TICK]
-        if tick != self._tick or self._words[System.HELD]:
-            self._tick = tick
-            self._changed = now
-        if self._note_at is not None and now > self._note_at:
-            self._note_at = None
-            print(f"{self._what}; the rack is at tick {tick}", file=sys.stderr, flush=True)
-        return now - self._changed < SILENT_S
-
-    @property
-    def is_in_vain(self) -> bool:
-        """Whether the run is over."""
-        return self._segment.run_is_over

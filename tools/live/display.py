@@ -10,12 +10,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress_bar import ProgressBar
-from rich.table import Table
 from rich.text import Text
 
 from rack.backplane.process import DEADLINE
@@ -29,6 +27,9 @@ from rack.tools.live.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
 
 if TYPE_CHECKING:
     from rich.live import Live
+
+Row = HostRow | EntryRow | PeerRow | ImportRow | ExportRow
+"""Row of a table of host boards, other racks, or what passes to and from them."""
 
 
 def _scheduling(priority: int) -> str:
@@ -52,7 +53,7 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "late ms": lambda row: decimal(row.lateness_ms, 2),
     "state": lambda row: row.state + " (operator)" * (row.mode == "operator"),
 }
-"""Columns by heading; `exec` and `late` are the longest since the last look."""
+"""Columns by heading."""
 DROPPED = (
     "tick",
     "sched",
@@ -74,18 +75,13 @@ STATES = {
     "holding": "yellow",
     "awaited": "yellow",
 }
-COUNTED = {
-    **dict.fromkeys(("missed", "skipped"), "red"),
-    **dict.fromkeys(
-        ("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses"), "yellow"
-    ),
-}
+LOSSES = ("missed", "skipped")
+TROUBLES = ("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses")
+COUNTED = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yellow")}
 """Colours of counts above 0."""
 HELD = "bold yellow"
 NO_DEMAND = "none"
 """The demand on an arm that is free to move."""
-BAR = 40
-"""Longest progress bar, in characters."""
 EVENTS = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
 OTHER_EVENTS = "yellow"
 QUIET = ("launch", "start", "end", "miss")
@@ -103,7 +99,12 @@ class Display:
         """Show the rack as it is now."""
 
     def show_event(self, event: Event) -> None:
-        """Show an event."""
+        """Show an event, unless the table shows it already."""
+        if is_shown(event):
+            self.print_event(event_text(event))
+
+    def print_event(self, text: Text) -> None:
+        """Print an event."""
 
 
 class LiveDisplay(Display):
@@ -118,14 +119,10 @@ class LiveDisplay(Display):
         """Redraw the table."""
         self._live.update(RackView(snapshot), refresh=True)
 
-    def show_event(self, event: Event) -> None:
+    def print_event(self, text: Text) -> None:
         """Print the event above the table."""
-        if is_shown(event):
-            style = EVENTS.get(event.kind, OTHER_EVENTS)
-            # The terminal wraps it, not rich: a command in it can still be copied.
-            self._live.console.print(
-                event_line(event), style=style, highlight=False, markup=False, soft_wrap=True
-            )
+        # The terminal wraps it, not rich: a command in it can still be copied.
+        self._live.console.print(text, soft_wrap=True)
 
 
 class PlainDisplay(Display):
@@ -143,10 +140,9 @@ class PlainDisplay(Display):
             self._next = now + self.period_s
             print(line_of(snapshot), flush=True)
 
-    def show_event(self, event: Event) -> None:
+    def print_event(self, text: Text) -> None:
         """Print the event."""
-        if is_shown(event):
-            print(event_line(event), flush=True)
+        print(text, flush=True)
 
 
 @contextmanager
@@ -167,11 +163,9 @@ def display_for(silent: bool) -> Iterator[Display]:
 @dataclass(frozen=True)
 class RackView:
     """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults,
-    holds, progress. A narrow terminal leaves out the columns `dropped`, in that order."""
+    holds, progress."""
 
     snapshot: Snapshot
-    columns: Mapping[str, Callable[[TaskRow], str]] = field(default_factory=lambda: COLUMNS)
-    dropped: Sequence[str] = DROPPED
 
     def __rich_console__(
         self, terminal: Console, options: ConsoleOptions
@@ -180,52 +174,37 @@ class RackView:
         snapshot = self.snapshot
         width = options.max_width
         yield _head(snapshot)
-        cells = [[cell(row) for cell in self.columns.values()] for row in snapshot.tasks]
-        yield grid(list(self.columns), cells, width, self.dropped, _style)
+        cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
+        yield grid(list(COLUMNS), cells, width, DROPPED, _style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
-        for rows in (
-            snapshot.hosts,
-            snapshot.entries,
-            snapshot.peers,
-            snapshot.imports,
-            snapshot.exports,
-        ):
-            yield from _rows(rows, width)
+        sides: tuple[Sequence[Row], ...] = (snapshot.hosts, snapshot.entries)
+        for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
+            if rows:
+                found = [asdict(row) for row in rows]
+                cells = [[_cell(name, value) for name, value in row.items()] for row in found]
+                yield Text()
+                yield grid(
+                    [name.replace("_", " ") for name in found[0]], cells, width, style=_style
+                )
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
         yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
-            shown = hold.line
-            if len(shown) > width:
-                shown = "\n  ".join(hold.parts)
+            # In two lines where it is long: a command must not be wrapped.
+            is_long = len(hold.line) > width
+            shown = hold.line.replace("; to release", "\n  to release") if is_long else hold.line
             yield Text(shown, style=HELD)
         if snapshot.progress is not None:
-            bar_width = width if terminal.is_terminal else 0
-            yield _bar(snapshot.progress, bar_width)
-
-
-def _rows(
-    rows: Sequence[HostRow | EntryRow | PeerRow | ImportRow | ExportRow], width: int
-) -> Iterator[RenderableType]:
-    """Yield the table of host boards, other racks, or what passes to and from them, if there are
-    any."""
-    if rows:
-        found = [asdict(row) for row in rows]
-        cells = [[_cell(name, value) for name, value in row.items()] for row in found]
-        yield Text()
-        yield grid([name.replace("_", " ") for name in found[0]], cells, width, style=_style)
+            yield Text(_progress(snapshot.progress))
 
 
 def _cell(column: str, value: Any) -> str:
     if not isinstance(value, float | None):
         return str(value)
-    if column.endswith("_ticks"):
-        return decimal(value, 0)
-    if column.endswith("_s"):
-        return decimal(value, 3)
-    return decimal(value, 1)
+    digits = {"s": 3, "ticks": 0}
+    return decimal(value, digits.get(column.rpartition("_")[2], 1))
 
 
 def line_of(snapshot: Snapshot) -> str:
@@ -240,7 +219,7 @@ def line_of(snapshot: Snapshot) -> str:
     }
     parts = [f"{snapshot.rack} {snapshot.time_s:.2f} s", f"tick {snapshot.tick}"]
     parts += [snapshot.run] if snapshot.run == DEAD else []
-    parts += [f"{name} {n}" for name, n in counts.items() if n or name in ("missed", "skipped")]
+    parts += [f"{name} {n}" for name, n in counts.items() if n or name in LOSSES]
     at = snapshot.progress
     parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
     # What follows a colon is in the table.
@@ -294,19 +273,10 @@ def _style(column: str, text: str) -> str:
     return COUNTED.get(column, "") if text != "0" else ""
 
 
-def _bar(progress: TaskProgress, width: int) -> RenderableType:
-    """Return the progress as a bar and text; without a width, as text alone."""
-    done = (
-        f"action {progress.actions_done}/{progress.actions}, move"
-        f" {progress.moves_done}/{progress.moves}"
-    )
-    left = width - len(f"task  {done} {progress.state}") - 1
-    bar = ProgressBar(
-        total=max(progress.moves, 1), completed=progress.moves_done, width=max(4, min(BAR, left))
-    )
-    row = Table.grid(padding=(0, 1))
-    row.add_row("task", *([bar] if width else []), done, progress.state)
-    return row
+def _progress(at: TaskProgress) -> str:
+    """Return the progress of the task, as one line."""
+    actions = f"{at.actions_done}/{at.actions}"
+    return f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}"
 
 
 def is_shown(event: Event) -> bool:
@@ -315,8 +285,9 @@ def is_shown(event: Event) -> bool:
     return event.kind not in QUIET and not is_brief
 
 
-def event_line(event: Event) -> str:
-    """Return an event as one line."""
+def event_text(event: Event) -> Text:
+    """Return an event as one line, in the colour of its kind."""
     tick = f"tick {event.tick} " if event.code else ""
     board = f"{event.board}: " if event.board else ""
-    return f"{tick}{event.kind}: {board}{event.text}"
+    style = EVENTS.get(event.kind, OTHER_EVENTS)
+    return Text(f"{tick}{event.kind}: {board}{event.text}", style)

@@ -10,8 +10,8 @@ import signal
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
-from math import ceil
 
+import numpy as np
 from rich.console import RenderableType
 from rich.text import Text
 from textual.app import App, ComposeResult
@@ -21,26 +21,22 @@ from textual.widget import Widget
 from textual.widgets import Footer, Input, OptionList, Static, TabbedContent, TabPane
 from textual.widgets.option_list import Option
 
-from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
 from rack.boards.crate.alarm_events import AlarmWatch
-from rack.boards.errors import BoardError
 from rack.boards.faults import KINDS
-from rack.levels.errors import LevelError
-from rack.tools.console.answer import Failure
-from rack.tools.console.tables import GAP, decimal, grid
+from rack.levels.timing.trace_times import lateness_ns
+from rack.tools.console.answer import Failure, as_failure
+from rack.tools.console.tables import GAP, grid
 from rack.tools.faults.live import LiveRack
 from rack.tools.live import display
 from rack.tools.live.desk import LiveDesk, goal_of
-from rack.tools.live.gauges import LATE_US, Gauges
+from rack.tools.live.message_text import DROPPED, list_mailboxes
 from rack.tools.live.snapshot import RackMonitor, Snapshot
 from rack.tools.live.watched import LocalRack
 
 LOOK_S = 0.2
-DROPPED = (*display.DROPPED[:-2], "command")
-"""Columns of the boards that a narrow terminal leaves out, in this order."""
-HISTOGRAM = 16
-"""Longest bar of the lateness histogram, in characters."""
+LATE_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
+"""Borders of the classes in which cycles are counted by their lateness."""
 INJECT = "inject"
 """First word of a fault on the command line; with any other it is a command to that level."""
 OWN_PROCESS = [kind.name for kind in KINDS if kind.where == "core"]
@@ -81,14 +77,18 @@ class RackScreen(App[None]):
         segment = rack.segment
         self._rack = rack
         self._has_ended = has_ended
-        self._looks = RackMonitor(segment)
-        self._gauges = Gauges(segment)
+        self._monitor = RackMonitor(segment, keeps_longest=True)
         self._alarms = AlarmWatch(segment)
         self._lines = UtilityLines(segment)
         self._events: deque[Text] = deque(maxlen=500)  # newest first
-        self._levels = deque(self._gauges.levels)
+        tasks = sorted(segment.layout.tasks, key=lambda task: -task.every)
+        names = [task.name for task in tasks]
+        boxes = {box.name for box in segment.layout.mailboxes}
+        self._hierarchy = [name for name in names if f"{name}.operator" in boxes] or names
+        self._levels = deque(self._hierarchy)  # the first is the one that keys command
+        self._late: dict[str, np.ndarray] = {}
         self._panes: dict[str, Callable[[Snapshot], RenderableType]] = {
-            "boards": self._boards,
+            "boards": display.RackView,
             "mailboxes": self._mailboxes,
             "events": lambda snapshot: Text("\n").join(list(self._events)),
             "lateness": self._lateness,
@@ -116,53 +116,38 @@ class RackScreen(App[None]):
         if self._rack.segment.run_is_over or self._has_ended():
             self.exit()
             return
-        snapshot = self._looks.look()
-        self._gauges.take(self._looks.cycles)
+        snapshot = self._monitor.look()
+        for task, rows in self._monitor.cycles.items():
+            counts, _ = np.histogram(lateness_ns(rows) * 1e-3, LATE_US)
+            self._late[task] = self._late.get(task, 0) + counts
         for event in (alarm.event for alarm in self._alarms.drain()):
             if display.is_shown(event):
-                style = display.EVENTS.get(event.kind, display.OTHER_EVENTS)
-                self._events.appendleft(Text(display.event_line(event), style))
+                self._events.appendleft(display.event_text(event))
         self.query_one("#head", Static).update(Text(display.line_of(snapshot)))
-        self.query_one("#levels", Static).update(self._hierarchy(snapshot))
+        self.query_one("#levels", Static).update(self._chosen(snapshot))
         pane = self.query_one(TabbedContent).active
         self.query_one(f"#{pane} Static", Static).update(self._panes[pane](snapshot))
 
-    def _hierarchy(self, snapshot: Snapshot) -> Text:
+    def _chosen(self, snapshot: Snapshot) -> Text:
         """Return the levels coloured by state; the one that keys command is reversed."""
         states = {row.task: row.state for row in snapshot.tasks}
         chosen = {self._levels[0]: "reverse"}
         levels = [
             Text(name, f"{display.STATES.get(states[name], '')} {chosen.get(name, '')}")
-            for name in self._gauges.levels
+            for name in self._hierarchy
         ]
         return Text(" > ").join(levels)
 
-    def _boards(self, snapshot: Snapshot) -> RenderableType:
-        gauges = self._gauges
-        # Short names: eighty characters hold what matters.
-        columns = {
-            **display.COLUMNS,
-            "task": lambda row: row.task.replace(".planner", "*"),
-            "exec ms": lambda row: decimal(gauges.worst_ms[row.task][1], 2),
-            "late ms": lambda row: decimal(gauges.worst_ms[row.task][0], 2),
-            "slice": lambda row: gauges.bar(row.task),
-            "plan s": lambda row: decimal(gauges.age_s(f"{row.task}.plan"), 2),
-            "command": lambda row: gauges.work(row.task),
-        }
-        return display.RackView(snapshot, columns, DROPPED)
-
     def _mailboxes(self, snapshot: Snapshot) -> RenderableType:
-        head = ("mailbox", "writer", "readers", "age s", "mean Hz")
-        return grid(head, [*self._gauges.traffic()], self.size.width - GAP, ("writer",))
+        rows = list_mailboxes(self._rack.segment)
+        cells = [[*map(str, row.values())] for row in rows]
+        return grid([*rows[0]], cells, self.size.width - GAP, DROPPED)
 
     def _lateness(self, snapshot: Snapshot) -> RenderableType:
-        counts = self._gauges.late[self._levels[0]]
-        bars = [
-            [f"< {border:g}", str(count), "█" * ceil(HISTOGRAM * count / counts.max())]
-            for border, count in zip(LATE_US[1:], counts.tolist(), strict=True)
-            if count
-        ]
-        return grid(("late us", "cycles", self._levels[0]), bars, self.size.width)
+        level = self._levels[0]
+        classes = zip(LATE_US[1:], self._late[level].tolist(), strict=True)
+        rows = [[f"< {border:g}", str(count)] for border, count in classes]
+        return grid(("late us", level), rows, self.size.width)
 
     def action_pane(self, number: int) -> None:
         """Show one pane."""
@@ -173,8 +158,9 @@ class RackScreen(App[None]):
         self._levels.rotate(-1)
 
     def action_worst(self) -> None:
-        """Forget the worst times and the lateness so far."""
-        self._gauges.reset()
+        """Forget the longest times and the lateness so far."""
+        self._monitor.forget_times()
+        self._late.clear()
 
     def action_interrupt(self) -> None:
         """End as Ctrl-C ends every command."""
@@ -233,8 +219,9 @@ class RackScreen(App[None]):
     def _answer(self, words: Sequence[str]) -> None:
         """Carry out a command, in a thread: its level may take seconds to answer."""
         try:
-            answer = self._result(words)
-        except (Failure, BackplaneError, BoardError, LevelError) as error:
+            with as_failure():
+                answer = self._result(words)
+        except Failure as error:
             answer = str(error)
         self._events.appendleft(Text(answer))
         self.notify(answer, markup=False)

@@ -8,10 +8,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rack.backplane.layout import MailboxSpec
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State, reason_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
@@ -20,6 +18,7 @@ from rack.boards.lan.awaited import awaited
 from rack.boards.operator import describe
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation, answered
+from rack.tools.live.newest import Newest
 
 STILL_S = 5.0
 """Simulated time without motion after which a held rack reports it as an event."""
@@ -46,13 +45,8 @@ class Hold:
     @property
     def line(self) -> str:
         """All of it as readable text."""
-        return "; ".join(self.parts)
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """The same in one or two parts, for two lines: a command must not be wrapped."""
-        how = (f"to release: {self.release}",) if self.release else ()
-        return (f"{self.level} {self.why}, since {self.since_s:.2f} s", *how)
+        how = f"; to release: {self.release}" if self.release else ""
+        return f"{self.level} {self.why}, since {self.since_s:.2f} s{how}"
 
 
 def resume_command(rack: str, level: str) -> str:
@@ -70,94 +64,63 @@ def is_news(reason: str, shown: list[str]) -> bool:
     return True
 
 
-class Holds:
-    """Finds what holds a running rack."""
+def find_holds(newest: Newest) -> tuple[Hold, ...]:
+    """Return what holds a rack now, the hold of its arm first; nothing once its run is over."""
+    return () if newest.segment.run_is_over else tuple(_find_holds(newest))
 
-    def __init__(self, segment: Segment) -> None:
-        self._segment = segment
-        self._lines = UtilityLines(segment)
-        tasks = {task.name for task in segment.layout.tasks}
-        boxes = [
-            box
-            for box in segment.layout.mailboxes
-            if box.name.endswith(".status") and box.writer in tasks
-        ]
-        self._statuses = {
-            box.writer: open_observer(segment, box.name) for box in boxes if "state" in _fields(box)
-        }
-        self._operated = {box.writer for box in boxes if _fields(box) >= OPERATED}
-        driving = next((box for box in boxes if "demand" in _fields(box)), None)
-        self._arm = None if driving is None else driving.writer
-        self._stop = (
-            ("arm", "braked")
-            if driving is None or "braked" in _fields(driving)
-            else ("hand", "valves closed")
-        )
 
-    def look(self) -> tuple[Hold, ...]:
-        """Return the holds now, the arm's first; none once the run is over."""
-        if self._segment.run_is_over:
-            return ()
-        shown: list[str] = []
-        held = (hold for level in self._statuses for hold in self._held(level))
-        kept = (hold for hold in held if hold.release or is_news(hold.why, shown))
-        return (*self._stopped(), *self._awaiting(), *kept)
+def _find_holds(newest: Newest) -> Iterator[Hold]:
+    segment = newest.segment
 
-    def _stopped(self) -> Iterator[Hold]:
-        if self._lines.emergency_stop:
-            since = (
-                self._segment.block(self._arm)[Block.LEVEL_SINCE] if self._arm is not None else 0
-            )
-            release = f"rack estop {self._segment.layout.rack} --reset"
-            what, how = self._stop
-            yield self._hold(what, since, f"{how}: emergency stop", release)
+    def hold(level: str, since: int, why: str, release: str = "") -> Hold:
+        return Hold(level, since, since * segment.layout.clock_ns * 1e-9, why, release)
 
-    def _awaiting(self) -> Iterator[Hold]:
-        for board, why in awaited(self._segment):
-            yield self._hold(board, self._segment.block(board)[Block.RELEASED], why, "")
-
-    def _held(self, level: str) -> Iterator[Hold]:
-        seen = self._statuses[level].peek()
-        if not seen.is_there:
-            return
-        status = seen.value
-        if level in self._operated and status.standing:
-            since, serial, what = self._standing(level, status)
+    arm, driving = next(newest.statuses("demand"), ("", None))
+    if UtilityLines(segment).emergency_stop:
+        is_arm = driving is None or "braked" in _fields(driving)
+        what, how = ("arm", "braked") if is_arm else ("hand", "valves closed")
+        since = segment.block(arm)[Block.LEVEL_SINCE] if arm else 0
+        release = f"rack estop {segment.layout.rack} --reset"
+        yield hold(what, since, f"{how}: emergency stop", release)
+    for board, why in awaited(segment):
+        yield hold(board, segment.block(board)[Block.RELEASED], why)
+    tasks = {task.name for task in segment.layout.tasks}
+    shown: list[str] = []
+    for level, status in newest.statuses("state"):
+        if level not in tasks:
+            continue
+        if _fields(status) >= OPERATED and status.standing:
+            since, serial, what = _command_in_force(segment, level, status)
             is_hold = status.standing == Operation.HOLD
             is_done = status.answer == Answer.DONE and serial in (status.order, 0)
             done = ", done" if is_done and not is_hold else ""
             why = f"{'held' if is_hold else 'diverted'} by the operator ({what}{done})"
-            yield self._hold(level, since, why, resume_command(self._segment.rack, level))
+            yield hold(level, since, why, resume_command(segment.rack, level))
         elif status.state == State.HOLDING:
-            since = self._segment.block(level)[Block.LEVEL_SINCE]
-            asks = ASKED.get(status.error) if level == self._arm else None
-            release = f"rack command {self._segment.rack} {level} {asks}" if asks else ""
+            asks = ASKED.get(status.error) if level == arm else None
+            release = f"rack command {segment.rack} {level} {asks}" if asks else ""
             why = f"holding: {reason_of(status) or 'no reason given'}"
-            yield self._hold(level, since, why, release)
+            if release or is_news(why, shown):
+                yield hold(level, segment.block(level)[Block.LEVEL_SINCE], why, release)
 
-    def _standing(self, level: str, status: Message) -> tuple[int, int, str]:
-        """Return tick, serial and text of the command in force; serial 0 where its message is
-        gone."""
-        rows = MailboxRing(self._segment, f"{level}.operator").drain().rows
-        newest = answered(status)
-        mine = {
-            int(row["message"]["id"]): row
-            for row in rows
-            if row["message"]["what"] == status.standing and row["message"]["id"] <= newest
-        }
-        # A command that was refused has left the one before it in force.
-        if status.answer == Answer.REFUSED and len(mine) > 1:
-            mine.pop(int(status.order), None)
-        if not mine:
-            text = Operation(status.standing).name.lower()
-            return self._segment.block(level)[Block.LEVEL_SINCE], 0, text
-        row = mine.get(int(status.order), mine[max(mine)])
-        message = Message(rows["message"].dtype)
-        message.raw[:] = row["message"].tobytes()
-        return int(row["tick"]), int(message.id), describe(message)
 
-    def _hold(self, level: str, since: int, why: str, release: str) -> Hold:
-        return Hold(level, since, since * self._segment.layout.clock_ns * 1e-9, why, release)
+def _command_in_force(segment: Segment, level: str, status: Message) -> tuple[int, int, str]:
+    """Return tick, serial and text of the operator's command in force at a level; serial 0 where
+    its message is gone."""
+    rows = MailboxRing(segment, f"{level}.operator").drain().rows
+    given = rows["message"]
+    is_candidate = (given["what"] == status.standing) & (given["id"] <= answered(status))
+    # A command that was refused has left the one before it in force.
+    if status.answer == Answer.REFUSED and is_candidate.sum() > 1:
+        is_candidate &= given["id"] != status.order
+    found = rows[is_candidate]
+    if not len(found):
+        return segment.block(level)[Block.LEVEL_SINCE], 0, Operation(status.standing).name.lower()
+    answering = found[found["message"]["id"] == status.order]
+    row = (answering if len(answering) else found)[-1]
+    message = Message(given.dtype)
+    message.raw[:] = row["message"].tobytes()
+    return int(row["tick"]), int(message.id), describe(message)
 
 
 class Standstill:
@@ -166,7 +129,7 @@ class Standstill:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        self._holds = Holds(segment)
+        self._newest = Newest(segment)
         self._still_since: int | None = None
         self._reported: set[tuple[str, int]] = set()
 
@@ -177,7 +140,7 @@ class Standstill:
         from rack.tools.faults.ending import arm_of
 
         tick = self._segment.words[System.TICK]
-        kept = [hold for hold in self._holds.look() if hold.release]
+        kept = [hold for hold in find_holds(self._newest) if hold.release]
         if not kept or not arm_of(self._segment).is_at_rest:
             self._still_since = None
             return
@@ -195,5 +158,5 @@ class Standstill:
                 )
 
 
-def _fields(box: MailboxSpec) -> set[str]:
-    return {field.name for field in box.fields}
+def _fields(message: Message) -> set[str]:
+    return {*(message.record.dtype.names or ())}

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rack.backplane.checked import as_named
-from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Box, TaskState
+from rack.tools.live.newest import Newest
 
 ADAPTER_STATUS = "adapter_status"
 """Message type of the status of a bus adapter: a group of counts for each entry."""
@@ -49,25 +49,18 @@ class EntryRow:
 
 def host_rows(segment: Segment) -> tuple[HostRow, ...]:
     """Return the host boards."""
-    return tuple(_host_row(segment, host) for host in segment.layout.hosts)
-
-
-def _host_row(segment: Segment, host: TaskSpec) -> HostRow:
-    block = segment.block(host.name)
-    # The process that runs a host board locks this word, and the kernel unlocks it.
-    runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
-    state = as_named(TaskState, block[Block.STATE])
-    shown = state.name.lower() if runs else AWAY
-    if state == TaskState.ENDED:
-        shown = DONE
-    pid = block[Block.PID] if runs else 0
-    return HostRow(
-        board=host.name,
-        pid=pid,
-        state=shown,
-        sent=sum(head[Box.HEAD] for head in _heads(segment, host.name)),
-        restarts=restarts(segment, host.name),
-    )
+    found = []
+    for host in segment.layout.hosts:
+        block = segment.block(host.name)
+        # The process that runs a host board locks this word, and the kernel unlocks it.
+        runs = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
+        state = as_named(TaskState, block[Block.STATE]).name.lower() if runs else AWAY
+        if block[Block.STATE] == TaskState.ENDED:
+            state = DONE
+        sent = sum(head[Box.HEAD] for head in _heads(segment, host.name))
+        pid = block[Block.PID] if runs else 0
+        found.append(HostRow(host.name, pid, state, sent, restarts(segment, host.name)))
+    return tuple(found)
 
 
 def restarts(segment: Segment, writer: str) -> int:
@@ -81,24 +74,19 @@ def _heads(segment: Segment, writer: str) -> list[memoryview]:
     return [segment.box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
-def entry_rows(segment: Segment) -> tuple[EntryRow, ...]:
+def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
     """Return the entries of all bus adapters."""
     found: list[EntryRow] = []
+    segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6
     for mailbox, entry, source in entries_of(segment.layout, segment.config):
-        status = open_observer(segment, mailbox).peek()
-        if status.is_there:
-            counts = getattr(status.value, entry)
+        if (status := newest.message(mailbox)) is not None:
+            counts = getattr(status, entry)
             age = int(counts["age"])
             age_ms = None if age < 0 else age * tick_ms
-            found.append(
-                EntryRow(
-                    entry=f"{mailbox.partition('.')[0]}.{entry}",
-                    source=source,
-                    **{name: int(counts[name]) for name in ENTRY_COUNTS},
-                    age_ms=age_ms,
-                )
-            )
+            numbers = {name: int(counts[name]) for name in ENTRY_COUNTS}
+            board = mailbox.partition(".")[0]
+            found.append(EntryRow(f"{board}.{entry}", source, **numbers, age_ms=age_ms))
     return tuple(found)
 
 

@@ -51,74 +51,48 @@ def inbox_depths(layout: Layout) -> dict[int, int]:
     return {slot: how_sent(found[0]).depth for slot, found in boxes.items() if found}
 
 
-class Inboxes:
-    """Looks at the inboxes of a rack, from the host side."""
-
-    def __init__(self, segment: Segment) -> None:
-        depths = {
-            segment.layout.handler(slot): depth
-            for slot, depth in inbox_depths(segment.layout).items()
-        }
-        self._blocks = [(name, segment.block(name), depth) for name, depth in depths.items()]
-
-    def look(self) -> tuple[InboxFill, ...]:
-        """Return the inbox of every board that messages interrupt, as it is now."""
-        served = Block.INTERRUPTS
-        lost = Block.INTERRUPTS_LOST
-        waiting = Block.INTERRUPTS_WAITING
-        return tuple(
-            InboxFill(name, block[served], block[lost], block[waiting], depth)
-            for name, block, depth in self._blocks
-        )
+def inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
+    """Return the inbox of every board that messages interrupt, as it is now."""
+    found = []
+    for slot, depth in inbox_depths(segment.layout).items():
+        board = segment.layout.handler(slot)
+        block = segment.block(board)
+        served, lost = block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST]
+        found.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
+    return tuple(found)
 
 
-class Delivered(NamedTuple):
-    """The messages of one mailbox at a board that they interrupt; ns of simulated time since tick
-    0, shape (n,)."""
+class Arrivals(NamedTuple):
+    """The messages that interrupted a board, mailbox after mailbox; times in ns of simulated time
+    since tick 0. Arrays have shape (n,)."""
 
+    mailbox: np.ndarray  # number of the mailbox, as `Layout.interrupting` counts
     sent_ns: np.ndarray
     end_ns: np.ndarray  # of the service; `LOST` where the inbox was full
-
-    @property
-    def is_served(self) -> np.ndarray:
-        """Which of them were served, bool, shape (n,)."""
-        return np.asarray(self.end_ns != LOST)
+    most_waiting: int
 
 
-class BoardInterrupts(NamedTuple):
-    """What interrupted a board in a run, by mailbox, and the most that waited."""
-
-    mailboxes: dict[str, Delivered]
-    waiting: int
-
-
-def replayed(recording: Recording, slot: int) -> BoardInterrupts:
+def replay_inbox(recording: Recording, slot: int) -> Arrivals:
     """Work the inbox of the board in a slot out again from the messages of a run, as the board
     did."""
     layout = recording.layout
     boxes = layout.interrupting(slot)
-    visible = [recording.signal(box.name, "visible_at").astype(np.int64) for box in boxes]
-    # A message that comes after a later one of its mailbox is sent with that.
-    first = [sent_ns(box, layout.clock_ns) for box in boxes]
-    sent = [
-        np.maximum.accumulate(at * layout.clock_ns) + ns
-        for at, ns in zip(visible, first, strict=True)
-    ]
-    ends = [np.full(len(at), LOST) for at in sent]
-    numbers = np.repeat(np.arange(len(boxes)), [len(at) for at in sent])
-    serials = np.concatenate([np.arange(len(at)) for at in sent])
+    sent = []
+    for box in boxes:
+        visible_at = recording.signal(box.name, "visible_at").astype(np.int64)
+        # A message that comes after a later one of its mailbox is sent with that.
+        newest = np.maximum.accumulate(visible_at * layout.clock_ns)
+        sent.append(newest + sent_ns(box, layout.clock_ns))
     times = np.concatenate(sent)
+    numbers = np.repeat(np.arange(len(boxes)), [len(at) for at in sent])
+    ends = np.full(len(times), LOST)
     inbox = Inbox(how_sent(boxes[0]).depth)
     services = [how_sent(box).service_ns for box in boxes]
-    for at in np.lexsort((serials, numbers, times)).tolist():
-        number = int(numbers[at])
-        end_ns = inbox.arrive(int(times[at]), services[number])
+    for at in np.lexsort((numbers, times)).tolist():
+        end_ns = inbox.arrive(int(times[at]), services[numbers[at]])
         if end_ns is not None:
-            ends[number][serials[at]] = end_ns
-    pairs = zip(boxes, sent, ends, strict=True)
-    return BoardInterrupts(
-        {box.name: Delivered(at, end) for box, at, end in pairs}, inbox.most_waiting
-    )
+            ends[at] = end_ns
+    return Arrivals(numbers, times, ends, inbox.most_waiting)
 
 
 def interrupts(recording: Recording) -> list[Document]:
@@ -131,28 +105,25 @@ def interrupts(recording: Recording) -> list[Document]:
     layout = recording.layout
     found = []
     for slot, depth in inbox_depths(layout).items():
-        board = replayed(recording, slot)
-        served = {
-            name: int(np.count_nonzero(one.is_served)) for name, one in board.mailboxes.items()
-        }
-        took = [(one.end_ns - one.sent_ns)[one.is_served] for one in board.mailboxes.values()]
+        arrivals = replay_inbox(recording, slot)
+        is_served = arrivals.end_ns != LOST
+        boxes = layout.interrupting(slot)
+        served, lost = (
+            np.bincount(arrivals.mailbox[part], minlength=len(boxes)).tolist()
+            for part in (is_served, ~is_served)
+        )
+        latency_ns = (arrivals.end_ns - arrivals.sent_ns)[is_served]
         found.append(
             {
                 "board": layout.handler(slot),
                 "depth": depth,
-                "served": sum(served.values()),
-                "lost": (
-                    sum(len(one.sent_ns) for one in board.mailboxes.values()) - sum(served.values())
-                ),
-                "waiting": board.waiting,
-                "latency_us": distribution(np.concatenate(took) * 1e-3),
+                "served": sum(served),
+                "lost": sum(lost),
+                "waiting": arrivals.most_waiting,
+                "latency_us": distribution(latency_ns * 1e-3),
                 "mailboxes": [
-                    {
-                        "mailbox": name,
-                        "served": served[name],
-                        "lost": len(one.sent_ns) - served[name],
-                    }
-                    for name, one in board.mailboxes.items()
+                    {"mailbox": box.name, "served": served[at], "lost": lost[at]}
+                    for at, box in enumerate(boxes)
                 ],
             }
         )

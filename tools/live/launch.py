@@ -25,8 +25,9 @@ from rack.tools.faults.ending import Strike, strikes
 from rack.tools.live.display import Display
 from rack.tools.live.folder import EventLog
 from rack.tools.live.holds import Standstill
+from rack.tools.live.newest import Newest
 from rack.tools.live.other_racks import OtherEnd, OtherRacks
-from rack.tools.live.queues import Queues
+from rack.tools.live.queues import queue_fills
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.live.verdict import list_failures
 from rack.tools.recording.origin import Origin
@@ -204,7 +205,7 @@ def run_rack(
             rows_lost=rows_lost,
             faults=strikes(segment, config.joints),
             clock_offset_ns=time.time_ns() - time.monotonic_ns(),
-            refused={queue.mailbox: queue.refused for queue in Queues(segment).look()},
+            refused={queue.mailbox: queue.refused for queue in queue_fills(Newest(segment))},
             others=others.ends(),
             failed=failed,
         )

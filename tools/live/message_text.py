@@ -1,15 +1,38 @@
-"""A message as a document, and as lines for people, field by field with units."""
+"""The mailboxes of a rack as rows, and a message as a document, and as lines for people, field by
+field with units."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import fitted
 from rack.tools.live.signals import cell
 from rack.tools.recording.parquet import HEAD
 from rack.tools.recording.signal import Signal
+
+DROPPED = ("bytes", "message", "protocol", "readers")
+"""Columns of the list of mailboxes that a narrow terminal leaves out, in this order."""
+
+
+def list_mailboxes(segment: Segment) -> list[Document]:
+    """Return a row of each mailbox of a rack."""
+    return [
+        {
+            "mailbox": box.name,
+            "message": f"{box.message} {box.version}",
+            "writer": box.writer,
+            "readers": ", ".join(box.readers) or "-",
+            "protocol": box.protocol,
+            "period_ms": round(box.every * segment.layout.clock_ns * 1e-6, 6),
+            "bytes": box.size,
+            "written": segment.box(box.name)[Box.HEAD],
+        }
+        for box in segment.layout.mailboxes
+    ]
 
 
 class MessageText:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.levels.peer import Presence, peer_port
+from rack.tools.live.newest import Newest
 
 BOARD = "lan"
 STATUS = f"{BOARD}.status"
@@ -76,6 +78,7 @@ class Entries(NamedTuple):
     peers: tuple[str, ...]
 
 
+@cache
 def exchanged(config: str) -> Entries | None:
     """Return what a rack exchanges by its config, TOML text; None: it has no network adapter."""
     table: dict[str, Any] | None = tomllib.loads(config).get("adapter", {}).get(BOARD)
@@ -89,71 +92,50 @@ def exchanged(config: str) -> Entries | None:
     return Entries(exports, imports, tuple(dict.fromkeys(racks)))
 
 
-class Network:
-    """The exchange of one rack, row by row; there are none in a rack without a network adapter."""
+def _entries(segment: Segment) -> Entries:
+    """Return what a rack exchanges; nothing in a rack without a network adapter."""
+    has_adapter = any(task.name == BOARD for task in segment.layout.tasks)
+    return (exchanged(segment.config) if has_adapter else None) or Entries({}, {}, ())
 
-    def __init__(self, segment: Segment) -> None:
-        self._segment = segment
-        entries = (
-            exchanged(segment.config)
-            if any(task.name == BOARD for task in segment.layout.tasks)
-            else None
-        )
-        self._entries = entries or Entries({}, {}, ())
-        self._status = None if entries is None else open_observer(segment, STATUS)
-        self._peers = {
-            rack: open_observer(segment, f"{BOARD}.{peer_port(rack)}")
-            for rack in self._entries.peers
-        }
 
-    def peers(self) -> tuple[PeerRow, ...]:
-        """Return the other racks."""
-        readings = [(rack, reader.peek()) for rack, reader in self._peers.items()]
-        return tuple(_peer(rack, reading.value) for rack, reading in readings if reading.is_there)
+def peer_rows(newest: Newest) -> tuple[PeerRow, ...]:
+    """Return the other racks."""
+    racks = _entries(newest.segment).peers
+    seen = ((rack, newest.message(f"{BOARD}.{peer_port(rack)}")) for rack in racks)
+    return tuple(_peer(rack, message) for rack, message in seen if message is not None)
 
-    def imports(self) -> tuple[ImportRow, ...]:
-        """Return the imports."""
-        found = []
-        for port, counts in self._groups("import", self._entries.imports).items():
-            age = int(counts["age"])
-            numbers = {name: int(counts[name]) for name in COUNTS}
-            ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
-            found.append(
-                ImportRow(
-                    f"{BOARD}.{port}",
-                    self._entries.imports[port],
-                    **numbers,
-                    age_ticks=ages[0],
-                    age_s=ages[1],
-                )
-            )
-        return tuple(found)
 
-    def exports(self) -> tuple[ExportRow, ...]:
-        """Return the exports."""
-        groups = self._groups("export", self._entries.exports)
-        return tuple(
-            ExportRow(f"{BOARD}.{port}", self._entries.exports[port], int(counts["sent"]))
-            for port, counts in groups.items()
-        )
+def import_rows(newest: Newest) -> tuple[ImportRow, ...]:
+    """Return the imports."""
+    found = []
+    for port, source, counts in _groups(newest, "import", _entries(newest.segment).imports):
+        age = int(counts["age"])
+        ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
+        numbers = {name: int(counts[name]) for name in COUNTS}
+        entry = f"{BOARD}.{port}"
+        found.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
+    return tuple(found)
 
-    def _groups(self, kind: str, ports: dict[str, str]) -> dict[str, Any]:
-        if self._status is None or not (status := self._status.peek()).is_there:
-            return {}
-        return {port: getattr(status.value, f"{kind}_{port}") for port in ports}
+
+def export_rows(newest: Newest) -> tuple[ExportRow, ...]:
+    """Return the exports."""
+    return tuple(
+        ExportRow(f"{BOARD}.{port}", source, int(counts["sent"]))
+        for port, source, counts in _groups(newest, "export", _entries(newest.segment).exports)
+    )
+
+
+def _groups(
+    newest: Newest, kind: str, sources: Mapping[str, str]
+) -> Iterator[tuple[str, str, Any]]:
+    """Yield port, source and counts of all imports or exports, once the adapter has counted."""
+    if (status := newest.message(STATUS)) is not None:
+        for port, source in sources.items():
+            yield port, source, getattr(status, f"{kind}_{port}")
 
 
 def _peer(rack: str, at: Any) -> PeerRow:
-    clock_ms = within_ms = None
-    if at.uncertainty > 0.0:
-        clock_ms = at.offset * 1e3
-        within_ms = at.uncertainty * 1e3
-    return PeerRow(
-        peer=rack,
-        state=Presence(at.presence).name.lower(),
-        since_tick=at.since,
-        launches=at.launches,
-        losses=at.losses,
-        clock_ms=clock_ms,
-        within_ms=within_ms,
-    )
+    is_known = at.uncertainty > 0.0
+    clock = (at.offset * 1e3, at.uncertainty * 1e3) if is_known else (None, None)
+    state = Presence(at.presence).name.lower()
+    return PeerRow(rack, state, at.since, at.launches, at.losses, *clock)

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.queue import queues_of, taken_name
-from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 from rack.tools.console.answer import Document
+from rack.tools.live.newest import Newest
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
@@ -34,32 +33,16 @@ class QueueFill:
         return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
 
 
-class Queues:
-    """Looks at the queues of a rack, from the host side."""
-
-    def __init__(self, segment: Segment) -> None:
-        names = [box.name for box in queues_of(segment.layout)]
-        self._ends = [
-            (open_observer(segment, name), open_observer(segment, taken_name(name)))
-            for name in names
-        ]
-
-    def look(self) -> tuple[QueueFill, ...]:
-        """Return every queue as it is now."""
-        found = []
-        for queue, position in self._ends:
-            # The position first: what is taken meanwhile was in the queue.
-            taken = int(position.peek().value.taken)
-            words = queue.slots.box
-            spec = queue.spec
-            found.append(
-                QueueFill(spec.name, words[Box.SENT] - taken, spec.capacity, words[Box.REFUSED])
-            )
-        return tuple(found)
-
-
-def _last(counts: np.ndarray) -> int:
-    return int(counts[-1]) if len(counts) else 0
+def queue_fills(newest: Newest) -> tuple[QueueFill, ...]:
+    """Return every queue of a rack as it is now."""
+    found = []
+    for box in queues_of(newest.segment.layout):
+        # The position first: what is taken meanwhile was in the queue.
+        position = newest.message(taken_name(box.name))
+        words = newest.segment.box(box.name)
+        unread = words[Box.SENT] - (0 if position is None else position.taken)
+        found.append(QueueFill(box.name, unread, box.capacity, words[Box.REFUSED]))
+    return tuple(found)
 
 
 def queues(recording: Recording) -> list[Document]:
@@ -75,13 +58,12 @@ def queues(recording: Recording) -> list[Document]:
             recording.signal(taken_name(box.name), field) for field in ("taken", "unread")
         )
         before = np.concatenate(([0], taken[:-1]))
-        sent = recording.signal(box.name, "serial")
         found.append(
             {
                 "mailbox": box.name,
                 "capacity": box.capacity,
-                "sent": _last(sent),
-                "taken": _last(taken),
+                "sent": int(recording.signal(box.name, "serial").max(initial=0)),
+                "taken": int(taken.max(initial=0)),
                 "waiting": int((taken + unread - before).max(initial=0)),
                 "refused": refused.get(box.name),
             }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,6 @@ from rack.backplane.message import text_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.levels.operator import DRIVES, SETTINGS, Answer
-from rack.tools.console.answer import Document
 
 REPLY_CYCLES = 4
 """Cycles that a level does within which it replies: one to read, one to become visible, one for an
@@ -52,10 +51,6 @@ class Reply:
     def is_standing(self) -> bool:
         """Whether it is in force, as far as is known."""
         return self.fate in ("taken", "done")
-
-    def document(self) -> Document:
-        """Return everything as plain data."""
-        return {**asdict(self), "worked": self.worked}
 
     @property
     def line(self) -> str:
@@ -104,24 +99,27 @@ class Replies:
         # After the statuses: what they answer was given before.
         given = self._given.drain().rows["message"]
         self._kinds.update(zip(given["id"].tolist(), given["what"].tolist(), strict=True))
-        orders = rows["message"]["order"]
-        answers = rows["message"]["answer"]
-        mine = orders == self.reply.serial
-        if self.reply.taken_up < 0 and mine.any():
-            self._take_up(rows[int(np.argmax(mine))])
-        done = mine & (answers == Answer.DONE)
-        if self.reply.fate == "taken" and done.any():
-            self.reply = replace(
-                self.reply, fate="done", done=int(rows["tick"][int(np.argmax(done))])
-            )
-        if self.reply.fate == "taken" and (late := mine & (answers == Answer.REFUSED)).any():
-            self._refuse(rows[int(np.argmax(late))])
-        newer = (orders > self.reply.serial) & np.isin(answers, (Answer.TAKEN, Answer.DONE))
-        if self.reply.fate in ("given", "taken") and any(
-            self._replaces(serial) for serial in set(orders[newer].tolist())
-        ):
-            self.reply = replace(self.reply, fate="superseded")
+        for row in rows:
+            if self.reply.fate in ("given", "taken"):
+                self.reply = self._judge(int(row["tick"]), row["message"])
         return self.reply
+
+    def _judge(self, tick: int, status: np.void) -> Reply:
+        """Return the reply as of one status."""
+        reply = self.reply
+        answer = status["answer"]
+        if status["order"] == reply.serial:
+            taken_up = tick if reply.taken_up < 0 else reply.taken_up
+            if answer == Answer.REFUSED:
+                objection = text_of(status["objection"])
+                return replace(reply, fate="refused", taken_up=taken_up, objection=objection)
+            if answer == Answer.DONE:
+                return replace(reply, fate="done", taken_up=taken_up, done=tick)
+            return replace(reply, fate="taken", taken_up=taken_up)
+        is_newer = status["order"] > reply.serial and answer in (Answer.TAKEN, Answer.DONE)
+        if is_newer and self._replaces(status["order"]):
+            return replace(reply, fate="superseded")
+        return reply
 
     def _replaces(self, serial: int) -> bool:
         """Return whether a newer command, accepted, takes this one's place."""
@@ -129,15 +127,6 @@ class Replies:
         if kind in SETTINGS:
             return False
         return kind not in DRIVES or self._kinds.get(self.reply.serial) in DRIVES
-
-    def _take_up(self, row: np.void) -> None:
-        self.reply = replace(self.reply, fate="taken", taken_up=int(row["tick"]))
-        if row["message"]["answer"] == Answer.REFUSED:
-            self._refuse(row)
-
-    def _refuse(self, row: np.void) -> None:
-        objection = text_of(row["message"]["objection"])
-        self.reply = replace(self.reply, fate="refused", objection=objection)
 
 
 class LastCycle:

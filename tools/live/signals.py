@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.tools.recording.signal import Signal
 
-if TYPE_CHECKING:
-    from rich.console import Console
+Rows = list[tuple[int, list[Any]]]
+"""Ticks, and the value of each signal at each; None before a signal's first one."""
 
 
 class Written(NamedTuple):
@@ -45,10 +45,22 @@ class SignalTap:
 
 
 class Strip:
-    """The last values of some signals by tick. A signal keeps its value until its next message."""
+    """The last values of some signals by tick. A signal keeps its value until its next message.
 
-    def __init__(self, segment: Segment, signals: Sequence[Signal], span: int) -> None:
-        """Keep `span` ticks, and for each mailbox the message before them."""
+    Attributes:
+        settles: Ticks after which everything released at a tick has been written.
+        lost: Messages that were overwritten before they were taken.
+    """
+
+    def __init__(
+        self,
+        segment: Segment,
+        signals: Sequence[Signal],
+        span: int,
+        followed: Sequence[Signal] = (),
+    ) -> None:
+        """Keep `span` ticks, and for each mailbox the message before them; of signals that are only
+        `followed`, nothing."""
         specs = [segment.layout.mailbox(signal.mailbox) for signal in signals]
         self.signals = signals
         self.tick_s = segment.layout.clock_ns * 1e-9
@@ -57,21 +69,29 @@ class Strip:
         # One look may bring as much as a ring holds.
         self._span = span + self.settles + max(spec.every * spec.depth for spec in specs)
         self._rows: dict[str, deque[tuple[int, list[Any]]]] = defaultdict(deque)
+        self._tap = SignalTap(segment, [*signals, *followed])
+        self.lost = 0
+        self.take()
+        # What was overwritten before anyone asked does not count.
+        self.lost = 0
 
-    def add(self, written: Written) -> None:
-        """Add messages of a mailbox, if it is one of the signals'."""
-        own = [signal for signal in self.signals if signal.mailbox == written.mailbox]
-        if not own:
-            return
-        values = map(list, zip(*(signal.plain(written.messages) for signal in own), strict=True))
-        rows = self._rows[written.mailbox]
-        rows.extend(zip(written.ticks.tolist(), values, strict=True))
-        while len(rows) > 1 and rows[1][0] < rows[-1][0] - self._span:
-            rows.popleft()
+    def take(self) -> list[Written]:
+        """Take what was written since the last call, and return it."""
+        found = [*self._tap.take()]
+        for written in found:
+            self.lost += written.lost
+            own = [signal for signal in self.signals if signal.mailbox == written.mailbox]
+            if own:
+                values = zip(*(signal.plain(written.messages) for signal in own), strict=True)
+                rows = self._rows[written.mailbox]
+                rows.extend(zip(written.ticks.tolist(), map(list, values), strict=True))
+                while len(rows) > 1 and rows[1][0] < rows[-1][0] - self._span:
+                    rows.popleft()
+        return found
 
-    def table(self, first: int, last: int) -> list[tuple[int, list[Any]]]:
+    def table(self, first: int, last: int) -> Rows:
         """Return a row for each tick from `first` to `last` at which one of the signals was
-        released: the tick, and the value of each; None before a signal's first one."""
+        released."""
         changes = [
             (tick, mailbox, values)
             for mailbox, rows in self._rows.items()
@@ -129,59 +149,3 @@ class Lines:
             print(encode_json(line), flush=True)
         else:
             print(f"{time_s:10.4f}", *map(cell, values), sep="  ", flush=True)
-
-
-class Plot:
-    """Signals as curves on the terminal: `span` ticks of them. Raises `ImportError` without
-    plotext."""
-
-    def __init__(self, strip: Strip, span: int, terminal: Console) -> None:
-        import plotext
-        from rich.live import Live
-
-        self._plotext = plotext
-        self._strip = strip
-        self._span = span
-        self._live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
-
-    def __enter__(self) -> Self:
-        self._live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._live.stop()
-
-    def show(self, last: int) -> None:
-        """Draw what was released in the time before the tick `last`."""
-        from rich.text import Text
-
-        rows = self._strip.table(last - self._span, last)
-        plot = self._plotext
-        plot.clear_figure()
-        plot.theme("clear")  # the terminal's own colours
-        # One line less: else the terminal scrolls.
-        plot.plotsize(self._live.console.width, max(self._live.console.height - 1, 4))
-        plot.xlabel("simulated time, s")
-        for name, points in self._curves(rows).items():
-            times, values = zip(*points, strict=True)
-            plot.plot(times, values, label=name, marker="braille")
-        self._live.update(Text.from_ansi(plot.build()), refresh=True)
-
-    def _curves(self, rows: list[tuple[int, list[Any]]]) -> dict[str, list[tuple[float, float]]]:
-        """Return points by the name of the curve: a signal with several numbers has one for
-        each."""
-        curves = defaultdict(list)
-        for tick, values in rows:
-            for signal, value in zip(self._strip.signals, values, strict=True):
-                for name, number in _numbers(signal.head, value):
-                    curves[name].append((self._strip.time_s(tick), number))
-        return curves
-
-
-def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
-    """Yield the numbers of a value, each with its name."""
-    if isinstance(value, list):
-        for index, part in enumerate(value):
-            yield from _numbers(f"[{index}] {name}", part)
-    elif isinstance(value, int | float):
-        yield name, value

@@ -13,18 +13,25 @@ from rack.backplane.checked import as_named
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Demand, Run, System, TaskState
 from rack.boards.exchange import EXCHANGE, PortAge, ages_of
 from rack.levels.timing.trace_times import execution_ns, lateness_ns
-from rack.tools.live.holds import Hold, Holds
+from rack.tools.live.holds import Hold, find_holds
 from rack.tools.live.host_side import EntryRow, HostRow, entry_rows, host_rows, restarts
-from rack.tools.live.interrupts import Inboxes, InboxFill
-from rack.tools.live.network import ExportRow, ImportRow, Network, PeerRow
-from rack.tools.live.queues import QueueFill, Queues
+from rack.tools.live.interrupts import InboxFill, inbox_fills
+from rack.tools.live.network import (
+    ExportRow,
+    ImportRow,
+    PeerRow,
+    export_rows,
+    import_rows,
+    peer_rows,
+)
+from rack.tools.live.newest import Newest
+from rack.tools.live.queues import QueueFill, queue_fills
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
@@ -32,14 +39,14 @@ DEAD = "dead"
 """State of a run whose launcher is gone: 'rack clean' removes it."""
 HELD = "HELD: 'rack step {}' lets it go on"
 """Line of a rack in lockstep that is single-stepped."""
-"""Names of the states of levels."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports the progress of the whole task."""
 
 
 @dataclass(frozen=True)
 class TaskRow:
-    """One task now. Times are the longest of the newest cycles, in ms; None before the first.
+    """One task now. Times are the longest of the newest cycles, in ms, or of all: see
+    `RackMonitor`; None before the first.
 
     `priority` is the SCHED_FIFO priority obtained, 0 for ordinary scheduling. `mode` is "operator"
     while a command of an operator is in force, otherwise "automatic"; empty for tasks that take
@@ -111,43 +118,29 @@ class Snapshot:
 
 
 class RackMonitor:
-    """Takes snapshots of one rack; each covers the cycles since the one before."""
+    """Takes snapshots of one rack; each covers the cycles since the one before, with
+    `keeps_longest` all since the first, or since `forget_times`."""
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, keeps_longest: bool = False) -> None:
         self._segment = segment
+        self._newest = Newest(segment)
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
-        self._holds = Holds(segment)
-        self._queues = Queues(segment)
-        self._inboxes = Inboxes(segment)
-        self._network = Network(segment)
-        self._joints = joint_names(segment.config)
+        robot = tomllib.loads(segment.config).get("robot", {})
+        self._joints = tuple(robot.get("joints", ()))
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self.cycles: dict[str, np.ndarray] = {}
         """Trace records of each task that the last look took."""
-        self._times: dict[str, tuple[float | None, float | None]] = dict.fromkeys(
-            self._traces, (None, None)
-        )
-        written = {m.name: m.message for m in segment.layout.mailboxes}
-        self._statuses = {
-            task.name: open_observer(segment, f"{task.name}.status")
-            for task in segment.layout.tasks
-            if f"{task.name}.status" in written
-        }
-        self._exchanges = {
-            box.writer: open_observer(segment, box.name)
-            for box in segment.layout.mailboxes
-            if box.message == EXCHANGE
-        }
-        whole = next((name for name, message in written.items() if message == TASK_STATUS), None)
-        self._whole = open_observer(segment, whole) if whole else None
+        self._keeps_longest = keeps_longest
+        self._longest_ns: dict[str, np.ndarray] = {}
 
     def look(self) -> Snapshot:
         """Return the rack as it is now."""
-        words = self._segment.words
-        layout = self._segment.layout
+        segment = self._segment
+        words = segment.words
+        layout = segment.layout
         run = DEAD
-        if self._segment.launcher_is_alive:
+        if segment.launcher_is_alive:
             run = as_named(Run, words[System.STATE]).name.lower()
         tick = words[System.TICK]
         return Snapshot(
@@ -163,19 +156,15 @@ class RackMonitor:
                 self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
             ),
             progress=self._progress(),
-            holds=self._holds.look(),
-            hosts=host_rows(self._segment),
-            entries=entry_rows(self._segment),
-            queues=self._queues.look(),
-            inboxes=self._inboxes.look(),
-            peers=self._network.peers(),
-            imports=self._network.imports(),
-            exports=self._network.exports(),
-            exchanges={
-                board: ages_of(reading.value)
-                for board, reader in self._exchanges.items()
-                if (reading := reader.peek()).is_there
-            },
+            holds=find_holds(self._newest),
+            hosts=host_rows(segment),
+            entries=entry_rows(self._newest),
+            queues=queue_fills(self._newest),
+            inboxes=inbox_fills(segment),
+            peers=peer_rows(self._newest),
+            imports=import_rows(self._newest),
+            exports=export_rows(self._newest),
+            exchanges={board: ages_of(message) for board, message in self._of_type(EXCHANGE)},
         )
 
     def _active_faults(self) -> Iterator[str]:
@@ -192,50 +181,39 @@ class RackMonitor:
             yield describe(fault, self._segment.layout, self._joints)
 
     def _asserted(self) -> list[str]:
+        """Return the utility lines asserted, and warnings."""
         lines = self._lines
-        held = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
+        shown = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
         single = {
             "ACFAIL": lines.acfail,
             "SYSRESET": lines.sysreset,
             "EMERGENCY STOP": lines.emergency_stop,
         }
-        stepped = [HELD.format(self._segment.rack)] if self._segment.words[System.HELD] else []
-        return (
-            held
-            + [name for name, asserted in single.items() if asserted]
-            + self._without_priority()
-            + stepped
-        )
-
-    def _without_priority(self) -> list[str]:
-        """Return a warning when tasks were refused their real-time priority."""
-        blocks = {
-            task.name: self._segment.block(task.name)
-            for task in self._segment.layout.tasks
-            if task.priority
-        }
-        refused = [
-            name for name, block in blocks.items() if block[Block.PID] and not block[Block.PRIORITY]
-        ]
+        shown += [name for name, asserted in single.items() if asserted]
         words = self._segment.words
-        is_up = words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]
-        return [f"NO REAL-TIME PRIORITY: {', '.join(refused)}"] if refused and is_up else []
+        tasks = [task.name for task in self._segment.layout.tasks if task.priority]
+        blocks = [(name, self._segment.block(name)) for name in tasks]
+        refused = [name for name, block in blocks if block[Block.PID] and not block[Block.PRIORITY]]
+        if refused and words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]:
+            shown.append(f"NO REAL-TIME PRIORITY: {', '.join(refused)}")
+        if words[System.HELD]:
+            shown.append(HELD.format(self._segment.rack))
+        return shown
 
     def _row(self, task: TaskSpec) -> TaskRow:
         block = self._segment.block(task.name)
         exec_ms, lateness_ms = self._times_ms(task.name)
         state = as_named(TaskState, block[Block.STATE]).name.lower()
-        reason = ""
-        row = ""
-        mode = ""
+        reason = row = mode = ""
         if block[Block.LOST]:
             state = LOST
-        elif task.name in self._statuses and (status := self._statuses[task.name].peek()).is_there:
+        elif (status := self._newest.message(f"{task.name}.status")) is not None:
             # Of a user's level without a state, or with others, it is that of its process.
-            state = state_name(getattr(status.value, "state", None), state)
-            reason = reason_of(status.value)
-            row = fired(status.value)
-            mode = mode_of(status.value)
+            state = state_name(getattr(status, "state", None), state)
+            reason = reason_of(status)
+            row = fired(status)
+            standing = getattr(status, "standing", None)
+            mode = "" if standing is None else "operator" if standing else "automatic"
         return TaskRow(
             task=task.name,
             slot=task.slot,
@@ -256,31 +234,31 @@ class RackMonitor:
             mode=mode,
         )
 
-    def _times_ms(self, task: str) -> tuple[float | None, float | None]:
-        """Return the longest execution and lateness of the cycles since the last look that saw
-        any."""
+    def forget_times(self) -> None:
+        """Begin again with the longest times."""
+        self._longest_ns.clear()
+
+    def _times_ms(self, task: str) -> list[float | None]:
+        """Return the longest execution and lateness of a task; where a look sees no cycle, as
+        before."""
         self.cycles[task] = cycles = self._traces[task].drain().rows
+        longest = self._longest_ns.get(task)
         if len(cycles):
-            self._times[task] = (
-                float(execution_ns(cycles).max()) * 1e-6,
-                float(lateness_ns(cycles).max()) * 1e-6,
-            )
-        return self._times[task]
+            newest = np.array([execution_ns(cycles).max(), lateness_ns(cycles).max()])
+            if longest is not None and self._keeps_longest:
+                newest = np.maximum(longest, newest)
+            longest = self._longest_ns[task] = newest
+        return [None, None] if longest is None else (longest * 1e-6).tolist()
+
+    def _of_type(self, message: str) -> Iterator[tuple[str, Message]]:
+        """Yield the newest message in every mailbox of a message type, with its writer."""
+        return self._newest.messages(lambda box: box.message == message)
 
     def _progress(self) -> TaskProgress | None:
-        if self._whole is None or not (status := self._whole.peek()).is_there:
-            return None
-        at = status.value
-        return TaskProgress(
-            at.moves_done, at.moves, at.action, at.actions, state_name(at.state), at.reason
-        )
-
-
-def mode_of(status: Message) -> str:
-    """Return by whose commands a level works, as in `TaskRow`."""
-    if "standing" not in (status.record.dtype.names or ()):
-        return ""
-    return "operator" if status.standing else "automatic"
+        for _, at in self._of_type(TASK_STATUS):
+            state = state_name(at.state)
+            return TaskProgress(at.moves_done, at.moves, at.action, at.actions, state, at.reason)
+        return None
 
 
 def fired(status: Message) -> str:
@@ -290,9 +268,3 @@ def fired(status: Message) -> str:
         return ""
     what = f"row {status.row} '{status.fired}'" if status.row else "no row"
     return f"{what}, now in '{status.in_state}', table {status.table}"
-
-
-def joint_names(config: str) -> tuple[str, ...]:
-    """Return the joints of the arm in a resolved config, from base to tool; empty without an
-    arm."""
-    return tuple(tomllib.loads(config).get("robot", {}).get("joints", ()))

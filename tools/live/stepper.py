@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 
-from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.tools.console.answer import Document, Failure
+from rack.tools.console.answer import Failure
+from rack.tools.console.tables import fitted
+from rack.tools.live.snapshot import RackMonitor
 
 LOOK_S = 0.001
 
@@ -20,21 +22,13 @@ class Stepped:
     rack: str
     tick: int
     time_s: float
-    levels: tuple[dict[str, str], ...]
+    levels: list[dict[str, str]]
 
-    def document(self) -> Document:
-        """Return everything as plain data."""
-        return asdict(self)
-
-    def text(self) -> str:
-        """Return the same as readable text."""
-        from rack.tools.console.tables import fitted
-
-        rows = [list(level.values()) for level in self.levels]
-        lines = fitted(["level", "state", "row", "reason"], rows)
-        return "\n".join(
-            [f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s", *lines]
-        )
+    def lines(self) -> Iterator[str]:
+        """Yield the same as readable text."""
+        yield f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s"
+        rows = [[*level.values()] for level in self.levels]
+        yield from fitted(["level", "state", "row", "reason"], rows)
 
 
 class Stepper:
@@ -43,6 +37,9 @@ class Stepper:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._words = segment.words
+        self._executors = {
+            task.name: task for task in segment.layout.tasks if task.role == "executor"
+        }
         if not self._words[System.LOCKSTEP]:
             hint = f"end it, and start it with: rack run {segment.rack} --lockstep --step"
             raise Failure(f"rack '{segment.rack}' runs in real time, which cannot be held; {hint}")
@@ -68,32 +65,25 @@ class Stepper:
 
         Raises `Failure` for an unknown level.
         """
-        executors = {task.name: task for task in self._executors()}
-        if level is not None and level not in executors:
-            raise Failure(f"--until {level}: no such level; levels: {', '.join(executors)}", 2)
-        task = (
-            executors[level]
-            if level is not None
-            else max(executors.values(), key=lambda task: task.every)
-        )
+        if level is None:
+            task = max(self._executors.values(), key=lambda task: task.every)
+        elif level in self._executors:
+            task = self._executors[level]
+        else:
+            known = ", ".join(self._executors)
+            raise Failure(f"--until {level}: no such level; levels: {known}", 2)
         return task.grid.since(at) + (cycles - 1) * task.every + 1
 
     def look(self) -> Stepped:
         """Return the rack as it is held."""
-        from rack.tools.live.snapshot import RackMonitor
-
-        found = RackMonitor(self._segment).look()
-        executors = {task.name for task in self._executors()}
-        rows = [row for row in found.tasks if row.task in executors]
         levels = [
             {"level": row.task, "state": row.state, "row": row.row, "reason": row.reason}
-            for row in rows
+            for row in RackMonitor(self._segment).look().tasks
+            if row.task in self._executors
         ]
         tick = self._words[System.HELD] - 1
-        return Stepped(found.rack, tick, tick * self._segment.layout.clock_ns * 1e-9, tuple(levels))
-
-    def _executors(self) -> list[TaskSpec]:
-        return [task for task in self._segment.layout.tasks if task.role == "executor"]
+        time_s = tick * self._segment.layout.clock_ns * 1e-9
+        return Stepped(self._segment.rack, tick, time_s, levels)
 
     def _await_hold(self, tick: int) -> int:
         """Wait until the rack holds before `tick` or a later one; return which."""

@@ -40,12 +40,15 @@ class RecordedMoment:
 
     def read(self, mailbox: str) -> Message:
         """Return the message that is in force, as a reader released now finds it."""
-        box = mailbox_of(mailbox, self._recording.layout.timed)
-        row = self._in_force.row(box.name, self.tick)
-        if row is None:
-            raise Failure(f"{box.name}: no message yet at {self.time_s:g} s")
-        content = row["message"]
+        content = self.row(mailbox_of(mailbox, self._recording.layout.timed).name)["message"]
         return Message(content.dtype, memoryview(bytearray(content.tobytes())))
+
+    def row(self, mailbox: str) -> Any:
+        """Return the same with its head, as a row of the mailbox's ring. Raises `Failure`."""
+        row = self._in_force.row(mailbox, self.tick)
+        if row is None:
+            raise Failure(f"{mailbox}: no message yet at {self.time_s:g} s", 2)
+        return row
 
     def __getitem__(self, name: str) -> Any:
         """Return the value of a signal, as in `servo.status.position`: an array or a number; a

@@ -22,7 +22,7 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.tables import fitted
 from rack.tools.live.continued import KeptStates, branched, state_at, tick_in
-from rack.tools.live.display import Display, event_line
+from rack.tools.live.display import Display, event_text
 from rack.tools.live.folder import folder_of
 from rack.tools.live.launch import run_rack
 from rack.tools.live.message_text import MessageText
@@ -108,6 +108,10 @@ class RewoundRun:
         raise Failure(f'"{condition}": does not begin to hold {where} {self._now}', 2)
 
     @property
+    def _moment(self) -> RecordedMoment:
+        return RecordedMoment(self.recording, self._in_force, self.tick)
+
+    @property
     def _now(self) -> str:
         return f"{self.time_s(self.tick):g} s, tick {self.tick}"
 
@@ -125,7 +129,7 @@ class RewoundRun:
             return self._message(name)
         if whole in self._signals:
             signal = Signal.of(name, self._layout.timed)
-            value = signal.plain(self._row(signal.mailbox)["message"][None])[0]
+            value = signal.plain(self._moment.row(signal.mailbox)["message"][None])[0]
             return self._shown(name, value, [f"{name} = {cell(value)} {signal.unit}".rstrip()])
         near = get_close_matches(whole, self.names, NEAREST) or [*self._tasks, *self._boxes]
         raise Failure(f"{name}: no such level, mailbox or signal; nearest: {', '.join(near)}", 2)
@@ -134,22 +138,15 @@ class RewoundRun:
         where = {"tick": self.tick, "time_s": self.time_s(self.tick)}
         return Glance({**where, "name": name, "value": value}, lines)
 
-    def _row(self, mailbox: str) -> Any:
-        row = self._in_force.row(mailbox, self.tick)
-        if row is None:
-            raise Failure(f"{mailbox}: no message yet at {self._now}", 2)
-        return row
-
     def _message(self, mailbox: str) -> Glance:
         text = MessageText(self._boxes[mailbox], self._layout.clock_ns)
-        document = text.document(self._row(mailbox), self.tick)
+        document = text.document(self._moment.row(mailbox), self.tick)
         return self._shown(mailbox, document, text.lines(document))
 
     def _level(self, task: str) -> Glance:
         tick, levels = self._levels
         if tick != self.tick:
-            moment = RecordedMoment(self.recording, self._in_force, self.tick)
-            levels = moment.levels(self._ready(), self._states)
+            levels = self._moment.levels(self._ready(), self._states)
             self._levels = self.tick, levels
         rows = [[name, cell(value)] for name, value in _flat(levels[task])]
         return self._shown(task, levels[task], fitted(("attribute", "value"), rows))
@@ -159,7 +156,7 @@ class RewoundRun:
         span = around_s * 1e9 / self._layout.clock_ns
         events = (event for event in self.recording.events if event.get("tick", -1) >= 0)
         found = [event for event in events if abs(event["tick"] - self.tick) <= span]
-        lines = [f"{self.time_s(one['tick']):g} s  {event_line(Event(**one))}" for one in found]
+        lines = [f"{self.time_s(one['tick']):g} s  {event_text(Event(**one))}" for one in found]
         nothing = f"no events within {around_s:g} s of {self._now}"
         return Glance({"tick": self.tick, "events": found}, lines or [nothing])
 

@@ -14,7 +14,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.crate import patience
 from rack.levels.peer import Presence, peer_port
-from rack.tools.live.holds import Holds
+from rack.tools.live.holds import find_holds
+from rack.tools.live.newest import Newest
 from tests.boards.lan.racks import (
     Ended,
     configs,
@@ -163,7 +164,9 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
         rack.start(1.0)
         watch([rack], until=lambda: rack.segment.block("lan")[Block.AWAITS])
         said = f"waits for rack '{names[1]}': it has not come yet, or does not name this rack"
-        assert [hold.why for hold in Holds(rack.segment).look() if hold.level == "lan"] == [said]
+        assert [hold.why for hold in find_holds(Newest(rack.segment)) if hold.level == "lan"] == [
+            said
+        ]
         watch([rack], until=lambda: rack.events[-1].kind == "waiting")
         assert rack.segment.words[System.TICK] < CYCLE
         rack.stop("test")

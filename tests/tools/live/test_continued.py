@@ -4,7 +4,9 @@ nothing."""
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
+from shutil import copytree
 
 import pytest
 
@@ -13,21 +15,30 @@ from rack.tools.console.answer import Failure
 from rack.tools.recording.recorder_process import ORIGIN
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.report import write_report
+from tests.conftest import SMALL
 from tests.tools.command_line import rack
 
 SECONDS = 2.0
 
 
-@pytest.fixture
-def run(small: Path, rack_name: str, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 2 s, with checkpoints at 0.5, 1 and 1.5 s."""
-    folder = tmp_path / "one"
+    folder = tmp_path_factory.mktemp("recorded")
+    small = folder / "small.toml"
+    small.write_text(SMALL)
     done = rack(
         *("run", small, "--lockstep", "--set", "record.checkpoint_s=0.5", "--seconds", SECONDS),
-        *("--set", f"name={rack_name}", "--out", folder, "--json"),
+        *("--set", f"name=test-continued-{os.getpid()}", "--out", folder / "one", "--json"),
     )
     assert done.returncode == 0, done.stderr
-    return folder
+    return folder / "one"
+
+
+@pytest.fixture
+def run(recorded: Path, tmp_path: Path) -> Path:
+    """A copy of that run, which a test may change."""
+    return Path(copytree(recorded, tmp_path / "one"))
 
 
 def content(run: Path) -> dict[Path, bytes]:
@@ -35,7 +46,9 @@ def content(run: Path) -> dict[Path, bytes]:
 
 
 @pytest.mark.slow
-def test_a_recorded_run_continues_and_its_recording_begins_there(run: Path, tmp_path: Path) -> None:
+def test_a_run_continues_and_its_recording_begins_there_and_names_it(
+    run: Path, tmp_path: Path
+) -> None:
     before = content(run)
     two = tmp_path / "two"
     done = rack(
@@ -53,24 +66,14 @@ def test_a_recorded_run_continues_and_its_recording_begins_there(run: Path, tmp_
         assert other.signal(name, "tick")[0] >= 480
         assert serials.tolist() == one.signal(name, "serial")[-len(serials) :].tolist()
     assert other.trace("lower")["tick"][[0, -1]].tolist() == [480, 799]
-    assert content(run) == before
-
-
-@pytest.mark.slow
-def test_a_branch_names_the_run_that_it_continues(run: Path, tmp_path: Path) -> None:
-    two = tmp_path / "two"
-    done = rack(
-        *("run", "--from", f"{run}@1.2", "--set", "record.checkpoint_s=0"),
-        *("--seconds", SECONDS, "--out", two, "--json"),
-    )
-    named = json.loads(done.stdout)["continues"]
-    assert named == {
+    assert report["continues"] == {
         "folder": str(run),
         "tick": 480,
         "time_s": 1.2,
-        "launched_ns": Recording(run).launch.created_ns,
+        "launched_ns": one.launch.created_ns,
     }
     assert f"\n- continues {run} from 1.2 s\n" in rack("report", two).stdout
+    assert content(run) == before
     assert json.loads(rack("report", run, "--json").stdout)["continues"] is None
 
 
@@ -174,20 +177,11 @@ def test_a_continued_run_takes_checkpoints_that_continue(run: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("at", "why"),
-    [
-        ("2", "2: permitted: 0 to 1.9975 s"),
-        ("-1", "-1: permitted: 0 to 1.9975 s"),
-        ("nan", "nan: permitted: 0 to"),
-        ("inf", "inf: permitted: 0 to"),
-        ("soon", "soon: permitted: 0 to"),
-    ],
-)
-def test_a_time_outside_the_run_is_refused(run: Path, tmp_path: Path, at: str, why: str) -> None:
-    refused = rack("run", "--from", f"{run}@{at}", "--out", tmp_path / "two")
+@pytest.mark.parametrize("at", ["2", "-1", "nan", "inf", "soon"])
+def test_a_time_outside_the_run_is_refused(recorded: Path, tmp_path: Path, at: str) -> None:
+    refused = rack("run", "--from", f"{recorded}@{at}", "--out", tmp_path / "two")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-    assert why in refused.stderr
+    assert f"{at}: permitted: 0 to 1.9975 s" in refused.stderr
     assert not (tmp_path / "two").exists()
 
 

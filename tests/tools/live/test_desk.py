@@ -73,18 +73,26 @@ def test_a_command_is_given_and_taken_up(running: str) -> None:
     assert answer["taken_up"] % 8 == 0
     again = rack("command", running, "upper", "resume")
     assert again.returncode == 0
-    assert again.stdout.startswith(
-        f"command {answer['serial'] + 1} to 'upper', resume: given at tick "
-    )
+    (line,) = again.stdout.splitlines()
+    assert line.startswith(f"command {answer['serial'] + 1} to 'upper', resume: given at tick ")
 
 
 @pytest.mark.slow
-def test_waiting_is_for_the_end_of_a_command(running: str) -> None:
+def test_waiting_is_for_the_end_of_a_command_which_says_how_to_end_it(running: str) -> None:
     answer = json.loads(rack("command", running, "upper", "hold", "--wait", "--json").stdout)
     assert answer["fate"] == "done"
     # The level below has answered: two cycles later.
     assert answer["given"] < answer["taken_up"] < answer["done"]
+    held = rack("command", running, "upper", "hold").stdout.splitlines()
+    assert held[1:] == [f"in force until: rack command {running} upper resume"]
+    refused = rack("command", running, "upper", "goto", "home")
+    assert refused.returncode == 1
+    assert refused.stdout.rstrip().endswith(": the way home is closed")
     assert rack("command", running, "upper", "resume").returncode == 0
+    listed = json.loads(rack("command", running, "--list", "--json").stdout)
+    rows = {row["level"]: row for row in listed}
+    assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
+    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off, set by, goto home"
 
 
 @contextmanager
@@ -140,13 +148,6 @@ def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
 
 
 @pytest.mark.slow
-def test_a_command_that_stays_in_force_says_how_to_end_it(running: str) -> None:
-    held = rack("command", running, "upper", "hold").stdout.splitlines()
-    assert held[1:] == [f"in force until: rack command {running} upper resume"]
-    assert len(rack("command", running, "upper", "resume").stdout.splitlines()) == 1
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("gone", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_level_holds_whose_operator_has_gone_within_a_lease(
     running: str, gone: signal.Signals
@@ -190,35 +191,6 @@ def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None
         assert process.wait(BOUND_S) == 0
     assert not OperatorTable(segment).leased()
     assert LiveDesk(LocalRack(running)).highest("hold") == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        ("upper resume --lease", "--lease: 'upper', resume: permitted: hold, "),
-        ("upper hold --lease --wait", "--lease, --wait: a lease stays anyway"),
-    ],
-)
-def test_a_lease_that_means_nothing_is_refused(running: str, words: str, why: str) -> None:
-    done = rack("command", running, *words.split())
-    assert (done.returncode, done.stderr.startswith(why)) == (2, True), done.stderr
-
-
-@pytest.mark.slow
-def test_a_refusal_says_why_and_is_no_success(running: str) -> None:
-    done = rack("command", running, "upper", "goto", "home")
-    assert done.returncode == 1
-    assert done.stdout.rstrip().endswith(": the way home is closed")
-
-
-@pytest.mark.slow
-def test_the_commands_that_each_level_takes_are_listed(running: str) -> None:
-    rows = {
-        row["level"]: row for row in json.loads(rack("command", running, "--list", "--json").stdout)
-    }
-    assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
-    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off, set by, goto home"
 
 
 @pytest.mark.slow
@@ -315,6 +287,14 @@ def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
 
 
 REFUSED = {
+    "a lease of nothing": (
+        ("upper", "resume", "--lease"),
+        "--lease: 'upper', resume: permitted: hold, ",
+    ),
+    "a lease that waits": (
+        ("upper", "hold", "--lease", "--wait"),
+        "--lease, --wait: a lease stays anyway",
+    ),
     "no level": (
         ("uper", "hold"),
         'level = "uper": no level of this name takes commands; levels that do: upper, lower',
@@ -410,15 +390,11 @@ def test_a_clock_without_ticks_is_not_waited_for(
         assert OperatorTable(Segment.attach(rack_name)).waiting() == []
 
 
-def test_goals_are_numbers_with_commas() -> None:
+def test_goals_are_numbers_with_commas_and_settings_names_with_on_or_off() -> None:
     assert goal_of("goto", ["position=1,-2.5,3e-1", "direction=0,0,-1"]) == {
         "position": [1.0, -2.5, 0.3],
         "direction": [0.0, 0.0, -1.0],
     }
-
-
-@pytest.mark.slow
-def test_a_setting_is_a_name_and_on_or_off() -> None:
     assert goal_of("modify", ["friction", "off"]) == {"name": "friction", "on": False}
     for words in ([], ["friction"], ["friction", "maybe"], ["friction", "on", "off"]):
         with pytest.raises(Failure, match="permitted: modify NAME on, modify NAME off"):

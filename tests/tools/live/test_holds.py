@@ -16,7 +16,8 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.config import load, wire
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Goal, Operation
-from rack.tools.live.holds import STILL_S, Holds, Standstill
+from rack.tools.live.holds import STILL_S, Standstill, find_holds
+from rack.tools.live.newest import Newest
 from tests.boards.commanded_racks import COMMANDED
 
 TICK_S = 0.0025
@@ -54,7 +55,7 @@ def answer(
 
 
 def lines(segment: Segment) -> list[str]:
-    return [hold.line for hold in Holds(segment).look()]
+    return [hold.line for hold in find_holds(Newest(segment))]
 
 
 def test_an_operators_hold_says_since_when_and_how_to_release_it(segment: Segment) -> None:
@@ -79,7 +80,7 @@ def test_a_diversion_says_where_to_and_whether_it_is_there(segment: Segment) -> 
 def test_a_command_that_was_refused_leaves_the_one_before_it_standing(segment: Segment) -> None:
     give(segment, Operation.GOTO, Operation.GOTO)
     answer(segment, Operation.GOTO, 2, Answer.REFUSED)
-    assert [hold.since_tick for hold in Holds(segment).look()] == [100]
+    assert [hold.since_tick for hold in find_holds(Newest(segment))] == [100]
 
 
 def test_a_level_that_holds_by_itself_gives_its_reason(segment: Segment) -> None:
@@ -133,7 +134,7 @@ def test_an_arm_that_is_not_enabled_says_which_command_it_waits_for(
         writer.message.state, writer.message.error = State.HOLDING, error
         writer.message.reason = "why"
         writer.write(400)
-        (hold,) = Holds(segment).look()
+        (hold,) = find_holds(Newest(segment))
         writer.close()
     unlink(rack_name)
     assert (hold.level, hold.why) == ("servo", "holding: why")

@@ -10,7 +10,7 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.live.interrupts import Inboxes, replayed
+from rack.tools.live.interrupts import inbox_fills, replay_inbox
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.report import write_report
@@ -37,7 +37,7 @@ def test_status_shows_every_inbox(tmp_path: Path, rack_name: str) -> None:
     path = tmp_path / "hub.toml"
     path.write_text(RACK)
     with Rack(load(path, [f"name={rack_name}", SMALL])) as rack:
-        (empty,) = Inboxes(rack.segment).look()
+        (empty,) = inbox_fills(rack.segment)
         assert empty.line == "interrupts of hub: 0 served, at most 0 of 2 waited"
         rack.run(SECONDS)
         (full,) = RackMonitor(rack.segment).look().inboxes
@@ -54,10 +54,12 @@ def test_a_recording_tells_what_the_board_itself_had(
     tmp_path: Path, rack_name: str, settings: tuple[str, ...]
 ) -> None:
     recording = recorded(tmp_path, rack_name, *settings)
-    board = replayed(recording, recording.layout.task("hub").slot)
+    slot = recording.layout.task("hub").slot
+    arrivals = replay_inbox(recording, slot)
+    names = [box.name for box in recording.layout.interrupting(slot)]
     had = recording.signal("hub.status", "cycle")
     for at in range(BOARDS):
-        ends = board.mailboxes[f"figure{at}.status"].end_ns
+        ends = arrivals.end_ns[arrivals.mailbox == names.index(f"figure{at}.status")]
         shown = [np.flatnonzero(ends <= tick * recording.layout.clock_ns) for tick in range(TICKS)]
         # A board writes in every tick, so the number of a message is its tick.
         assert had[:, at].tolist() == [found[-1] if len(found) else -1 for found in shown]

@@ -17,7 +17,16 @@ from rack.backplane.segment import Segment, unlink
 from rack.boards.config.resolved import loads, wire
 from rack.levels.peer import Presence
 from rack.tools.live.display import RackView
-from rack.tools.live.network import ExportRow, ImportRow, Network, PeerRow, exchanged
+from rack.tools.live.network import (
+    ExportRow,
+    ImportRow,
+    PeerRow,
+    exchanged,
+    export_rows,
+    import_rows,
+    peer_rows,
+)
+from rack.tools.live.newest import Newest
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.timing.analysis.report import network
 from rack.tools.timing.analysis.report_markdown import _network
@@ -58,14 +67,13 @@ def segment(rack_name: str) -> Iterator[Segment]:
 
 
 def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> None:
-    found = Network(segment)
-    assert found.peers() == (PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2),)
-    assert found.imports() == (
+    assert peer_rows(Newest(segment)) == (PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2),)
+    assert import_rows(Newest(segment)) == (
         ImportRow(
             "lan.other", "other-one/pulse.status", *COUNTS.values(), age_ticks=16, age_s=0.04
         ),
     )
-    assert found.exports() == (ExportRow("lan.pulse", "pulse.status", 12),)
+    assert export_rows(Newest(segment)) == (ExportRow("lan.pulse", "pulse.status", 12),)
 
 
 def test_the_table_of_a_rack_shows_them_too(segment: Segment) -> None:

@@ -10,7 +10,8 @@ from rack.boards import Rack
 from rack.boards.config import load, wire
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
-from rack.tools.live.queues import Queues
+from rack.tools.live.newest import Newest
+from rack.tools.live.queues import queue_fills
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.inventory import inventory, inventory_lines
 from tests.boards.test_queues import QUEUES
@@ -40,11 +41,10 @@ def test_a_running_rack_shows_its_queues(tmp_path: Path, rack_name: str) -> None
     path = tmp_path / "queues.toml"
     path.write_text(QUEUES)
     with Rack(load(path, [f"name={rack_name}", *FULL])) as rack:
-        queues = Queues(rack.segment)
-        (empty,) = queues.look()
+        (empty,) = queue_fills(Newest(rack.segment))
         assert empty.line == "queue upper.requests: 0 of 7 unread"
         rack.run(1.0)
-        (full,) = queues.look()
+        (full,) = queue_fills(Newest(rack.segment))
     assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
 
 

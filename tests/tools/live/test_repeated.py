@@ -4,6 +4,7 @@ commanded."""
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -133,35 +134,32 @@ def test_what_an_operator_commanded_before_the_config_did_is_not_taken_for_that(
     assert recorded_commands(Recording(tmp_path / "one")) == given
 
 
+@pytest.fixture(scope="module")
+def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A run in lockstep whose operator commands what no config has."""
+    return commanded(
+        tmp_path_factory.mktemp("lockstep"), f"test-repeated-{os.getpid()}", "lockstep"
+    )
+
+
 @pytest.mark.slow
-def test_a_run_in_lockstep_is_repeated_with_its_operators_commands(
-    rack_name: str, tmp_path: Path
+@pytest.mark.parametrize(("at", "ticks"), [(0.0, [40, 80, 200]), (0.3, [200]), (1.2025, [])])
+def test_a_run_in_lockstep_goes_on_from_any_tick_with_its_operators_commands(
+    in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
-    one = commanded(tmp_path, rack_name, "lockstep")
-    two = repeated(one, tmp_path / "two")
-    assert first_difference(one, two) is None
-    assert two.signal("upper.operator", "tick").tolist() == [40, 80, 200]
-    assert one.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
+    two = repeated(in_lockstep, tmp_path / "two", at)
+    assert first_difference(in_lockstep, two) is None
+    assert two.signal("upper.operator", "tick").tolist() == ticks
+    assert in_lockstep.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("at", [0.3, 1.2025])
-def test_it_goes_on_from_any_tick_as_it_did(rack_name: str, tmp_path: Path, at: float) -> None:
-    one = commanded(tmp_path, rack_name, "lockstep")
-    two = repeated(one, tmp_path / "two", at)
-    assert first_difference(one, two) is None
-    assert two.signal("upper.operator", "tick").tolist() == [200] * (at < 0.5)
-    assert one.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
-
-
-@pytest.mark.slow
-def test_the_commands_are_what_makes_it_equal(rack_name: str, tmp_path: Path) -> None:
-    one = commanded(tmp_path, rack_name, "lockstep")
+def test_the_commands_are_what_makes_it_equal(in_lockstep: Recording, tmp_path: Path) -> None:
     # The run's config has no command but the first one.
-    again = load(one.folder / "config.toml", [])
+    again = load(in_lockstep.folder / "config.toml", [])
     assert [command.tick for command in again.command] == [40]
     run_rack(again, SECONDS, tmp_path / "two", Display())
-    difference = first_difference(one, Recording(tmp_path / "two"))
+    difference = first_difference(in_lockstep, Recording(tmp_path / "two"))
     assert difference is not None
     assert 80 <= difference.tick < 120
 
@@ -183,18 +181,19 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
         assert difference is None
 
 
-@pytest.fixture(params=[Client.WAITS, Client.LEASES])
-def by_hand(request: pytest.FixtureRequest, rack_name: str, tmp_path: Path) -> Recording:
+@pytest.fixture(scope="module", params=[Client.WAITS, Client.LEASES])
+def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """A run in lockstep with a checkpoint each 100 ticks, whose operator commands at 140 and 260
     what no config has; under a lease these are in force to the end."""
-    file = tmp_path / "commanded.toml"
-    file.write_text(COMMANDED)
-    settings = ("clock.mode=lockstep", "record.checkpoint_s=0.25", commands(HOLD))
-    config = load(file, (f"name={rack_name}", *settings))
+    folder = tmp_path_factory.mktemp("by-hand")
+    (folder / "commanded.toml").write_text(COMMANDED)
+    name = f"test-by-hand-{os.getpid()}"
+    settings = (f"name={name}", "clock.mode=lockstep", "record.checkpoint_s=0.25", commands(HOLD))
+    config = load(folder / "commanded.toml", settings)
     given = requests(config, resume=140, hold=260)
-    with closing(ByHand(rack_name, given, request.param)) as operator:
-        run_rack(config, SECONDS, tmp_path / "one", operator, step=True)
-    one = Recording(tmp_path / "one")
+    with closing(ByHand(name, given, request.param)) as operator:
+        run_rack(config, SECONDS, folder / "one", operator, step=True)
+    one = Recording(folder / "one")
     assert one.signal("upper.operator", "tick").tolist() == [40, 140, 260]
     return one
 
@@ -246,8 +245,9 @@ def test_a_branch_has_its_own_commands_besides_those_repeated(
 def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
     by_hand: Recording,
 ) -> None:
-    by_hand.kept = [(0, 200), (240, 800)]
-    found = [[one.tick for one in commands_from(by_hand, tick)] for tick in (0, 100, 250)]
+    flight = Recording(by_hand.folder)
+    flight.kept = [(0, 200), (240, 800)]
+    found = [[one.tick for one in commands_from(flight, tick)] for tick in (0, 100, 250)]
     assert found == [[40, 140], [140], [260]]
 
 

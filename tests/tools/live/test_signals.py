@@ -4,13 +4,11 @@ tick."""
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 
 import pytest
-from rich.console import Console
 
-from rack.tools.live.signals import Lines, Plot, SignalTap, Strip
+from rack.tools.live.signals import Lines, SignalTap, Strip
 from rack.tools.recording.signal import Signal
 from tests.backplane.bus import NAME
 from tests.link import Link, links
@@ -53,16 +51,13 @@ def test_what_is_overwritten_is_counted(link: Link, signals: list[Signal]) -> No
 def test_a_strip_has_a_row_for_each_tick_and_keeps_its_span(
     link: Link, signals: list[Signal]
 ) -> None:
-    tap = SignalTap(link.segment, signals)
     strip = Strip(link.segment, signals, span=20)
     link.run(0, 40)
-    for written in tap.take():
-        strip.add(written)
+    strip.take()
     assert strip.table(10, 15) == [(10, [10, 10]), (12, [12, 12]), (14, [14, 14])]
     for first in range(40, 400, 40):
         link.run(first, first + 40)
-        for written in tap.take():
-            strip.add(written)
+        strip.take()
     kept = strip.table(0, 400)
     assert kept[-1] == (398, [398, 398])
     # The span, and as much as one look may bring: the ring, and what is being written.
@@ -73,12 +68,20 @@ def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Sig
     strip = Strip(link.segment, signals, span=20)
     assert strip.table(0, 10) == []
     link.run(0, 8)
-    for written in SignalTap(link.segment, signals).take():
-        strip.add(written._replace(mailbox="another"))
-        assert strip.table(0, 10) == []
-        strip.add(written)
+    strip.take()
     assert strip.table(5, 6) == [(6, [6, 6])]
     assert strip.time_s(6) == 0.015
+
+
+def test_a_strip_counts_only_what_is_overwritten_after_it_began(
+    link: Link, signals: list[Signal]
+) -> None:
+    link.run(0, 400)
+    strip = Strip(link.segment, signals, span=20)
+    assert strip.lost == 0
+    link.run(400, 800)
+    strip.take()
+    assert strip.lost > 0
 
 
 def test_lines_are_as_far_apart_as_was_asked(
@@ -86,8 +89,7 @@ def test_lines_are_as_far_apart_as_was_asked(
 ) -> None:
     strip = Strip(link.segment, signals, span=100)
     link.run(0, 40)
-    for written in SignalTap(link.segment, signals).take():
-        strip.add(written)
+    strip.take()
     lines = Lines(strip, first=4, every=10, as_json=True)
     for last in (3, 15, 16, 39):
         lines.show(last)
@@ -96,18 +98,3 @@ def test_lines_are_as_far_apart_as_was_asked(
     assert found[0] == {"time_s": 0.01, "tick": 4, f"{NAME}.row[3]": 4, f"{NAME}.id": 4}
     Lines(strip, first=36, every=0, as_json=False).show(39)
     assert capsys.readouterr().out.splitlines() == ["    0.0900  36  36", "    0.0950  38  38"]
-
-
-def test_a_plot_has_a_curve_for_each_number(link: Link) -> None:
-    boxes = link.segment.layout.mailboxes
-    signals = [Signal.of(f"{NAME}.{name}", boxes) for name in ("row[3]", "id", "text")]
-    strip = Strip(link.segment, signals, span=100)
-    link.run(0, 40)
-    for written in SignalTap(link.segment, signals).take():
-        strip.add(written)
-    terminal = Console(force_terminal=True, color_system=None, width=90, height=30)
-    with terminal.capture() as drawn, Plot(strip, 40, terminal) as plot:
-        plot.show(39)
-    # Text has no curve.
-    assert {*re.findall(rf"{NAME}\S+", drawn.get())} == {f"{NAME}.row[3]", f"{NAME}.id"}
-    assert "simulated time, s" in drawn.get()

@@ -17,7 +17,7 @@ from rack.boards.config import load, wire
 from rack.boards.config.faults import injections
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
-from rack.tools.live.snapshot import RackMonitor, Snapshot, TaskRow, joint_names
+from rack.tools.live.snapshot import RackMonitor, Snapshot, TaskRow
 from rack.tools.timing.analysis.report import write_report
 
 FAULT = 'fault=[{ kind = "mute", board = "lower" }]'
@@ -105,8 +105,3 @@ def test_a_fault_is_shown_while_it_is_active(segment: Segment) -> None:
 def test_what_is_demanded_of_the_arm_is_shown(segment: Segment, demand: Demand) -> None:
     segment.words[System.DEMAND] = demand
     assert RackMonitor(segment).look().demand == demand.name.lower()
-
-
-def test_joints_are_those_of_the_config(segment: Segment) -> None:
-    assert joint_names(segment.config) == ()
-    assert joint_names('[robot]\njoints = ["a", "b"]') == ("a", "b")

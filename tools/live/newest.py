@@ -1,0 +1,40 @@
+"""The newest messages in the mailboxes of a running rack."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.message import Message
+from rack.backplane.segment import Segment
+
+
+class Newest:
+    """Reads newest messages. It opens each mailbox once: that takes longer than many reads."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.segment = segment
+        self._readers: dict[str, Reader] = {}
+
+    def message(self, mailbox: str) -> Message | None:
+        """Return the newest message of a mailbox; None without one, or without the mailbox."""
+        if mailbox not in self.segment.map.mailboxes:
+            return None
+        if mailbox not in self._readers:
+            self._readers[mailbox] = open_observer(self.segment, mailbox)
+        reading = self._readers[mailbox].peek()
+        return reading.value if reading.is_there else None
+
+    def messages(self, is_wanted: Callable[[MailboxSpec], bool]) -> Iterator[tuple[str, Message]]:
+        """Yield the newest message of every wanted mailbox that has one, with its writer."""
+        for box in self.segment.layout.mailboxes:
+            if is_wanted(box) and (message := self.message(box.name)) is not None:
+                yield box.writer, message
+
+    def statuses(self, field: str) -> Iterator[tuple[str, Message]]:
+        """Yield the newest status of every level whose status has a field, with the level."""
+        return self.messages(
+            lambda box: box.name.endswith(".status") and field in (own.name for own in box.fields)
+        )
