@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -16,12 +17,15 @@ from rack.boards.faults.config import as_seconds
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
-from rack.tools.live.signals import Lines, Rows, Strip, cell
+from rack.tools.console.tables import console
+from rack.tools.live.signals import Lines, Plot, Rows, Strip, cell
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import Signal, Trigger
 
 LOOK_S = 0.02
 """Time between looks: rings hold 2 s, in a fast lockstep a quarter of that."""
+SHOWN_S = 10.0
+"""Simulated time that a plot shows."""
 MOST_S = 600.0
 """Longest time kept before or after a moment: all of it is in memory."""
 
@@ -63,9 +67,9 @@ def watch(
 ) -> None:
     """Show signals of a running rack until its run is over, or until Ctrl-C.
 
-    A signal is a field of a mailbox ('rack mailbox RACK' lists those), or one number of it. Each
-    line has the time, s, and the values; with --json each line is a document. The viewer shows them
-    as curves: rack record RACK --view.
+    A signal is a field of a mailbox ('rack mailbox RACK' lists those), or one number of it. On a
+    terminal it is plotted, if plotext is there (pip install 'nasrem-rack[live]'). Otherwise each
+    line has the time, s, and the values; with --json each line is a document.
 
     With --when it waits for a moment, and saves what was around it: every message, none left out.
     Watching reads the rings that the recorder reads: it costs the rack no deadline.
@@ -131,13 +135,21 @@ def _check_writable(path: Path) -> None:
 
 def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: bool) -> None:
     """Show signals until the run is over."""
-    strip = Strip(segment, signals, span=0)
-    every = round(every_s / strip.tick_s)
-    lines = Lines(strip, segment.words[System.TICK], every, as_json)
-    for is_over in looks(segment, LOOK_S):
-        strip.take()
-        settles = 0 if is_over else strip.settles
-        lines.show(segment.words[System.TICK] - settles)
+    span = round(SHOWN_S * 1e9 / segment.layout.clock_ns)
+    strip = Strip(segment, signals, span)
+    first = segment.words[System.TICK]
+    view: Lines | Plot = Lines(strip, first, round(every_s / strip.tick_s), as_json)
+    terminal = console()
+    with ExitStack() as stack:
+        if terminal.is_terminal and not as_json:
+            try:
+                view = stack.enter_context(Plot(strip, span, terminal))
+            except ImportError:
+                print("no curves without plotext: pip install 'nasrem-rack[live]'", file=sys.stderr)
+        for is_over in looks(segment, LOOK_S):
+            strip.take()
+            settles = 0 if is_over else strip.settles
+            view.show(segment.words[System.TICK] - settles)
     if strip.lost:
         raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 

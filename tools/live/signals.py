@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.tools.recording.signal import Signal
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Rows = list[tuple[int, list[Any]]]
 """Ticks, and the value of each signal at each; None before a signal's first one."""
@@ -149,3 +152,59 @@ class Lines:
             print(encode_json(line), flush=True)
         else:
             print(f"{time_s:10.4f}", *map(cell, values), sep="  ", flush=True)
+
+
+class Plot:
+    """Signals as curves on the terminal: `span` ticks of them. Raises `ImportError` without
+    plotext."""
+
+    def __init__(self, strip: Strip, span: int, terminal: Console) -> None:
+        import plotext
+        from rich.live import Live
+
+        self._plotext = plotext
+        self._strip = strip
+        self._span = span
+        self._live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
+
+    def __enter__(self) -> Self:
+        self._live.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._live.stop()
+
+    def show(self, last: int) -> None:
+        """Draw what was released in the time before the tick `last`."""
+        from rich.text import Text
+
+        rows = self._strip.table(last - self._span, last)
+        plot = self._plotext
+        plot.clear_figure()
+        plot.theme("clear")  # the terminal's own colours
+        # One line less: else the terminal scrolls.
+        plot.plotsize(self._live.console.width, max(self._live.console.height - 1, 4))
+        plot.xlabel("simulated time, s")
+        for name, points in self._curves(rows).items():
+            times, values = zip(*points, strict=True)
+            plot.plot(times, values, label=name, marker="braille")
+        self._live.update(Text.from_ansi(plot.build()), refresh=True)
+
+    def _curves(self, rows: Rows) -> dict[str, list[tuple[float, float]]]:
+        """Return points by the name of the curve: a signal with several numbers has one for
+        each."""
+        curves = defaultdict(list)
+        for tick, values in rows:
+            for signal, value in zip(self._strip.signals, values, strict=True):
+                for name, number in _numbers(signal.head, value):
+                    curves[name].append((self._strip.time_s(tick), number))
+        return curves
+
+
+def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of a value, each with its name."""
+    if isinstance(value, list):
+        for index, part in enumerate(value):
+            yield from _numbers(f"[{index}] {name}", part)
+    elif isinstance(value, int | float):
+        yield name, value
