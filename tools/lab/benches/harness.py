@@ -242,8 +242,9 @@ class Comparison:
             yield self.conclusion
 
     def _row(self, sample: Sample) -> list[str]:
-        figures = [shown(getattr(sample, name)) for name in ("median", "p99", "best", "worst")]
-        ratios = [decimal(self.ratio(sample, name), 2) for name in ("median", "p99")]
+        found = self._figures(sample)
+        figures = [shown(found[name]) for name in ("median", "p99", "best", "worst")]
+        ratios = [decimal(found[name], 2) for name in ("ratio", "p99_ratio")]
         return [sample.case, sample.who, f"{sample.count}", *figures, sample.unit, *ratios]
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, loads
+from rack.boards.config import load
 from rack.boards.errors import ConfigError
-from rack.tools.console.answer import Failure
 from rack.tools.lab.reproduction.experiments import partition
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.partition import (
@@ -17,7 +16,7 @@ from rack.tools.lab.reproduction.experiments.partition import (
     Partition,
     Partitions,
 )
-from tests.boards.conftest import CLOCK, PLANNED
+from tests.boards.conftest import PLANNED
 from tests.machine import needs_fifo, needs_two_cores
 
 pytestmark = pytest.mark.thorough
@@ -53,17 +52,6 @@ def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
         assert len(slots) == len(set(slots)) == len(rack.board) + 4 * name.startswith("loose")
     assert found["loose, 2 cores"].board["servo"].planner_core == 0
     assert found["tight, 2 cores"].board["world"].coupling == "none"
-
-
-def test_a_crate_without_free_slots_is_refused() -> None:
-    boards = "".join(
-        f'[board.b{slot}]\nslot = {slot}\nrate_hz = 400\nexecutor = "wave_levels:PlannedWave"\n'
-        'planner = "wave_levels:GainPlanner"\ncoupling = "tight"\n'
-        for slot in range(2, 22)
-    )
-    config = loads(CLOCK + boards)
-    with pytest.raises(Failure, match="slots go up to 21"):
-        Partition("loose", 1).of(config)
 
 
 def test_a_board_that_polls_cannot_share_the_only_core() -> None:

@@ -10,7 +10,6 @@ from rack.boards.config import RackConfig, loads, rack_timing, resolve
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
 from rack.boards.faults.bounds import counting
 from rack.levels.timing.trace_times import Distribution, counts, distribution, plans
-from rack.tools.console.answer import Failure
 from rack.tools.lab.reproduction.experiments.experiment import (
     Experiment,
     Workshop,
@@ -46,7 +45,6 @@ class Partition:
 
         Raises:
             ConfigError: If the rack does not permit this partition.
-            Failure: If the crate has no slot left for a planner.
         """
         taken = {board.slot for board in config.board.values()}
         free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
@@ -64,12 +62,7 @@ class Partition:
         if board.planner is not None:
             changes["coupling"] = self.coupling
         if board.planner is not None and self.coupling == "loose":
-            slot = next(free, None)
-            if slot is None:
-                raise Failure(
-                    f"the crate has no slot left for every planner: slots go up to {LAST_SLOT}"
-                )
-            changes |= {"planner_slot": slot, "planner_core": (core + 1) % self.cores}
+            changes |= {"planner_slot": next(free), "planner_core": (core + 1) % self.cores}
         return board.model_copy(update=changes)
 
 
