@@ -187,8 +187,8 @@ class RackView:
                     [name.replace("_", " ") for name in found[0]], cells, width, style=_style
                 )
         yield from (Text(line, style="red") for line in _reasons(snapshot))
-        for fill in (*snapshot.queues, *snapshot.inboxes):
-            yield Text(fill.line)
+        yield from (Text(queue.line) for queue in snapshot.queues)
+        yield from (Text(inbox.line) for inbox in snapshot.inboxes)
         yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:

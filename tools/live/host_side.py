@@ -84,9 +84,9 @@ def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
             counts = getattr(status, entry)
             age = int(counts["age"])
             age_ms = None if age < 0 else age * tick_ms
-            numbers = [int(counts[name]) for name in ENTRY_COUNTS]
+            numbers = {name: int(counts[name]) for name in ENTRY_COUNTS}
             board = mailbox.partition(".")[0]
-            found.append(EntryRow(f"{board}.{entry}", source, *numbers, age_ms))
+            found.append(EntryRow(f"{board}.{entry}", source, **numbers, age_ms=age_ms))
     return tuple(found)
 
 

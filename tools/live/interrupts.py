@@ -57,8 +57,8 @@ def inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
     for slot, depth in inbox_depths(segment.layout).items():
         board = segment.layout.handler(slot)
         block = segment.block(board)
-        counts = (Block.INTERRUPTS, Block.INTERRUPTS_LOST, Block.INTERRUPTS_WAITING)
-        found.append(InboxFill(board, *(block[count] for count in counts), depth))
+        served, lost = block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST]
+        found.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
     return tuple(found)
 
 

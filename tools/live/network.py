@@ -111,8 +111,9 @@ def import_rows(newest: Newest) -> tuple[ImportRow, ...]:
     for port, source, counts in _groups(newest, "import", _entries(newest.segment).imports):
         age = int(counts["age"])
         ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
-        numbers = [int(counts[name]) for name in COUNTS]
-        found.append(ImportRow(f"{BOARD}.{port}", source, *numbers, *ages))
+        numbers = {name: int(counts[name]) for name in COUNTS}
+        entry = f"{BOARD}.{port}"
+        found.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
     return tuple(found)
 
 

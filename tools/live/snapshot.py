@@ -245,9 +245,9 @@ class RackMonitor:
         longest = self._longest_ns.get(task)
         if len(cycles):
             newest = np.array([execution_ns(cycles).max(), lateness_ns(cycles).max()])
-            is_first = longest is None or not self._keeps_longest
-            longest = newest if is_first else np.maximum(longest, newest)
-            self._longest_ns[task] = longest
+            if longest is not None and self._keeps_longest:
+                newest = np.maximum(longest, newest)
+            longest = self._longest_ns[task] = newest
         return [None, None] if longest is None else (longest * 1e-6).tolist()
 
     def _of_type(self, message: str) -> Iterator[tuple[str, Message]]:

@@ -46,7 +46,6 @@ def _equation(
     config: str,
     settings: tuple[str, ...] = (),
     judge: Callable[[NasremRun], ClaimVerdict] | None = None,
-    is_pictured: bool = False,
 ) -> PaperClaim:
     """Return an equation as a claim; it fails in this config with these settings."""
     return PaperClaim(
@@ -57,7 +56,6 @@ def _equation(
         (NASREM,),
         judge or partial(rules.judge_equation, number),
         partial(predictions.predict_equation, number, config, settings),
-        is_pictured,
     )
 
 
@@ -284,7 +282,6 @@ SECTIONS = (
                 " processing and communication.",
                 "fig4",
                 settings_of("fig4", 3.0),
-                is_pictured=True,
             ),
         ),
     ),

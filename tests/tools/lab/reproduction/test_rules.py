@@ -45,7 +45,7 @@ EQUATIONS = [f"equation-3.{number}" for number in range(1, 11)]
 HOLDS, BOUNDED, FAILS = Ruling.HOLDS, Ruling.BOUNDED, Ruling.FAILS
 NO_TIMES = Percentiles(1.0, 3.0)
 WAY = WayResponse(NO_TIMES, ())
-RUN = NasremRun("task done", 800, (), {}, SystemResponse(4.0, WAY, WAY), (), {})
+RUN = NasremRun("task done", 800, (), {}, SystemResponse(4.0, WAY, WAY), ())
 
 
 def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_order() -> None:
