@@ -113,10 +113,10 @@ def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, operator: Op
     try:
         from rack.tools.network.estop import stop, stop_when
     except ImportError as error:
-        if error.name != "zenoh":
+        if error.name not in ("zenoh", "cryptography"):
             raise
         raise Failure(
-            "racks on other machines need eclipse-zenoh: pip install nasrem-rack[lan]"
+            "racks on other machines need zenoh and cryptography: pip install nasrem-rack[lan]"
         ) from None
     return stop_when(_pressed, address, operator, _Teller()) if ready else stop(address, operator)
 
