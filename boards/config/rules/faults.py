@@ -63,7 +63,13 @@ class FaultRules:
 
     def mistakes(self) -> Iterator[Mistake]:
         """Yield every mistake in the fault."""
-        yield from self._once_each()
+        # Check that its begin and its end are each given in one way.
+        for keys in (("tick", "at", "when"), ("for", "cycles")):
+            given = [key for key in keys if self._value(key) is not None]
+            for key in given[1:]:
+                yield self._mistake(
+                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
+                )
         fault = self.fault
         places = (*self.config.tasks(), *self.config.hosts())
         tasks: dict[str, Role] = {place.name: place.role for place in places}
@@ -82,15 +88,6 @@ class FaultRules:
                 condition(fault.when, layout)
             except LookupError as error:
                 yield self._mistake("when", str(error.args[0]))
-
-    def _once_each(self) -> Iterator[Mistake]:
-        """Check that its begin and its end are each given in one way."""
-        for keys in (("tick", "at", "when"), ("for", "cycles")):
-            given = [key for key in keys if self._value(key) is not None]
-            for key in given[1:]:
-                yield self._mistake(
-                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
-                )
 
     def _of_kind(self, kind: Kind) -> Iterator[Mistake]:
         if kind.realtime and self.config.clock.mode == "lockstep":
