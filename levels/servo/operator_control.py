@@ -100,7 +100,12 @@ class OperatorControl:
             if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
                 self._way.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
-            self._arrive()
+            # React to the arm's arrival at its goal.
+            if not self.orders.stands and self._way:
+                self._way.pop()
+            if self.orders.stands or not self._way:
+                self.stands = self.orders.stands
+                self.orders.done()
         return motion
 
     def _aim(self) -> Array | None:
@@ -108,11 +113,3 @@ class OperatorControl:
         if self.orders.standing is Operation.SETPOINT:
             return self._goal
         return self._way[-1] if not self.orders.stands and self._way else None
-
-    def _arrive(self) -> None:
-        """React to the arm's arrival at its goal."""
-        if not self.orders.stands and self._way:
-            self._way.pop()
-        if self.orders.stands or not self._way:
-            self.stands = self.orders.stands
-            self.orders.done()

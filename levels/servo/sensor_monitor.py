@@ -206,11 +206,6 @@ class SensorMonitor:
         least = np.maximum(np.abs(self._qd) - self._speed_room, 0.0)
         self._claimed[:] = np.where(unchanged, self._claimed + passed_s * least, 0.0)
 
-    def _is_still(self) -> Mask:
-        return np.asarray(
-            (self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown)
-        )
-
     def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
         q = self._q
@@ -224,7 +219,9 @@ class SensorMonitor:
         if not self._coarse:
             self._claim(unchanged, passed_s)
         frozen = self._claimed > self._room
-        still = self._is_still()
+        still = np.asarray(
+            (self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown)
+        )
         begins = not self.faulty
         room += passed_s * np.abs(qd - last_qd)
         steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room

@@ -91,7 +91,20 @@ class HybridExecutor(WristLevel):
             write.command.due = 0
             self._moving[:] = 0.0
         self._report(read, write.status)
-        self._report_force(read.compliance.value, write.force)
+        force = write.force
+        watch = self._watch
+        force.echo = read.compliance.value.id
+        force.operator = read.compliance.value.operator
+        force.sensed = watch.sensed
+        force.wrench = watch.felt
+        force.offset = self._law.offset
+        force.struck = watch.struck
+        force.axis = watch.axis
+        force.wanted = 0.0 if watch.task is None else watch.task.wanted
+        force.selected = 0 if watch.task is None else watch.task.selected
+        resting = State.IDLE if watch.task is None else State.EXECUTING
+        force.state = State.HOLDING if watch.reason else resting
+        force.reason = watch.reason
 
     def _begin(self, position: Array, tick: int) -> None:
         """Begin at rest, without a difference from the motion."""
@@ -137,18 +150,3 @@ class HybridExecutor(WristLevel):
             status.state = State.HOLDING
         else:
             status.state = State.IDLE if self._reference.holding else State.EXECUTING
-
-    def _report_force(self, compliance: Message, force: Message) -> None:
-        watch = self._watch
-        force.echo = compliance.id
-        force.operator = compliance.operator
-        force.sensed = watch.sensed
-        force.wrench = watch.felt
-        force.offset = self._law.offset
-        force.struck = watch.struck
-        force.axis = watch.axis
-        force.wanted = 0.0 if watch.task is None else watch.task.wanted
-        force.selected = 0 if watch.task is None else watch.task.selected
-        resting = State.IDLE if watch.task is None else State.EXECUTING
-        force.state = State.HOLDING if watch.reason else resting
-        force.reason = watch.reason

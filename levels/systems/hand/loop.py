@@ -81,7 +81,12 @@ class HandLoop(Executor):
         self.orders.take(read.operator)
         if not self._met:
             if not hand.is_there:
-                self._wait(write.status)
+                status = write.status
+                status.driven = self.driven
+                status.sensed = -1
+                status.holding = True
+                status.stopped = True
+                status.reason = NO_HAND_YET
                 return
             self._met = True
             self.meet(read, hand.value)
@@ -126,13 +131,6 @@ class HandLoop(Executor):
                 self.command.copy_from(command.value)
                 self.commanded = True
                 self._taken = tick
-
-    def _wait(self, status: Message) -> None:
-        status.driven = self.driven
-        status.sensed = -1
-        status.holding = True
-        status.stopped = True
-        status.reason = NO_HAND_YET
 
     def _kept(self, read: Ports, tick: int) -> str:
         """Return why the hand does not follow the level above; empty: it does."""

@@ -58,20 +58,19 @@ class JointTorques(CommandsAbove):
             for board in self.oldest:
                 value = commands[board].value
                 if self._messages.get(board) is not value:
-                    self._see(board, value)
+                    # Find the numbers of a message: those of the next ones of its board are
+                    # in the same place.
+                    self._messages[board] = value
+                    views = [
+                        numbers(m, "torque", "payload_offset") for m in self._messages.values()
+                    ]
+                    self._memory, self._begins = one_view(*views)
         return why
 
     def add_up(self) -> None:
         """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""
         self.rests_on = max(message.operator for message in self._messages.values())
         self.moves = self._add_up(self._sum, self.wanted.table, self._memory, self._begins)
-
-    def _see(self, board: str, message: Message) -> None:
-        """Find the numbers of a message: those of the next ones of its board are in the same
-        place."""
-        self._messages[board] = message
-        views = [numbers(m, "torque", "payload_offset") for m in self._messages.values()]
-        self._memory, self._begins = one_view(*views)
 
 
 @compiled
