@@ -34,7 +34,7 @@ from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.lateness import judge_lost_cycles
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.neighbours import conflicts, holders, occupied, placed
+from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.patience import Patience, RackAwaited, await_opened
 from rack.boards.crate.recovery import HostBoards, LostBoards, Recovery, Supervision
 from rack.boards.crate.requests import (
@@ -174,7 +174,7 @@ class Rack:
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
         # Reported first, because the next steps take long on occupied cores.
-        for note in shared or occupied(held):
+        for note in shared:
             self._journal.add("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
