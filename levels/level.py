@@ -92,6 +92,7 @@ from rack.backplane.mailbox.queue import ALL
 from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
+from rack.levels.compiled import preload
 from rack.levels.errors import ProgramError
 from rack.levels.faults import Fault
 from rack.levels.operator import Commands, Operation
@@ -282,8 +283,7 @@ class LevelSection:
     def preload(cls) -> None:
         """Load what every process of the level needs, such as compiled code. Called once, before
         the crate forks."""
-        for module in cls.preloads:
-            module.preload()
+        preload(*cls.preloads)
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled, compiled_for
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import SCENE, WORLD_MODEL
 from rack.levels.tables import Positive, Table, read_params
@@ -58,19 +58,7 @@ class WorldModel(Executor):
     @classmethod
     def preload(cls) -> None:
         """Load the compiled function."""
-        poses = np.zeros((1, 7))
-        rules = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-        vectors = np.zeros((1, 3))
-        find_motion.load()(
-            vectors,
-            np.zeros((1, 4)),
-            poses,
-            poses,
-            np.zeros(1, dtype=bool),
-            np.zeros(1),
-            vectors,
-            rules,
-        )
+        find_motion.preload()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Update from a new scene; when one is missing, keep poses and set velocities to zero."""
@@ -104,7 +92,9 @@ class WorldModel(Executor):
         return self._find(scene.position, scene.quaternion, *memory, velocity, rules)
 
 
-@compiled
+@compiled_for(
+    "f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8[:,::1], UniTuple(f8, 6)"
+)
 def find_motion(
     position: Array,  # (bodies, 3), m: as sensed
     quaternion: Array,  # (bodies, 4)

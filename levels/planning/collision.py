@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled, compiled_for
 from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
@@ -309,7 +309,10 @@ def farthest(
     return float(np.max(reached))
 
 
-@compiled
+@compiled_for(
+    "i8, i8, i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], i4[::1], i4[:,:], "
+    "f8[:], i8, f8, f8[:,::1]"
+)
 def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     model: int,  # address
     data: int,  # address
@@ -355,13 +358,3 @@ def carry(pose: Array, tool: Array, turned: Array, offset: Array) -> None:
     quaternion = np.empty(4)
     mju_mat_to_quat(quaternion.ctypes.data, turned.ctypes.data)
     mju_mul_quat(pose[3:].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data)
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
-    none = np.zeros(0)
-    path = np.zeros((0, 0))
-    arrays = np.zeros(0, dtype=int), none, np.zeros(3), np.zeros(9), np.zeros(7), path
-    room = contact_views(data.model, data)
-    first_blocked.load()(data.model._address, data._address, *arrays, *room, -1, 0.0, path)

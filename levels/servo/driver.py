@@ -11,6 +11,7 @@ import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import BY_DEMAND
+from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import (
     Arm,
@@ -26,7 +27,7 @@ from rack.levels.arm import (
 )
 from rack.levels.arm.faulty import STEPS
 from rack.levels.arm.guard import kept_bounds
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.errors import RobotError
 from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
 from rack.levels.messages import SCENE, Error
@@ -138,10 +139,8 @@ class ArmDriver(Executor):
         """Load the compiled functions of the level and of its arm."""
         super().preload()
         preload()
-        for module in (sensor_monitor, actuator_monitor):
-            module.preload()
-        joints = np.zeros((3, 1))
-        show.load()(np.zeros(8), joints[0], joints[0], joints, joints, joints[0], 0.0, 0.0, 0.0)
+        compiled.preload(sensor_monitor, actuator_monitor)
+        show.preload()
 
     @classmethod
     def misfits(
@@ -440,7 +439,7 @@ def numbers(message: Message, first: str, last: str) -> Array:
     return np.frombuffer(message.raw[begin:end])
 
 
-@compiled
+@compiled_for("f8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8, f8, f8")
 def show(
     status: Array,  # (5 joints + 3,): set, its fields from `position` to `grip_force`
     state: Array,  # (3 joints,): set, its fields from `position` to `doubt`

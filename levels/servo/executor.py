@@ -14,7 +14,7 @@ from rack.levels.level import Input, LevelContext, Ports, Verdict
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SERVO_PLAN, SERVO_STATUS
 from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.dynamics import Terms
-from rack.levels.servo import control, reference
+from rack.levels.servo import control, curves, reference
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams, SetPointLaw
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver
@@ -49,7 +49,7 @@ class ServoExecutor(ArmDriver):
         **dict.fromkeys(DRIVES, ()),
     }
     params: ClassVar[type[ServoParams]] = ServoParams
-    preloads = (control, reference)
+    preloads = (control, curves, reference)
     gives_set_points = True
 
     def __init__(self, context: LevelContext) -> None:

@@ -13,7 +13,7 @@ from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.servo.control import ArmParams
@@ -338,7 +338,7 @@ class SensorMonitor:
         self._rung.clear()
 
 
-@compiled
+@compiled_for("f8[:,::1], b1, f8[::1], f8[::1], f8[:,::1], f8, f8, f8, b1, b1")
 def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     table: Array,  # (19, joints): rows as below
     coarse: bool,
@@ -412,11 +412,3 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
         last_q[j] = position[j] = q[j]
         last_qd[j] = velocity[j] = qd[j]
     return TAKEN
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    joints = np.zeros(1)
-    check.load()(
-        np.zeros((19, 1)), False, joints, joints, np.zeros((2, 1)), 0.0, 0.0, 0.0, False, False
-    )

@@ -11,7 +11,7 @@ from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Payload
-from rack.levels.servo import reference
+from rack.levels.servo import curves, reference
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.force.compliance import ComplianceWatch
 from rack.levels.systems.force.hybrid_law import HybridGains, HybridLaw
@@ -54,7 +54,7 @@ class HybridExecutor(WristLevel):
         "force": Output(FORCE_STATUS, rests_on="wrench"),
     }
     params = HybridGains
-    preloads = (dynamics, reference)
+    preloads = (curves, dynamics, reference)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
 from rack.levels.servo.driver import numbers
@@ -82,7 +82,10 @@ class JointLaw:
             self.clipped += 1
 
 
-@compiled
+@compiled_for(
+    "UniTuple(f8, 2), UniTuple(f8, 2), f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], "
+    "f8[:,::1], f8[::1], f8[::1]"
+)
 def set_joint_torques(
     gains: tuple[float, float],  # stiffness, 1/s2, and damping, 1/s
     times: tuple[float, float],  # s: by which the sample, and the target, are taken on
@@ -120,12 +123,3 @@ def set_joint_torques(
             torque[j] = np.minimum(np.maximum(needed, -limit[j]), limit[j])  # NaN stays
             clipped = clipped or needed != torque[j]
     return clipped
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    joint = np.zeros(1)
-    table = np.zeros((4, 1))
-    set_joint_torques.load()(
-        (0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], table[:1], joint, joint
-    )

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
 from rack.levels.servo.driver import numbers
@@ -104,7 +104,9 @@ class TendonLaw:
             self.clipped += 1
 
 
-@compiled
+@compiled_for(
+    "UniTuple(f8, 4), UniTuple(f8, 2), f8[:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1]"
+)
 def set_tensions(
     # Mean tension, N, lead, share of a cycle in the lag, largest trim, N.
     numbers: tuple[float, float, float, float],
@@ -147,12 +149,3 @@ def set_tensions(
             reached[row, j] += share * (early - reached[row, j])
             tension[row, j] = np.minimum(np.maximum(early + trim[row, j], least[j]), most[j])
     return clipped
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    numbers = np.zeros(4)
-    pair = np.zeros((2, 1))
-    set_tensions.load()(
-        (0.0,) * 4, (0.0,) * 2, np.zeros((4, 1)), np.zeros((3, 2, 1)), numbers, numbers[:1], pair
-    )

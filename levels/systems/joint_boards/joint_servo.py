@@ -16,7 +16,7 @@ from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
-from rack.levels.servo import reference
+from rack.levels.servo import curves, reference
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import numbers
@@ -69,7 +69,7 @@ class JointServo(Executor):
         Operation.SET: (),
     }
     params = JointServoParams
-    preloads = (dynamics, reference, joint_control)
+    preloads = (curves, dynamics, reference, joint_control)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm.above import CommandsAbove
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext, Reading
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
@@ -73,7 +73,7 @@ class JointTorques(CommandsAbove):
         self.moves = self._add_up(self._sum, self.wanted.table, self._memory, self._begins)
 
 
-@compiled
+@compiled_for("f8[::1], f8[:,::1], f8[::1], i8[::1]")
 def add_up(
     total: Array,  # (3 joints + 5,): set
     motion: Array,  # (3, joints), rad, rad/s: set, but for the accelerations
@@ -92,9 +92,3 @@ def add_up(
         motion[1, j] = total[2 * joints + j]
         moves = moves or motion[1, j] != 0.0
     return moves
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    numbers = np.zeros(8)
-    add_up.load()(numbers, np.zeros((3, 1)), numbers, np.zeros(0, dtype=np.int64))
