@@ -12,8 +12,6 @@ are touched, and touched here by kind: memory of the process itself where it is 
 the crate has used them, the segment whole.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import mmap

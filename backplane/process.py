@@ -1,7 +1,5 @@
 """Processes: alive or not, on which core, at which priority."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os

@@ -7,8 +7,6 @@
 - `CheckpointError`: a state that cannot be kept, or a checkpoint that cannot be continued.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any

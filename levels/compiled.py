@@ -11,8 +11,6 @@ damaged file, runs code with flipped bits, and notices a change in the function,
 it calls.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import pickle

@@ -10,8 +10,6 @@
   reason.
 """
 
-from __future__ import annotations
-
 
 class LevelError(Exception):
     """Root of every error this package raises; its text is one line for the user."""

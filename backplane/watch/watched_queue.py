@@ -5,8 +5,6 @@ Silence proves nothing, since a queue is written on demand. Only a writer found 
 counts as lost.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from rack.backplane.mailbox.mailbox import Reading

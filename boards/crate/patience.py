@@ -1,8 +1,6 @@
 """Waits, with a line to the user when they take long: during a launch, and in lockstep for another
 rack."""
 
-from __future__ import annotations
-
 import math
 import time
 

@@ -1,7 +1,5 @@
 """The layer next to an arm: positions of the joints, from what its drives give."""
 
-from __future__ import annotations
-
 from rack.levels.algebra import Array
 from rack.levels.arm.arm import Arm, JointTarget, Sensed
 from rack.levels.level import Finding

@@ -1,7 +1,5 @@
 """What a `[robot]` table may leave to its model: joints, tool, home."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

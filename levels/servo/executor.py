@@ -1,7 +1,5 @@
 """The executor of the servo level: in every cycle torques for the arm, or a stop."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """The planner of the servo level: the arm's inertia for the coming cycles."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Fields that the messages of many systems have: numbers, flags, ticks, and values by joint."""
 
-from __future__ import annotations
-
 from rack.backplane.message import Field
 
 

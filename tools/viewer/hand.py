@@ -1,7 +1,5 @@
 """A hand: joints, tensions and tip forces by finger, as curves."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rack.levels.robot.hand import Hand

@@ -1,7 +1,5 @@
 """Reading a recording back: curves and spans of run.rrd as arrays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

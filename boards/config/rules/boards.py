@@ -1,8 +1,6 @@
 """Boards and host boards: names, neighbours, planners and slots; their rates, the clock, and a
 static schedule."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from graphlib import CycleError, TopologicalSorter

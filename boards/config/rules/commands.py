@@ -1,7 +1,5 @@
 """Operator commands: what a level takes, with which goal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Faults: whether their kind, their target and their time fit each other and the rack."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 

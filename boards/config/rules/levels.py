@@ -1,7 +1,5 @@
 """What the levels' classes demand of their boards, and what arm and scene must be for them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 from pydantic import ValidationError

@@ -1,7 +1,5 @@
 """Mailboxes: who writes and reads them, on which side of the rack, and how they are shared."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from rack.backplane.layout import BY_TICKS

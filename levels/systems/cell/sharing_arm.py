@@ -1,8 +1,6 @@
 """The simulated arm in a cell whose bodies other simulations may move: see
 `rack.levels.systems.cell.shared_bodies`."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

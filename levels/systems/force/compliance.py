@@ -1,8 +1,6 @@
 """What a level of hybrid control makes of a `COMPLIANCE` and of the contact: axes of force, guards,
 reasons to rest."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The torques of several boards as those of one arm, while all of them are fresh."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -5,8 +5,6 @@ A motion is a smooth stream of set points for the boards that servo the joints, 
 the arm.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rack.backplane.message import Field, Message, command, status

@@ -1,7 +1,5 @@
 """One trial: a run of the whole task with its faults, and everything that its judgement needs."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
