@@ -4,10 +4,9 @@ planner."""
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.compiled import compiled, compiled_for
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import SCENE, WORLD_MODEL
@@ -98,7 +97,7 @@ def find_motion(
     quaternion: Array,  # (bodies, 4)
     last: Array,  # (bodies, 7): the same in the last scene; set to this one
     rest: Array,  # (bodies, 7): where bodies rested last
-    moving: NDArray[np.bool_],  # (bodies,)
+    moving: Mask,  # (bodies,)
     slow_s: Array,  # (bodies,): time for which they have been slow
     velocity: Array,  # (bodies, 3), m/s: set; zero for bodies at rest
     rules: tuple[float, float, float, float, float, float],

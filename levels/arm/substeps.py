@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
@@ -40,7 +40,7 @@ class Substeps(NamedTuple):
     contacts: NDArray[np.int32]  # (1,), their number
     geoms: NDArray[np.int32]  # (room, 2), of the contacts
     distance: Array  # (room,), m
-    touch: NDArray[np.bool_]  # (ngeom, ngeom), True where a contact is unintended
+    touch: Mask  # (ngeom, ngeom), True where a contact is unintended
 
     @property
     def seen(self) -> Array:
@@ -98,7 +98,7 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     contacts: NDArray[np.int32],
     geoms: NDArray[np.int32],
     distance: Array,
-    touch: NDArray[np.bool_],
+    touch: Mask,
 ) -> int:
     """Make the steps of a tick from number `begin` on, up to one that needs a closer look; the tick
     ends at `end_s`.

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Ints
 from rack.levels.compiled import compiled, compiled_for
 from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
@@ -252,7 +252,7 @@ class CollisionChecker:
         reached, opening = max(found)
         return float(opening) if reached > found[0][0] + self._margin else None
 
-    def _carriers(self) -> NDArray[np.int_]:
+    def _carriers(self) -> Ints:
         """Return the geoms of the fixed bodies that carry the arm: some links are always near
         them."""
         m = self.cell.model
@@ -285,14 +285,12 @@ class CollisionChecker:
             self._require(touched, supports, to_supports)
             self._require(gripper, supports, self._margin)
 
-    def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:
+    def _require(self, some: Ints, others: Ints, distance: float) -> None:
         self._required[some[:, None], others] = distance
         self._required[others[:, None], some] = distance
 
 
-def farthest(
-    model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int_], axis: ArrayLike
-) -> float:
+def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike) -> float:
     """Return how far bounding boxes of geoms reach along `axis` (3,), a unit vector, from the
     origin, m."""
     # A box's extent along an axis: its half sizes times the axis in its own frame.

@@ -6,8 +6,8 @@ from itertools import chain
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot.model import compile_spec, listed, load_spec
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -41,7 +41,7 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
 
 def find_all(
     model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str
-) -> NDArray[np.int_]:
+) -> Ints:
     """Return the ids of named elements. Raises `RobotError`."""
     return np.array([find(model, kind, name, place) for name in names], dtype=int)
 
@@ -77,7 +77,7 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
                 yield str(error)
 
 
-def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None) -> int:
+def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
     """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm; None: on
     any.
 
@@ -89,9 +89,7 @@ def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None)
     return tool
 
 
-def gripper_joint(
-    model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.bool_]
-) -> int | None:
+def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: Mask) -> int | None:
     """Return the id of the gripper's joint; None: the arm has no gripper. Raises `RobotError`."""
     if robot.gripper is None:
         return None
@@ -105,7 +103,7 @@ def gripper_joint(
     return joint
 
 
-def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> NDArray[np.bool_]:
+def hand(model: mujoco.MjModel, gripper: int | None, arm: Ints) -> Mask:
     """Mark (nbody,) the body that carries the gripper's linkage, and its descendants.
 
     The driven joint may be anywhere in the linkage; the joints `arm` are not part of it.
@@ -122,7 +120,7 @@ def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> N
     return below(model, model.body_parentid[[body]])
 
 
-def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+def free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the ids of the objects' free joints. Raises `RobotError` for a body without one."""
     joints = model.body_jntadr[bodies]
     for body, joint in zip(bodies, joints, strict=True):
@@ -134,7 +132,7 @@ def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.i
     return np.asarray(joints, dtype=int)
 
 
-def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+def mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the mocap ids of the obstacles. Raises `RobotError` for a body without one."""
     for body in bodies:
         if model.body_mocapid[body] < 0:
@@ -145,7 +143,7 @@ def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int
     return np.asarray(model.body_mocapid[bodies], dtype=int)
 
 
-def below(model: mujoco.MjModel, roots: NDArray[np.int_]) -> NDArray[np.bool_]:
+def below(model: mujoco.MjModel, roots: Ints) -> Mask:
     """Mark (nbody,) the bodies `roots` and their descendants."""
     marked = np.zeros(model.nbody, dtype=bool)
     marked[roots] = True
@@ -154,7 +152,7 @@ def below(model: mujoco.MjModel, roots: NDArray[np.int_]) -> NDArray[np.bool_]:
     return marked
 
 
-def geoms_of(model: mujoco.MjModel, bodies: NDArray[np.bool_]) -> NDArray[np.int_]:
+def geoms_of(model: mujoco.MjModel, bodies: Mask) -> Ints:
     """Return the ids of the geoms on the bodies marked (nbody,)."""
     return np.flatnonzero(bodies[model.geom_bodyid])
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.robot.model_file import ModelReader
 from rack.levels.robot.state import SLEEP
@@ -143,7 +143,7 @@ def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
     spec.add_key(name="start")
 
 
-def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], NDArray[np.float64]]:
+def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Array]:
     """Replace the drives of the arm's joints in `spec`; return the motors' names and torque limits
     (joints,), N m.
 
@@ -273,7 +273,7 @@ def drive_limit(actuator: mujoco.MjsActuator) -> float:
     return min((x for x in limits if x > 0), default=0.0)
 
 
-def reach(limited: mujoco.mjtLimited, span: NDArray[np.float64]) -> float:
+def reach(limited: mujoco.mjtLimited, span: Array) -> float:
     """Return the largest symmetric range within `span`; 0: there is none."""
     if limited == mujoco.mjtLimited.mjLIMITED_FALSE or not span[0] < span[1]:
         return 0.0

@@ -4,16 +4,13 @@ return the same way."""
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.operator import DRIVES, SETTINGS, Commands, Operation, Orders, joints_of
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
-
-Mask = NDArray[np.bool_]
 
 
 class OperatorControl:

@@ -5,18 +5,15 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.arm import Sensed
 from rack.levels.compiled import compiled_for
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.servo.control import ArmParams
-
-Mask = NDArray[np.bool_]
 
 FIT_RAD = 5e-5
 """Permitted difference between a position and the integrated velocities: 20 times that of faultless
@@ -306,7 +303,7 @@ class SensorMonitor:
         slower = np.copysign(np.maximum(speed - self._braking * time_s, 0.0), self.velocity)
         np.copyto(self.velocity, slower, where=joints)
 
-    def _name(self, alarm: Alarm, wrong: Mask, values: Array | NDArray[np.int_]) -> None:
+    def _name(self, alarm: Alarm, wrong: Mask, values: Array | Ints) -> None:
         if wrong.any():
             joint = int(wrong.argmax())
             self._ring(Finding(alarm, joint, float(values[joint])))

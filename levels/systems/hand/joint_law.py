@@ -14,11 +14,10 @@ is taken on to when the torque acts, a valve's lag included, at the velocity sen
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
@@ -40,7 +39,7 @@ class JointGains(Table):
 class JointLaw:
     """Sets the torques of some joints of a hand."""
 
-    def __init__(self, cell: Cell, driven: NDArray[np.bool_], gains: JointGains) -> None:
+    def __init__(self, cell: Cell, driven: Mask, gains: JointGains) -> None:
         """Drive the joints `driven`, (joints,)."""
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(len(driven))

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
+from rack.levels.algebra import Mask
 from rack.levels.level import Executor, LevelContext, Misfits, Ports, Reading
 from rack.levels.operator import BELOW_LOST, HOLDABLE, Orders
 from rack.levels.robot.cell import cell_of
@@ -41,7 +41,7 @@ class HandLoop(Executor):
         self._numbers = [field.name for field in command.fields if field.kind == "f8"]
         self.commanded = False  # there was one
         # (joints,) or (fingers,), as in the status: those of this board.
-        self.driven: NDArray[np.bool_]
+        self.driven: Mask
         self._above = ", ".join(context.above)
         self._period = max(pace.every for pace in context.above.values())
         slowest = max(context.every, *(pace.every for pace in context.below.values()))

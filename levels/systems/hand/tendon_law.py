@@ -18,11 +18,10 @@ time.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
@@ -52,9 +51,7 @@ class TendonLaw:
     """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew
     after a restart."""
 
-    def __init__(
-        self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, context: LevelContext
-    ) -> None:
+    def __init__(self, hand: Hand, driven: Mask, gains: TendonGains, context: LevelContext) -> None:
         """Drive the joints `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
         least = np.full(joints, hand.least + gains.margin)
