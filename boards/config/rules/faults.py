@@ -1,6 +1,6 @@
 """Faults: whether their kind, their target and their time fit each other and the rack."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
@@ -9,7 +9,7 @@ from rack.backplane.mailbox.queue import is_position
 from rack.boards.config.mistakes import at_key
 from rack.boards.config.published import Levels
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 from rack.boards.faults.config import FaultConfig, condition
 from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.levels.tables import RobotConfig
@@ -59,7 +59,7 @@ class FaultRules:
     layout: Layout | None = None
     unspecified: Collection[str] = ()
 
-    def mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Mistakes:
         """Yield every mistake in the fault."""
         # Check that its begin and its end are each given in one way.
         for keys in (("tick", "at", "when"), ("for", "cycles")):
@@ -87,7 +87,7 @@ class FaultRules:
             except LookupError as error:
                 yield self._mistake("when", str(error.args[0]))
 
-    def _of_kind(self, kind: Kind) -> Iterator[Mistake]:
+    def _of_kind(self, kind: Kind) -> Mistakes:
         if kind.realtime and self.config.clock.mode == "lockstep":
             why = (
                 f"{kind.name} needs real time: in lockstep time waits for every task; run without"
@@ -114,7 +114,7 @@ class FaultRules:
             )
         yield from self._parameters(kind)
 
-    def _parameters(self, kind: Kind) -> Iterator[Mistake]:
+    def _parameters(self, kind: Kind) -> Mistakes:
         known = {parameter.name: parameter for parameter in kind.parameters}
         for name, value in self.fault.parameters.items():
             if name not in known:
@@ -126,7 +126,7 @@ class FaultRules:
             if parameter.default is None and parameter.name not in self.fault.parameters:
                 yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
 
-    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Iterator[Mistake]:
+    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
         """Check that the task can be struck by such a fault."""
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
@@ -168,7 +168,7 @@ class FaultRules:
         is_known = place.partition(".")[0].strip() not in self.unspecified
         return self.layout if is_known else None
 
-    def _mailboxes(self, kind: Kind, layout: Layout) -> Iterator[Mistake]:
+    def _mailboxes(self, kind: Kind, layout: Layout) -> Mistakes:
         every = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
         # The position of a queue's reader is not written through a port.
         written = {
@@ -206,7 +206,7 @@ class FaultRules:
                 )
                 yield self._mistake("mailbox", why)
 
-    def _without(self, keys: Iterable[str], why: str) -> Iterator[Mistake]:
+    def _without(self, keys: Iterable[str], why: str) -> Mistakes:
         """Check that none of these keys is given."""
         for key in keys:
             if self._value(key) is not None:
