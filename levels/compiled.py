@@ -70,7 +70,8 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
             from numba.core.sigutils import normalize_signature
 
             machine: Any = self.load()
-            machine.compile(normalize_signature(f"({self._types},)")[0])
+            types, _ = normalize_signature(f"({self._types},)")  # type: ignore[no-untyped-call]
+            machine.compile(types)
 
     def source(self) -> Iterator[bytes]:
         """Yield what determines the machine code: instructions, constants, and the values of names,

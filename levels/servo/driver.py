@@ -2,8 +2,8 @@
 report."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,17 @@ from rack.levels.arm.faulty import STEPS
 from rack.levels.arm.guard import kept_bounds
 from rack.levels.compiled import compiled_for
 from rack.levels.errors import RobotError
-from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
+from rack.levels.level import (
+    Demand,
+    Executor,
+    Fault,
+    Finding,
+    LevelContext,
+    Misfits,
+    Output,
+    Ports,
+    Reading,
+)
 from rack.levels.messages import SCENE, Error
 from rack.levels.operator import Operation, Orders
 from rack.levels.robot.cell import cell_of, sensed_by
@@ -143,7 +153,7 @@ class ArmDriver(Executor):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield a hand, whose tendons have a board of another kind, and an arm whose samples are
         too coarse to guard it."""
         robot = context.robot

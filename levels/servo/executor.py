@@ -1,6 +1,6 @@
 """The executor of the servo level: in every cycle torques for the arm, or a stop."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.level import Input, LevelContext, Ports, Verdict
+from rack.levels.level import Input, LevelContext, Misfits, Ports, Verdict
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SERVO_PLAN, SERVO_STATUS
 from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.dynamics import Terms
@@ -77,7 +77,7 @@ class ServoExecutor(ArmDriver):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield control modifications that do not suit the law, and what `ArmDriver` yields."""
         yield from super().misfits(context, above, below)
         yield from misfits_of(context)
