@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import inspect
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import pairwise
@@ -371,12 +371,19 @@ class RobotConfig(Table):
     """keys of this table whose values were guessed, as in gripper.force: an arm that is not
     simulated is not enabled before each is confirmed, by removing it here"""
 
-    @property
-    def per_joint(self) -> dict[str, tuple[Any, ...] | None]:
-        """The lists with one value per joint, by key; None: not given."""
+    def misfits(self) -> Iterator[tuple[str, Any, str]]:
+        """Yield key, values and reason for every list without one value per joint."""
+        joints = len(self.joints)
         keys = ("home", "start", "velocity", "acceleration", "jerk", "torque", "position")
         lists = {key: getattr(self, key) for key in keys}
-        return {**lists, "calibration.offset": self.calibration.offset}
+        lists["calibration.offset"] = self.calibration.offset
+        for key, values in lists.items():
+            if values is not None and len(values) != joints:
+                yield key, values, f"{len(values)} values; permitted: {joints}, one per joint"
+        for key, values in self.sensors or ():
+            if isinstance(values, tuple) and len(values) != joints:
+                permitted = f"one for all joints, or {joints}, one per joint"
+                yield f"sensors.{key}", values, f"{len(values)} values; permitted: {permitted}"
 
     @field_validator("guessed")
     @classmethod

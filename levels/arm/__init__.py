@@ -3,8 +3,7 @@ two."""
 
 from rack.levels import compiled
 from rack.levels.arm import drives, poses, substeps
-from rack.levels.arm.arm import Arm, DriveState, JointTarget, Link, Sensed, find_arm
-from rack.levels.arm.calibration import CalibratedLink
+from rack.levels.arm.arm import Arm, CalibratedLink, DriveState, JointTarget, Link, Sensed, find_arm
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.present import PresentLink

@@ -90,16 +90,8 @@ def check_number(joints: Sequence[str]) -> None:
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
     """Raise `RobotError` for a list of the wrong length, and for a joint that is missing, not
     scalar or named twice."""
-    wanted = len(robot.joints)
-    for name, values in robot.per_joint.items():
-        if values is not None and len(values) != wanted:
-            raise RobotError(f"robot.{name}: {len(values)} values; one per joint: {wanted}")
-    for name, given in robot.sensors or ():
-        if isinstance(given, tuple) and len(given) != wanted:
-            raise RobotError(
-                f"robot.sensors.{name}: {len(given)} values; one for all joints, or one per joint:"
-                f" {wanted}"
-            )
+    for key, _, why in robot.misfits():
+        raise RobotError(f"robot.{key}: {why}")
     for name in robot.joints:
         joint = spec.joint(name)
         if joint is None:

@@ -103,20 +103,12 @@ def robot(wiring: Wiring) -> Mistakes:
     robot = wiring.config.robot
     if robot is None:
         return
-    joints = len(robot.joints)
     try:
         check_regular_file(robot.model, MAX_MODEL_BYTES)
     except OSError as error:
         yield Mistake("robot.model", str(robot.model), f"cannot be read: {error.strerror}")
-    for key, values in robot.per_joint.items():
-        if values is not None and len(values) != joints:
-            yield Mistake(
-                f"robot.{key}", values, f"{len(values)} values; permitted: {joints}, one per joint"
-            )
-    for key, values in robot.sensors or ():
-        if isinstance(values, tuple) and len(values) != joints:
-            why = f"{len(values)} values; permitted: one for all joints, or {joints}, one per joint"
-            yield Mistake(f"robot.sensors.{key}", values, why)
+    for key, values, why in robot.misfits():
+        yield Mistake(f"robot.{key}", values, why)
     if robot.hand is not None and robot.interface != "torque":
         why = "tendons of a hand take tensions; permitted: torque"
         yield Mistake("robot.interface", robot.interface, why)
