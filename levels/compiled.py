@@ -2,7 +2,8 @@
 
 A few hundred numpy calls on six numbers were most of a servo cycle: each costs a microsecond,
 whatever it computes. A function marked `@compiled` is ordinary numpy code; called directly it runs
-as such, the reference of its tests. Alternatives considered: a C extension (users would need a
+as such, the reference of its tests. One marked with its types, `@compiled_for`, can be loaded
+before a run: see `Executor.preload`. Alternatives considered: a C extension (users would need a
 compiler), `jit` at import (numba takes 0.4 s to import, and most commands compute nothing).
 
 Without `fastmath` the order of operations is the source's, so the bits do not depend on the

@@ -274,7 +274,8 @@ class LevelSection:
     """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it
     by itself."""
     preloads: ClassVar[tuple[ModuleType, ...]] = ()
-    """Modules of which every process of the level needs the compiled functions."""
+    """Modules of which every process of the level needs the functions marked `compiled_for`: see
+    `rack.levels.compiled`."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
