@@ -22,6 +22,8 @@ Names are imported on first use: numpy takes a tenth of a second, which `rack li
 need not wait for.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
 from rack.backplane.exports import on_first_use

@@ -5,6 +5,8 @@ blocks, trace rings and alarm rings of its tasks, then the mailboxes that it wri
 from the layout alone.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec

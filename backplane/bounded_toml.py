@@ -1,6 +1,8 @@
 """TOML text from outside, parsed within bounds: the time of a parse grows with the length of the
 text alone."""
 
+from __future__ import annotations
+
 import re
 import tomllib
 from typing import Any

@@ -3,6 +3,8 @@
 Every process of the user may write there, so that a number may be any.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from enum import IntEnum
 from math import isfinite

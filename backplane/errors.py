@@ -11,6 +11,8 @@
 - `EmergencyStopError`: a reset of the emergency stop while an input is bad.
 """
 
+from __future__ import annotations
+
 
 class BackplaneError(Exception):
     """Root of every error this package raises; its text is one line for the user."""

@@ -1,6 +1,8 @@
 """Exports of a package, imported on first use: a user of one name does not wait for the libraries
 of the others."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any

@@ -6,6 +6,8 @@ and end: all tasks of a tick see the same faults, and a run in lockstep repeats 
 holds numbers; `boards` knows the meaning of kinds and parameters.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum

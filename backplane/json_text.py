@@ -3,6 +3,8 @@
 JSON has no NaN and no infinity, and programs that read JSON refuse a file that holds one.
 """
 
+from __future__ import annotations
+
 import json
 from math import isfinite
 from typing import Any

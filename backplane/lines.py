@@ -1,6 +1,8 @@
 """The utility lines of the bus as shared words: SYSFAIL, SYSRESET, ACFAIL, and the emergency
 stop."""
 
+from __future__ import annotations
+
 from rack.backplane.errors import EmergencyStopError
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System

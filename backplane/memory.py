@@ -12,6 +12,8 @@ are touched, and touched here by kind: memory of the process itself where it is 
 the crate has used them, the segment whole.
 """
 
+from __future__ import annotations
+
 import ctypes
 import gc
 import mmap

@@ -11,6 +11,8 @@ check in a microsecond. With a lease the client stays after its command was issu
 sees when it ends, or is not `heard` any more.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """Processes: alive or not, on which core, at which priority."""
 
+from __future__ import annotations
+
 import ctypes
 import errno
 import os

@@ -1,5 +1,7 @@
 """Names of racks. A rack and its segment have the same name."""
 
+from __future__ import annotations
+
 import re
 import unicodedata
 from collections.abc import Container

@@ -4,6 +4,8 @@ Files that a user or another program names may be FIFOs, which block whoever ope
 which act or never end, or too large for memory.
 """
 
+from __future__ import annotations
+
 import errno
 import os
 import stat

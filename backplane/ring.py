@@ -1,5 +1,7 @@
 """Reading a ring in blocks, for the host side: it never slows the writer down."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -5,6 +5,8 @@ resolved config in the segment itself. It gets its name only when it is complete
 earlier leaves nothing in /dev/shm, and no process ever finds half a segment.
 """
 
+from __future__ import annotations
+
 import json
 import mmap
 import os

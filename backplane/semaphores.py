@@ -9,6 +9,8 @@ The C library can wait by CLOCK_MONOTONIC (since glibc 2.30). Alternatives consi
 through ctypes, and an eventfd with `poll`; both wake up more slowly.
 """
 
+from __future__ import annotations
+
 import ctypes
 import time
 from collections.abc import Sequence

@@ -10,6 +10,8 @@ A task traces a cycle after its last write. The trace therefore also proves thin
 back. Age alone proves nothing, since the task may have been preempted.
 """
 
+from __future__ import annotations
+
 from enum import IntFlag
 from functools import partial
 from struct import Struct

@@ -4,6 +4,8 @@ Each is an aligned 64-bit integer with one writer, stored and loaded whole throu
 to 'q'. (`struct` packs byte by byte: a reader could see half a number.)
 """
 
+from __future__ import annotations
+
 from enum import IntEnum
 
 

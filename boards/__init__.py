@@ -18,6 +18,8 @@ Names are imported on first use: the crate and its boards import parts of this p
 small.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
 from rack.backplane.exports import on_first_use

@@ -1,5 +1,7 @@
 """Classes of levels by name, as in "package.module:Class", and where they are looked for."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Sequence
 from pathlib import Path

@@ -7,6 +7,8 @@
 - `CheckpointError`: a state that cannot be kept, or a checkpoint that cannot be continued.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """An operator's requests: the level that each addresses, its message, and the command in words."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.checked import as_named, pick

@@ -1,5 +1,7 @@
 """Plain data that the Rack sends to the crate: everything that a process needs to run."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -18,6 +18,8 @@ the same bits on every processor), `rack.levels.robot` (cell, limits, dynamics),
 `world`, `figures`.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
 from rack.backplane.exports import on_first_use

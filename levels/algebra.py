@@ -15,6 +15,8 @@ and sorting of values have one order on all x86-64 processors. Alternatives cons
 fixed too, but twice the time.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import mujoco

@@ -12,6 +12,8 @@ damaged file, runs code with flipped bits, and notices a change in the function,
 it calls.
 """
 
+from __future__ import annotations
+
 import errno
 import os
 import pickle

@@ -10,6 +10,8 @@
   reason.
 """
 
+from __future__ import annotations
+
 
 class LevelError(Exception):
     """Root of every error this package raises; its text is one line for the user."""

@@ -5,6 +5,8 @@ a step of such a class can then strike it: a new kind needs no change in the lev
 are the project's own.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property

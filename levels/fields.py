@@ -1,5 +1,7 @@
 """Fields that many messages have: numbers, flags, ticks, and values by joint."""
 
+from __future__ import annotations
+
 from rack.backplane.message import Field
 
 

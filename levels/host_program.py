@@ -24,6 +24,8 @@ repeats, if the program depends on its messages, `tick` and `time_s` alone. One 
 elsewhere for 30 s ends the run. For prompts lockstep does not wait.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 

@@ -5,6 +5,8 @@ cell, see `rack.levels.robot.state`). Quaternions are w, x, y, z. Poses are in t
 Simulated time is tick times the clock's period.
 """
 
+from __future__ import annotations
+
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status

@@ -5,6 +5,8 @@ A level that works together with another rack reads it with `Input(PEER, "lan.pe
 whether that rack is there, and how its simulated time lies next to ours.
 """
 
+from __future__ import annotations
+
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType

@@ -1,6 +1,8 @@
 """What a config names as "package.module:Name", imported; also by the names that earlier versions
 had for it."""
 
+from __future__ import annotations
+
 import importlib
 import inspect
 import os

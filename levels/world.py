@@ -1,6 +1,8 @@
 """The world model: global memory of objects and obstacles, updated from sensing, read by every
 planner."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

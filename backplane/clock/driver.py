@@ -11,6 +11,8 @@ the return of a restarted board, all decided by the clock before a tick's first 
 depend on which process is faster.
 """
 
+from __future__ import annotations
+
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable

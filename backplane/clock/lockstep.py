@@ -13,6 +13,8 @@ no other task is released, no message of another one becomes visible, and the cl
 nothing to do: so the executor reads and writes the same.
 """
 
+from __future__ import annotations
+
 import sys
 import time
 from collections.abc import Callable

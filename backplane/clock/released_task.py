@@ -6,6 +6,8 @@ than its release, or it has used so much processor time that it will not end. A 
 processor time is starved.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 from rack.backplane.layout import Layout, TaskSpec

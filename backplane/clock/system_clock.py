@@ -1,5 +1,7 @@
 """The system clock as every board reads it: an integer tick on one absolute grid (eq. 3.7)."""
 
+from __future__ import annotations
+
 from math import inf
 from time import monotonic_ns
 

@@ -15,6 +15,8 @@ of its cycle.
 In lockstep there is no grid: a task that would sleep is woken by a signal.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable
 from time import monotonic_ns, sleep

@@ -7,6 +7,8 @@ count: nothing reads them, and whether they are written before the run ends depe
 mailboxes of host boards do not count either: they are not written at ticks.
 """
 
+from __future__ import annotations
+
 from functools import partial
 from hashlib import blake2b
 

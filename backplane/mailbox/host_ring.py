@@ -10,6 +10,8 @@ and a dead reader raises in the writer), and protocol time-slice (a host board h
 its messages could become visible).
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.layout import SPARE, FieldSpec

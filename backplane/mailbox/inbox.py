@@ -6,6 +6,8 @@ wait; one that arrives when so many wait is lost. All times are ns. Nothing here
 memory: boards, `rack check` and recordings use the same arithmetic.
 """
 
+from __future__ import annotations
+
 import sys
 from collections import deque
 from collections.abc import Iterator, Sequence

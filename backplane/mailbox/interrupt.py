@@ -26,6 +26,8 @@ serves interrupts and keeps the inbox in shared memory (a context switch for eac
 more process that may die).
 """
 
+from __future__ import annotations
+
 from collections import deque
 
 from rack.backplane.address_map import oldest_kept

@@ -11,6 +11,8 @@ message (not a function of ticks alone: protocol `double-buffer`). For the memor
 rely on see `slots`.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Iterator, Sequence
 from enum import IntEnum

@@ -7,6 +7,8 @@ kernel's lock on the mailbox, which ends with its process. An access cut off by 
 error: a verdict, never a hang.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Sequence
 

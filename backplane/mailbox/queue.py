@@ -27,6 +27,8 @@ Alternative considered: a position word in the mailbox's head, without a mailbox
 function of ticks, so whether a queue is full would depend on which process is faster.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from struct import Struct
 

@@ -18,6 +18,8 @@ a write; CRC32 alone, seeded likewise: 32 bits are few for a digest, and on 200 
 times as long.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from struct import Struct
 from time import monotonic_ns

@@ -4,6 +4,8 @@ alarm, never a wait.
 An alarm is raised once per episode: when a condition is found, not in every cycle while it lasts.
 """
 
+from __future__ import annotations
+
 from enum import IntEnum
 from functools import partial
 from os import eventfd_write

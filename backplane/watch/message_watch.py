@@ -7,6 +7,8 @@ after the end of the cycle that made it. The reader may be delayed too. So a mes
 first, then its slot must still be its own (`Slots.keeps`), and only then is the copy judged.
 """
 
+from __future__ import annotations
+
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept

@@ -7,6 +7,8 @@ only when there is something new has a limit of its own, for the age of its info
 reports why nothing comes, and may void what it wrote, or keep it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 from rack.backplane.mailbox.interrupt import BoardInbox

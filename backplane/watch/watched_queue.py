@@ -5,6 +5,8 @@ Silence proves nothing, since a queue is written on demand. Only a writer found 
 counts as lost.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 from rack.backplane.mailbox.mailbox import Reading

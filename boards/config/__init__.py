@@ -13,6 +13,8 @@
 Everything wrong with a config is a `ConfigError`, which reports all mistakes at once.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
 from rack.backplane.exports import on_first_use

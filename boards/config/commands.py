@@ -1,5 +1,7 @@
 """Operator commands: made into requests for the operator table, once their rules are kept."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

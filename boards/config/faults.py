@@ -1,5 +1,7 @@
 """Fault tables made into entries of the fault table, once their rules are kept."""
 
+from __future__ import annotations
+
 from zlib import crc32
 
 from rack.backplane.address_map import CLOCK

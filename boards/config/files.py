@@ -1,6 +1,8 @@
 """Config files: found by name or path, merged with the files that they extend, with absolute
 paths."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches

@@ -1,6 +1,8 @@
 """From the wiring of a rack to its layout: all mailboxes and tasks, as plain data for its
 segment."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """Mistakes that pydantic finds in a single table; those between tables are found by the rules."""
 
+from __future__ import annotations
+
 import difflib
 from collections import Counter
 from collections.abc import Iterable, Iterator

@@ -1,5 +1,7 @@
 """The table of the mailboxes' protocols."""
 
+from __future__ import annotations
+
 from typing import Annotated
 
 from pydantic import Field, StringConstraints

@@ -1,5 +1,7 @@
 """`[record]`: what is kept of a run; by default everything, with checkpoints in lockstep."""
 
+from __future__ import annotations
+
 from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, model_validator

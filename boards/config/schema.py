@@ -5,6 +5,8 @@ and `[board.<name>.params]` may hold is declared by the classes of the levels. I
 unit follows a comma; `rack schema` shows it in a separate column.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self

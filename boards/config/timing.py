@@ -1,5 +1,7 @@
 """From a config to the timing model: budgets, and the model's input record."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 

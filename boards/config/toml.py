@@ -1,5 +1,7 @@
 """TOML text: parsed within limits, modified by `--set key.sub=value`, and written."""
 
+from __future__ import annotations
+
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence

@@ -6,6 +6,8 @@ A port's source is a mailbox, or is relative to its board: "above.command", "bel
 (`rack.boards.config.rules`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,6 +1,8 @@
 """Alarms of tasks and clock as events: with names and units, as text for people and codes for
 programs."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

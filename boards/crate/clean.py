@@ -1,5 +1,7 @@
 """Removal of the remains of killed racks; a rack in use is never removed."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Collection
 from contextlib import suppress

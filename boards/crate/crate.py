@@ -8,6 +8,8 @@ kernel kills them if it ends. It is started as `python -m rack.boards.crate LINE
 descriptors of the line and of the eventfd to which boards write.
 """
 
+from __future__ import annotations
+
 import gc
 import os
 import select

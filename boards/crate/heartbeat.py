@@ -5,6 +5,8 @@ In real time it checks the clock alone, since the clock's watchdog checks the ta
 checks all.
 """
 
+from __future__ import annotations
+
 import time
 
 from rack.backplane.address_map import CLOCK

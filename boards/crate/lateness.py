@@ -4,6 +4,8 @@ Every release without a finished cycle is a skipped cycle, whatever the reason: 
 or its board dead, restarting, or not back before the end of the run.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable
 

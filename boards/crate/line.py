@@ -6,6 +6,8 @@ socket pair. Both ends are processes of this program, one started by the other. 
 reach the sockets, so pickles are safe.
 """
 
+from __future__ import annotations
+
 import os
 import subprocess
 import sys

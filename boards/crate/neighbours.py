@@ -4,6 +4,8 @@ Two real-time boards on one core starve each other, and each rack sees only its 
 in lockstep and tasks at ordinary priority occupy no core: they can wait.
 """
 
+from __future__ import annotations
+
 import os
 import tomllib
 from collections.abc import Mapping

@@ -13,6 +13,8 @@ as under protocol time-slice, so every level reads what it reads in a rack in lo
 same. No clock, no shared memory, no checks and no trace; nobody commands it, and no fault strikes.
 """
 
+from __future__ import annotations
+
 import gc
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence

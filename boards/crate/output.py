@@ -1,6 +1,8 @@
 """What host boards print: lines of bounded length, of each board as many as a run keeps; the others
 are counted."""
 
+from __future__ import annotations
+
 import os
 import re
 from contextlib import suppress

@@ -1,6 +1,8 @@
 """Waits, with a line to the user when they take long: during a launch, and in lockstep for another
 rack."""
 
+from __future__ import annotations
+
 import math
 import time
 

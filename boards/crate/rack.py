@@ -1,5 +1,7 @@
 """The Rack: launches the boards of a config, supervises them, and ends them."""
 
+from __future__ import annotations
+
 import atexit
 import os
 import sys

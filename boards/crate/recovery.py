@@ -5,6 +5,8 @@ host boards, which are started with the run and in real time never waited for. T
 board demands nothing of the arm. The clock admits its return, as it does that of other boards.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple

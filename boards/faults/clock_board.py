@@ -4,6 +4,8 @@ The board itself acts the faults that no task can: signals to processes, forged 
 its own ticks.
 """
 
+from __future__ import annotations
+
 import os
 import random
 import signal

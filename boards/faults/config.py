@@ -1,5 +1,7 @@
 """`[[fault]]` tables: a fault as a user writes it, and the condition that starts it."""
 
+from __future__ import annotations
+
 import re
 from typing import Annotated, Any
 

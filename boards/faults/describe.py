@@ -1,5 +1,7 @@
 """An entry of the fault table in words, and as plain data."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,6 +4,8 @@ A kind's record holds draws made by the functions here; a campaign calls them. T
 draws the same fault.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

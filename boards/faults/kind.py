@@ -10,6 +10,8 @@ Every process of a rack imports the modules of its levels, so all of them know t
 that look at the rack know it as the rack publishes it: see `rack.boards.config.published`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,6 +1,8 @@
 """The project's own kinds of faults, one record each, in the order in which `rack inject --list`
 shows them."""
 
+from __future__ import annotations
+
 from functools import partial
 
 from rack.backplane.watch.alarms import Alarm

@@ -6,6 +6,8 @@ The content is in the writer's own message. Random choices depend only on the fa
 message's release tick, so they repeat.
 """
 
+from __future__ import annotations
+
 import os
 import random
 import signal

@@ -1,6 +1,8 @@
 """What bus adapters have in common: they see the segment itself, and may open something outside the
 rack."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any, ClassVar
 

@@ -1,6 +1,8 @@
 """A host board: one process under ordinary scheduling, which runs a program until that returns or
 the rack ends it."""
 
+from __future__ import annotations
+
 import os
 import signal
 import sys

@@ -1,5 +1,7 @@
 """The bus as a program of the host side sees it: `rack.levels.host_program.Bus`, on a segment."""
 
+from __future__ import annotations
+
 import os
 import time
 from collections.abc import Mapping

@@ -26,6 +26,8 @@ A replay does without host boards: what entered in a recorded run is given out a
 at its tick.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping
 from typing import Any

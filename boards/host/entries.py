@@ -1,6 +1,8 @@
 """The entries of a bridge: what each passes, in which direction, when, and what is counted of
 it."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

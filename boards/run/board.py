@@ -1,5 +1,7 @@
 """A board: one process on one core, from its power-on to the end of the run."""
 
+from __future__ import annotations
+
 import os
 import sys
 import traceback

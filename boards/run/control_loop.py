@@ -6,6 +6,8 @@ coupled). `lock` and `unlock` are inside the mailboxes, since only protocol `loc
 stopwatch keeps time stamps, trace and counts; faults take effect between cycles.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic_ns

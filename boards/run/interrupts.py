@@ -6,6 +6,8 @@ cycle. So reading, t_comm of eq. 3.5, grows by it, and every task below on the s
 waiting. In lockstep, where nothing waits for a processor, it takes no time.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from time import process_time_ns
 from typing import Self

@@ -1,5 +1,7 @@
 """A task's ports on the bus: the readers and writers of its mailboxes, used once per cycle."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 

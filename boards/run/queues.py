@@ -1,5 +1,7 @@
 """A task's ports whose messages its level sends itself: queues, and mailboxes written on demand."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 from rack.backplane.mailbox.mailbox import Reading, Writer

@@ -6,6 +6,8 @@ the trace record, missed deadlines, skipped releases, failed accesses, and the r
 that a release is done.
 """
 
+from __future__ import annotations
+
 from time import monotonic_ns, thread_time_ns
 
 from rack.backplane.clock.system_clock import SystemClock

@@ -1,6 +1,8 @@
 """A task on its board: the common part of the executor's and the planner's loop, and the clock
 guard of fast tasks."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from time import process_time_ns

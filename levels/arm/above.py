@@ -1,6 +1,8 @@
 """The commands of the boards above that drive an arm, or a hand, together: all of them must be
 fresh."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 from rack.levels.level import LevelContext, Reading, Verdict

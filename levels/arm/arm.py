@@ -8,6 +8,8 @@ drives that take set points) or `brake` or neither (the last command stays in fo
 ends the board, which is restarted as after any crash; report a broken arm in `fault` instead.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from enum import IntEnum
 from typing import ClassVar, NamedTuple, Protocol

@@ -1,6 +1,8 @@
 """Parts of the simulated arm's drives: brakes, the limit gate on torques, and encoders of finite
 resolution."""
 
+from __future__ import annotations
+
 import math
 
 import daqp

@@ -4,6 +4,8 @@ motors.
 The steps that act the faults are in `rack.levels.faults`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,6 +1,8 @@
 """What an arm that does not keep its limits by itself is driven through: its samples are judged,
 and torques cut by them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import NamedTuple
 

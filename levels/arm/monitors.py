@@ -1,6 +1,8 @@
 """Monitors of the simulation: limits exceeded and unintended contacts, independent of the code that
 prevents them."""
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray

@@ -1,5 +1,7 @@
 """Whatever a board drives, arm or hand: its time, its counters, and the messages that they fill."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.message import Message

@@ -1,5 +1,7 @@
 """The poses of bodies and tool, from MuJoCo's memory into a `SCENE`, in compiled code."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

@@ -1,6 +1,8 @@
 """Samples of an arm behind a bus are some ticks old: its equation of motion brings them to the
 present."""
 
+from __future__ import annotations
+
 from collections import deque
 from typing import NamedTuple
 

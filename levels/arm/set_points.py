@@ -1,6 +1,8 @@
 """Drives that follow set points of position or velocity: what such set points must pass, and the
 simulated ones."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.watch.alarms import Alarm

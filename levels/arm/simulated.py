@@ -1,5 +1,7 @@
 """The arm and its cell in MuJoCo, with drives that keep the limits by themselves."""
 
+from __future__ import annotations
+
 import math
 from collections import deque
 

@@ -1,6 +1,8 @@
 """The simulation of a cell: the ticks of a plant in MuJoCo, judged at every step, and what moves by
 itself in it."""
 
+from __future__ import annotations
+
 from itertools import pairwise
 from typing import ClassVar
 

@@ -1,5 +1,7 @@
 """The MuJoCo steps of one tick, in compiled code, and the judgement of each."""
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """The executor of the elemental move level: supplies the primitive level with segments."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

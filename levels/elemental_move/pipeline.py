@@ -1,6 +1,8 @@
 """The executor's plans, which wait until their moves are due, and its segments handed down. The
 level's parameters."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,6 +1,8 @@
 """The planner of the elemental move level: a collision-free path for every move, before it is
 due."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import NamedTuple
 

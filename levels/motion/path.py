@@ -1,5 +1,7 @@
 """A path in joint space: straight lines with rounded corners."""
 
+from __future__ import annotations
+
 import math
 from bisect import bisect_right
 from functools import cached_property

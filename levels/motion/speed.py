@@ -1,6 +1,8 @@
 """Limits of a path's parameter s: joint limits seen along the path, and the speeds that they
 permit."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import replace

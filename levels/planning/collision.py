@@ -4,6 +4,8 @@ MuJoCo finds the close pairs of geoms. A matrix of required distances, one entry
 which of them count.
 """
 
+from __future__ import annotations
+
 import copy
 from functools import partial
 

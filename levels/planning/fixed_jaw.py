@@ -6,6 +6,8 @@ along its y axis, meets on one side. Distances are those of MuJoCo's contacts, w
 their hulls: a jaw whose hull slants meets an object with an edge, and that counts.
 """
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 

@@ -6,6 +6,8 @@ considered: mink, which does the same on numpy and a solver of choice, but the b
 products depend on the processor.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 
 import mujoco

@@ -1,6 +1,8 @@
 """The path of one elemental move: inverse kinematics, then a straight tool line or a search in
 joint space."""
 
+from __future__ import annotations
+
 from functools import partial
 
 import numpy as np

@@ -6,6 +6,8 @@ never by time, and every call seeds the random numbers anew: equal arguments giv
 every process.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import mujoco

@@ -7,6 +7,8 @@ linkage, of any kind, gives the force there from the actuator's. If the line mis
 unknown and only the motors are checked.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

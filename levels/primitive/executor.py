@@ -1,6 +1,8 @@
 """The executor of the primitive level: a joint set point every cycle, from paths that its planner
 has timed."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.message import Message, State

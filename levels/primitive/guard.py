@@ -1,6 +1,8 @@
 """The guard checks the remaining path in every cycle; sight checks that the world model is recent
 enough for motion."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.message import Message

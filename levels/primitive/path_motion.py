@@ -1,6 +1,8 @@
 """Motion of the set point along one path: begun, held, resumed, ended; always at rest or on a
 trajectory."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,6 +1,8 @@
 """The planner of the primitive level: times the next path, in the background, while the executor
 moves."""
 
+from __future__ import annotations
+
 from collections.abc import Collection
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Segments of work from the window of the level above, and the executor's memory of them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from math import ceil
 from typing import NamedTuple

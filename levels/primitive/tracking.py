@@ -1,5 +1,7 @@
 """Whether the servo receives and follows set points: motion continues only while it does."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,6 +1,8 @@
 """What an arm can do at rest: how far its tool reaches, what it holds there, and how much torque
 gravity leaves."""
 
+from __future__ import annotations
+
 import copy
 import math
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """The cell: a robot and its surroundings, as one MuJoCo model and the indices into it."""
 
+from __future__ import annotations
+
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache

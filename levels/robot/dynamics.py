@@ -5,6 +5,8 @@ Evaluated on separate data, with contacts and constraints off: a pure function o
 of a simulation. (`qfrc_bias` of a simulation belongs to the state before its last step.)
 """
 
+from __future__ import annotations
+
 import copy
 import math
 from typing import NamedTuple

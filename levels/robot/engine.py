@@ -9,6 +9,8 @@ Of an error that MuJoCo calls fatal (its memory is exhausted) the bindings would
 here it ends the process, as the exception would have ended the board.
 """
 
+from __future__ import annotations
+
 import ctypes
 from collections.abc import Iterator
 from pathlib import Path

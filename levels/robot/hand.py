@@ -5,6 +5,8 @@ can be negative: so it can only pull. The two of a joint pull it opposite ways, 
 do not vary, and turn no other joint: torque = arm (flexor's tension - extensor's).
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

@@ -12,6 +12,8 @@ equal models give equal poses.
 An equality may not tie a joint of the arm: `check_couplings` refuses that.
 """
 
+from __future__ import annotations
+
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,6 +1,8 @@
 """Look up the names of a config in a compiled model. Every mistake is one `RobotError` that lists
 the valid names."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from itertools import chain
 

@@ -1,5 +1,7 @@
 """Fit a model to the servo level: torque motors, integrator, time step, tool, keyframe."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 

@@ -4,6 +4,8 @@ The files are not trusted: every mistake is one `RobotError`, in bounded time an
 gets the text that is checked here, and opens no XML file itself.
 """
 
+from __future__ import annotations
+
 import math
 import struct
 from collections.abc import Iterable, Iterator

@@ -6,6 +6,8 @@ step while they are awake. A simulation restored from this state continues bit f
 awake.
 """
 
+from __future__ import annotations
+
 from copy import copy
 
 import mujoco

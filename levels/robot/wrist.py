@@ -1,6 +1,8 @@
 """The wrist sensor of an arm, as the model describes it: where it is, its range, and the limits on
 contact."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

@@ -1,5 +1,7 @@
 """Judges from the arm's motion whether its motors give the commanded torques."""
 
+from __future__ import annotations
+
 import math
 from functools import partial
 

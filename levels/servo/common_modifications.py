@@ -1,6 +1,8 @@
 """Control modifications for any arm: a dead zone before the law, PD control in its place, a notch
 after it."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

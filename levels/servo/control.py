@@ -1,6 +1,8 @@
 """The servo level's loops: computed torque for the joints, a position loop with limited force for
 the gripper."""
 
+from __future__ import annotations
+
 import math
 from functools import partial
 from typing import Literal

@@ -6,6 +6,8 @@ lowest first, and where the joints rest after it. So one compiled function gives
 of them.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.levels.algebra import Array

@@ -1,6 +1,8 @@
 """The part of a level that drives an arm, whatever it drives it to: sense, decide, drive or brake,
 report."""
 
+from __future__ import annotations
+
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple

@@ -1,6 +1,8 @@
 """Whether the arm is enabled: asks its drives at the start or by an operator's command, and says
 what they wait for."""
 
+from __future__ import annotations
+
 from collections.abc import Collection
 
 from rack.backplane.message import Message

@@ -1,5 +1,7 @@
 """The executor of the servo level: in every cycle torques for the arm, or a stop."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 

@@ -12,6 +12,8 @@ A modification that raises an exception, or whose result is not finite, is undon
 the same sample: the law goes on without it, and the torque goes over to it in the same way.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

@@ -1,6 +1,8 @@
 """An operator's commands to the servo level: hold, or move the joints to a set point, and later
 return the same way."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 
 import numpy as np

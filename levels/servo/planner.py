@@ -1,5 +1,7 @@
 """The planner of the servo level: the arm's inertia for the coming cycles."""
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 

@@ -5,6 +5,8 @@ motion is the cubic Hermite curve through positions and velocities, so it is C1.
 time, the motion ramps to rest; when set points resume, it joins them smoothly.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

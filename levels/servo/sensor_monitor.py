@@ -1,5 +1,7 @@
 """Checks the joints' sensors, and estimates where the arm is while they are wrong."""
 
+from __future__ import annotations
+
 import sys
 from functools import partial
 from typing import NamedTuple

@@ -1,5 +1,7 @@
 """Decides in every cycle whether the arm follows its set points or stops, and for how long."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple

@@ -1,6 +1,8 @@
 """The level of the paper's Gantt charts (section 3.4, figures 2 to 4): it only consumes processor
 time."""
 
+from __future__ import annotations
+
 from time import process_time_ns
 from typing import Annotated
 

@@ -1,5 +1,7 @@
 """Actions as elemental moves: of the ways to do an action, the quickest that succeeds."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, TypeVar

@@ -1,5 +1,7 @@
 """The executor of the task level: hands down a window of the plan and tracks its execution."""
 
+from __future__ import annotations
+
 from typing import ClassVar
 
 from rack.backplane.message import Message, State

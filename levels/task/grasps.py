@@ -1,5 +1,7 @@
 """Grasps of an object, and the poses in which it can stand."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 

@@ -1,6 +1,8 @@
 """The planner of the task level: the whole program as elemental moves, or the reason why it cannot
 be done."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import ClassVar
 

@@ -6,6 +6,8 @@ afterwards, from the arm's position at that time. Work on an object is completed
 grasp, depart.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.message import Message, State, copied

@@ -1,5 +1,7 @@
 """Chains of boards above each other that have the same timing, and their names as text."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,6 +1,8 @@
 """The path of an operator's command, from the commanded level to the lowest, and its longest
 response."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, TickGrid

@@ -7,6 +7,8 @@ cycle; t_comm its reading and writing, waiting included; t_residual the rest of 
 one plan with its update; d the cycles that a plan may take; t_cs one context switch.
 """
 
+from __future__ import annotations
+
 import operator
 from collections.abc import Callable, Sequence
 from itertools import pairwise

@@ -7,6 +7,8 @@ phase is its place in them. Boards whose places are in one tick follow each othe
 Planners have no place: they plan in the slack.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

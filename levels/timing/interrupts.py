@@ -1,5 +1,7 @@
 """What messages that interrupt a board cost it, and how many of them wait, in the worst case."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

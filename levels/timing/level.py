@@ -1,5 +1,7 @@
 """The timing of one board: its data for the timing model, and its times in the paper's terms."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal

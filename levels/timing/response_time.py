@@ -14,6 +14,8 @@ ever, as in a static cyclic schedule: then response times are those of the sched
 repeats. Times are integers in one unit; a rack uses ns.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -1,6 +1,8 @@
 """The response of the whole system, predicted: its bounds (eqs 3.2, 3.3), and the mailboxes along
 which information passes."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 

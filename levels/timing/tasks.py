@@ -1,6 +1,8 @@
 """Budgets of levels, and tasks of the timing model: unit functions of known length, released on a
 grid."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal

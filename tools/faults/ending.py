@@ -1,6 +1,8 @@
 """The state of a rack at its end, before its memory is released: its faults, its levels, its
 arm."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

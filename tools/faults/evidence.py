@@ -1,6 +1,8 @@
 """Events as evidence of faults: which event can be the detection of which fault, and the reactions
 to it."""
 
+from __future__ import annotations
+
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

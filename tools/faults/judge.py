@@ -1,6 +1,8 @@
 """The judge of faults: did each strike, was it found within its bound, reacted to, and recovered
 from?"""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

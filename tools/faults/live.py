@@ -1,5 +1,7 @@
 """Faults in a running rack: written as in a config, put into its fault table, and followed."""
 
+from __future__ import annotations
+
 import math
 import sys
 import time

@@ -1,5 +1,7 @@
 """The arm in a model: its joints from base to tool, and what it carries; all else is held."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,6 +1,8 @@
 """Something to do for a drafted arm: a table with two blocks that it moves, or a tour of poses;
 either is rehearsed as the task level will."""
 
+from __future__ import annotations
+
 import itertools
 import time
 from collections.abc import Iterator

@@ -1,6 +1,8 @@
 """From a model to a `[robot]` table: what the model states is taken, the rest found or guessed, and
 each guess named."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,5 +1,7 @@
 """What is to be known of an arm before it moves: its joints, what it can do, and what is wrong."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,6 +1,8 @@
 """What the fingers of a gripper can take, and the tool between them, by rays on their surfaces: two
 fingers, or one that closes on a jaw that stands still."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

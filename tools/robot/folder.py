@@ -1,5 +1,7 @@
 """What `rack robot new` writes: a config with comments, the model that it names, a picture."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """The gripper that an arm carries: one joint drives it, the others follow."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

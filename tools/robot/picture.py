@@ -1,5 +1,7 @@
 """A picture of an arm at home, as MuJoCo draws it: axes of the joints, the tool, contacts."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import mujoco

@@ -1,6 +1,8 @@
 """Meshes of a gripper as convex pieces: MuJoCo simulates a mesh by its hull, which fills the bend
 of a jaw, and leaves no room for what one finger could take."""
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray

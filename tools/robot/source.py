@@ -1,6 +1,8 @@
 """A model from anywhere as an `MjSpec`: MJCF, or URDF by MuJoCo's own parser with its meshes
 found."""
 
+from __future__ import annotations
+
 import shutil
 from collections import Counter
 from collections.abc import Mapping

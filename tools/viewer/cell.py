@@ -1,6 +1,8 @@
 """The cell in 3D: its geoms, each once, in the frame of its body; poses of moving bodies; pushes;
 path and goals."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import mujoco

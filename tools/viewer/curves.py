@@ -1,5 +1,7 @@
 """Curves: the arm's joints against their set points and limits, and the numbers of any message."""
 
+from __future__ import annotations
+
 from math import prod
 
 import mujoco

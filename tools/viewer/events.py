@@ -3,6 +3,8 @@
 Each board also has a lane: the kind of its last event, until the next.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,6 +1,8 @@
 """Forces of contacts: an arrow at each place where they are sensed, and curves of what is wanted
 and exerted."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

@@ -1,5 +1,7 @@
 """A hand: joints, tensions and tip forces by finger, as curves."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.levels.robot.hand import Hand

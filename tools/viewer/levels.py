@@ -1,6 +1,8 @@
 """The levels: state, command and move of each as lanes, errors as log lines, and all of them as a
 graph."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from enum import IntEnum
 from functools import partial

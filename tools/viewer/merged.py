@@ -1,6 +1,8 @@
 """Recorded runs of several racks as one recording for the viewer: each below its name, all on one
 time line."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 

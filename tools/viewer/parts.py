@@ -1,5 +1,7 @@
 """The viewer's files of a run: run.rrd, and of a long one the parts that continue it."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from itertools import count, takewhile
 from pathlib import Path

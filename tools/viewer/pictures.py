@@ -1,6 +1,8 @@
 """Pictures of a recording without a screen: `python -m rack.tools.viewer.pictures RUN/run.rrd
 OUT.png --at 7.5`."""
 
+from __future__ import annotations
+
 import argparse
 import shutil
 import socket

@@ -1,5 +1,7 @@
 """Reading a recording back: curves and spans of run.rrd as arrays."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """One MuJoCo geom as a shape in the frame of its body."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import mujoco

@@ -1,6 +1,8 @@
 """The recorder's rows as a recording for the viewer: taken as they are drained, written in
 blocks."""
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Mapping
 from functools import partial

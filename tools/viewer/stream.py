@@ -5,6 +5,8 @@ Its rows have three timelines: simulated time, tick, wall clock. They come in bl
 or one task.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path

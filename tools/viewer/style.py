@@ -3,6 +3,8 @@
 rerun marks the archetype of lanes as unstable, so it is used only here.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np

@@ -1,6 +1,8 @@
 """The timing of a rack in the view: lanes and curves of every task, from its trace, and the ages of
 messages."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid

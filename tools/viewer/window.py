@@ -1,6 +1,8 @@
 """The viewer's window: a separate process, which may be closed at any time and outlives the command
 that opened it."""
 
+from __future__ import annotations
+
 import os
 import shutil
 import signal

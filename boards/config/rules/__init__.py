@@ -6,6 +6,8 @@ are already reported. Faults and commands, which may come live too, have rules o
 `faults` and `commands`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module

@@ -1,6 +1,8 @@
 """Boards and host boards: names, neighbours, planners and slots; their rates, the clock, and a
 static schedule."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter

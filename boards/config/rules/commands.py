@@ -1,5 +1,7 @@
 """Operator commands: what a level takes, with which goal."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Iterable
 from functools import partial
 

@@ -1,5 +1,7 @@
 """Faults: whether their kind, their target and their time fit each other and the rack."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 

@@ -4,6 +4,8 @@ are shown.
 The table makes a board, `lan`, which is checked like any other. A user knows it as `adapter.lan`.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator
 from dataclasses import replace

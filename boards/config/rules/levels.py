@@ -1,5 +1,7 @@
 """What the levels' classes demand of their boards, and what arm and scene must be for them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 from pydantic import ValidationError

@@ -1,5 +1,7 @@
 """Mailboxes: who writes and reads them, on which side of the rack, and how they are shared."""
 
+from __future__ import annotations
+
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
 from rack.backplane.message import State

@@ -1,5 +1,7 @@
 """Actions of a task program as fields of a message, and back."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

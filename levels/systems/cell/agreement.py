@@ -11,6 +11,8 @@ nothing, after a new launch of its rack, knows which step is under way, and whet
 begun.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping, Sequence
 
 from rack.backplane.message import Message

@@ -1,5 +1,7 @@
 """A task level whose actions are carried out by the task levels of other racks."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,6 +4,8 @@ Both racks must have the same layout of them, whatever their arms: no symbolic s
 says all there is to know, so that those that are lost, or overtaken by a newer one, are not missed.
 """
 
+from __future__ import annotations
+
 from enum import IntEnum
 from typing import Annotated
 

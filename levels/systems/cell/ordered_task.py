@@ -3,6 +3,8 @@
 Its planner makes elemental moves of an order, or finds the reason why it cannot be done.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 

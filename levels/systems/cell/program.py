@@ -1,6 +1,8 @@
 """The program of a coordinator, `[task]`: steps, each with what one or more arms do in it at the
 same time."""
 
+from __future__ import annotations
+
 import zlib
 from typing import Annotated
 

@@ -14,6 +14,8 @@ apart. A copy is as late as the messages, and where none come any more it stays 
 that is launched anew takes over what the others know, its own claims of before included.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,6 +1,8 @@
 """The simulated arm in a cell whose bodies other simulations may move: see
 `rack.levels.systems.cell.shared_bodies`."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.levels.algebra import Array, Mask

@@ -1,5 +1,7 @@
 """The servo level of an arm that shares objects with the arms of other racks."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import cast
 

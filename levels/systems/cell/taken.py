@@ -9,6 +9,8 @@ a lost message only delays. What makes the arms begin together, or not at all:
   which knows of no promise, it fails what it is asked to do.
 """
 
+from __future__ import annotations
+
 from rack.backplane.message import Message
 from rack.levels.messages import Error
 from rack.levels.systems.cell.messages import OrderVerb, Response

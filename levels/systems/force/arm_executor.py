@@ -1,6 +1,8 @@
 """The executor of a board of an arm with a wrist sensor: an `ArmExecutor` that measures contacts
 and limits them."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.watch.alarms import Alarm

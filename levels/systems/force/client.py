@@ -13,6 +13,8 @@ the server its sign of life; a program that makes none for longer than the serve
 lost to it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

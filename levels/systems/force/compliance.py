@@ -1,6 +1,8 @@
 """What a level of hybrid control makes of a `COMPLIANCE` and of the contact: axes of force, guards,
 reasons to rest."""
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 

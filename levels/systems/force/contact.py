@@ -1,6 +1,8 @@
 """The contact that requests have asked for: which axes of a task frame are of force, and what ends
 a motion."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Self, get_args
 

@@ -5,6 +5,8 @@ last two follow from the model: it evaluates the same sensor at the same motion,
 contact. So no mass is entered twice, and a tool with joints of its own needs no special case.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,6 +1,8 @@
 """The executor of a level of hybrid motion/force control, between a trajectory level and boards
 that servo joints."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.message import Message, State

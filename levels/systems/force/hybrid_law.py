@@ -11,6 +11,8 @@ space: with no axis of force the difference stays what it is, so the motion goes
 only elsewhere.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

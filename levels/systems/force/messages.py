@@ -7,6 +7,8 @@ Vectors of six are force, N, and torque, N m, or velocity, m/s, and angular velo
 wrench is what the surroundings exert on the tool.
 """
 
+from __future__ import annotations
+
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status

@@ -1,6 +1,8 @@
 """The executor of a server of force and motion: does a client's requests, and outlives the
 client."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.message import Message

@@ -1,6 +1,8 @@
 """Does the requests of a server of force and motion: those of a trajectory level, COMPLY and
 GUARD."""
 
+from __future__ import annotations
+
 import numpy as np
 from pydantic import Field
 

@@ -1,5 +1,7 @@
 """The base of the levels that need what an arm's wrist senses."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 from rack.levels.level import Executor, LevelContext, Misfits

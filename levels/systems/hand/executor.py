@@ -1,6 +1,8 @@
 """The executor of a board of a hand: gives its valves the tensions of the boards above, or closes
 them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,6 +1,8 @@
 """The fingers as the grasp loop sees them: the boards below, one for all fingers or one a finger,
 as one."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -10,6 +10,8 @@ loop, it is not. The joint loop also damps it, and a small part of its own stiff
 posture: the tip leaves one joint of a finger undetermined.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

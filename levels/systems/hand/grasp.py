@@ -1,6 +1,8 @@
 """The grasp loop: does a program of steps, from the open hand around an object to the open hand
 again."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import mujoco

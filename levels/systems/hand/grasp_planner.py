@@ -8,6 +8,8 @@ touches nothing before; of those the one counts whose joints are farthest from t
 ranges.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

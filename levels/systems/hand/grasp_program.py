@@ -1,6 +1,8 @@
 """A program of a grasp, in `[task]`: named postures of the fingers, and steps from the open hand to
 the open hand."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 

@@ -6,6 +6,8 @@ time that it was under way. Its `do` returns whether it is done, and raises `Ref
 failed.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any

@@ -10,6 +10,8 @@ these have crept or slipped to, and the forces stay. Friction bears more the har
 grip rises at once with the load sensed at the tips, and falls slowly after it.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from pydantic import Field
 

@@ -11,6 +11,8 @@ fed forward for the velocity wanted, not for the one sensed: what damps is not c
 is taken on to when the torque acts, a valve's lag included, at the velocity sensed.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -5,6 +5,8 @@ Evaluated on separate data, like the arm's (`rack.levels.robot.dynamics`): a pur
 positions. The palm does not move.
 """
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 

@@ -1,6 +1,8 @@
 """What all loops of a hand have in common: whom they follow, when they keep what they have, and
 what they report."""
 
+from __future__ import annotations
+
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any

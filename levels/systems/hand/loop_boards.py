@@ -5,6 +5,8 @@ With one loop each, the fingertip loop turns what the grasp loop wants into targ
 the joint loop these into torques, and the tendon loop these into tensions.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -8,6 +8,8 @@ in the positive direction. Points and forces are in the frame of the palm, which
 `robot.tool`.
 """
 
+from __future__ import annotations
+
 from enum import IntEnum
 
 from rack.backplane.message import Field, command, status

@@ -1,5 +1,7 @@
 """The hand in MuJoCo: tendons that pull, behind valves that follow a tension or are closed."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import mujoco

@@ -15,6 +15,8 @@ model for this runs on the commands that the hand reports with each sample: both
 time.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -5,6 +5,8 @@ counts, so a prompt reads these from the crate's memory, word by word at their b
 may be writing them at that time, in lockstep too.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

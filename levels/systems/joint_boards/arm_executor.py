@@ -1,6 +1,8 @@
 """The executor of a board of the arm: gives it the torques of the boards that servo its joints, or
 brakes it."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import ClassVar

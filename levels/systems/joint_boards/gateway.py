@@ -1,6 +1,8 @@
 """The executor of a board that joins a trajectory level, across a link with a delay, to boards that
 servo joints."""
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Mapping
 from typing import ClassVar

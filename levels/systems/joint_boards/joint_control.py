@@ -1,6 +1,8 @@
 """The law of a board that servoes joints of an arm: each by itself, with the inertia and load that
 it is given."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -1,6 +1,8 @@
 """The executor of a board that servoes some or all joints of an arm whose plant is on a board of
 its own."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any

@@ -1,5 +1,7 @@
 """The torques of several boards as those of one arm, while all of them are fresh."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

@@ -16,6 +16,8 @@ A level of your own above these reports no set point (`due = 0`) while one of th
 begins again where they hold the arm.
 """
 
+from __future__ import annotations
+
 from rack.backplane.message import command, status
 from rack.levels.fields import by_joint, flag, real, tick
 from rack.levels.messages import DRIVEN_ARM, JOINT_SET_POINT, SERVO_STATUS

@@ -4,6 +4,8 @@ The message says which are to be in, not what has changed, so none that is lost 
 missed. While the other rack is lost, they stay as they are.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 

@@ -1,5 +1,7 @@
 """The gateway where the level above runs in another rack, and a network is the link."""
 
+from __future__ import annotations
+
 from pydantic import Field
 
 from rack.backplane.message import Message, State

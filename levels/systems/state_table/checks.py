@@ -6,6 +6,8 @@ of cases is kept as boxes, a set of values per condition each; what a row leaves
 most as many boxes as it has conditions.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 
 from rack.levels.systems.state_table.table import SAME, STATES, RowConfig, StateTable

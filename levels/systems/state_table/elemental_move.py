@@ -5,6 +5,8 @@ The plan is static: heights above what is to be reached, at a speed each. The ex
 joints of a pose when a row says `move`, from the object's place as sensed, in bounded time.
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any
 

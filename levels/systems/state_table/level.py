@@ -6,6 +6,8 @@ of a level are read when its board starts, never in a cycle; an operator swaps b
 tick. To try an edited file, restart the board: `rack inject RACK BOARD kill`.
 """
 
+from __future__ import annotations
+
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

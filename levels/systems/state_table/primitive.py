@@ -5,6 +5,8 @@ A motion is a smooth stream of set points for the boards that servo the joints, 
 the arm.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from rack.backplane.message import Message, command, status

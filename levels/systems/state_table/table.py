@@ -23,6 +23,8 @@ Rows of a state exclude each other, unless the later one says `else`; together t
 `rack.levels.systems.state_table.checks` sees to that before the launch.
 """
 
+from __future__ import annotations
+
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,6 +1,8 @@
 """The task level as a state table: a static list of steps, each an object and the place to which it
 goes."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

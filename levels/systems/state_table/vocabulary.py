@@ -4,6 +4,8 @@ A level's class declares them; a table, a TOML file, combines them. Every set of
 whether two rows overlap, and which case no row takes, can be decided exactly.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product

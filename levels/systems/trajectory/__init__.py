@@ -4,6 +4,8 @@ them.
 Names are imported on first use: tools that read the messages need not wait for the levels.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
 from rack.backplane.exports import on_first_use

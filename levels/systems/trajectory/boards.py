@@ -1,5 +1,7 @@
 """Whether all boards that servo joints follow set points: motion continues only while they do."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -12,6 +12,8 @@ while the queue is full. A request that is lost, with a board that died as it he
 by the next call that waits.
 """
 
+from __future__ import annotations
+
 import runpy
 import sys
 from collections.abc import Callable, Mapping, Sequence

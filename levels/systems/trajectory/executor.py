@@ -1,6 +1,8 @@
 """The executor of a trajectory level: follows the motion requests of its queue with a set point
 every cycle."""
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Mapping
 from typing import ClassVar

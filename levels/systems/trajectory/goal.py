@@ -6,6 +6,8 @@ from when the body was sensed to the sample's time, and smoothed: a body may sta
 arm cannot. The smoothed frame catches up with a body of constant velocity completely.
 """
 
+from __future__ import annotations
+
 import mujoco
 import numpy as np
 

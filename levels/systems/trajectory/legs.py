@@ -7,6 +7,8 @@ transitions of RCCL [recalled]: two legs in sequence, the second begun a before 
 one motion with matched position, velocity and acceleration.
 """
 
+from __future__ import annotations
+
 from math import ceil
 from typing import NamedTuple
 

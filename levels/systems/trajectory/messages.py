@@ -1,6 +1,8 @@
 """Motion requests, which a planning level or a program queues, and the status of the level that
 does them."""
 
+from __future__ import annotations
+
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status

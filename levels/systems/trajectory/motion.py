@@ -4,6 +4,8 @@ In every cycle the motion is evaluated once, one sample ahead. Velocity and acce
 are the differences of those around it, so they always fit the positions, however these come about.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -6,6 +6,8 @@ queued them: only live goals stay open [assumed]. So does the planner: its plan 
 executor only says how far the program is.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Does the requests of the agenda, sample by sample."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 from pydantic import Field

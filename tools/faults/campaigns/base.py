@@ -4,6 +4,8 @@ Until its first fault a trial is this run, bit for bit. So it starts at the last
 that, with the events until then, and its verdict is that of a whole trial.
 """
 
+from __future__ import annotations
+
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

@@ -1,6 +1,8 @@
 """A campaign: a faultless run, trials with faults, kills and sizes, and faultless time; each run
 leaves a file."""
 
+from __future__ import annotations
+
 import json
 import os
 from collections import Counter

@@ -1,5 +1,7 @@
 """The plan of a trial, and the targets in a rack that a plan can choose from."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -1,6 +1,8 @@
 """The report of a campaign: one document, campaign.json, and campaign.md for people, from the same
 figures."""
 
+from __future__ import annotations
+
 import os
 import platform
 from collections.abc import Iterator

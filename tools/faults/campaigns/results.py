@@ -1,5 +1,7 @@
 """The results of a campaign: trials as judged, each kept in a file, and faultless time."""
 
+from __future__ import annotations
+
 import json
 from collections import Counter
 from collections.abc import Iterator

@@ -1,5 +1,7 @@
 """The figures of a campaign: shares with their confidence, rates, delays, by kind of fault."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import exp, lgamma, log, sqrt

@@ -1,5 +1,7 @@
 """One trial: a run of the whole task with its faults, and everything that its judgement needs."""
 
+from __future__ import annotations
+
 import os
 import signal
 import time
