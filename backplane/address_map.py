@@ -57,16 +57,13 @@ class AddressMap:
         self.mailboxes: dict[str, int] = {}
         self.faults = HEAD_SIZE
         self.operator = HEAD_SIZE + FAULT_ENTRIES * FAULT_ENTRY_SIZE
-        address = self._place_clock(HEAD_SIZE, layout)
+        self.alarms[CLOCK] = self.operator + OPERATOR_ENTRIES * operator_entry_size(layout)
+        end = pages(self._place_mailboxes({CLOCK}, layout, self.alarms[CLOCK] + ALARM_SIZE))
+        self.windows.append(Window(CLOCK, HEAD_SIZE, end - HEAD_SIZE))
+        address = end
         for board in dict.fromkeys(task.board for task in layout.processes):
             address = self._place_board(board, layout, address)
         self.size = address
-
-    def _place_clock(self, start: int, layout: Layout) -> int:
-        self.alarms[CLOCK] = self.operator + OPERATOR_ENTRIES * operator_entry_size(layout)
-        end = pages(self._place_mailboxes({CLOCK}, layout, self.alarms[CLOCK] + ALARM_SIZE))
-        self.windows.append(Window(CLOCK, start, end - start))
-        return end
 
     def _place_board(self, board: str, layout: Layout, start: int) -> int:
         address = start

@@ -12,7 +12,6 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
-from threading import Thread
 
 _HELD: set[ProcessLock] = set()
 _FLOCK = struct.Struct("hhqqi4x")
@@ -72,26 +71,9 @@ os.register_at_fork(after_in_child=_close_inherited)
 def is_locked(fd: int, address: int) -> bool:
     """Return whether the byte at a bus address of an open segment is locked, without taking the
     lock."""
-    # A shared lock: those who wait for the end of the exclusive one do not count as its holder.
     asked = _one_byte(fcntl.F_RDLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK
-
-
-def await_unlocked(fd: int, address: int, timeout_s: float) -> bool:
-    """Wait until no process has locked the byte at a bus address; return False after the timeout.
-
-    Args:
-        fd: Descriptor of the segment, which nobody else uses for a wait.
-        address: Bus address of the byte.
-        timeout_s: Longest wait.
-    """
-    shared = _one_byte(fcntl.F_RDLCK, address)
-    # The kernel's wait has no time-out.
-    waiter = Thread(target=fcntl.fcntl, args=(fd, fcntl.F_OFD_SETLKW, shared), daemon=True)
-    waiter.start()
-    waiter.join(timeout_s)
-    return not waiter.is_alive()
 
 
 def _one_byte(kind: int, address: int) -> bytes:

@@ -21,7 +21,7 @@ from zlib import crc32
 import posix_ipc
 
 from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
-from rack.backplane.byte_lock import ProcessLock, await_unlocked, is_locked
+from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.layout import (
@@ -32,13 +32,10 @@ from rack.backplane.layout import (
     MailboxSpec,
     TaskSpec,
 )
-from rack.backplane.process import is_alive
 from rack.backplane.words import Block, Box, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 16
-LOCKED_SINCE = 16
-"""First layout version whose launcher holds a lock."""
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 """Words with the addresses of the texts; the word after each has its size."""
 PREFIX = "nasrem-rack."
@@ -47,6 +44,8 @@ KIND = re.compile(r"[<>|]?[biufcSUV]\d+")
 number in a message."""
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
+LOOK_S = 0.02
+"""Time between two looks at the lock of a launcher that is to end."""
 _LIFE = 8 * Head.LAUNCHER_PID
 """Bus address on which the launcher holds a lock for as long as it lives."""
 PROCESSOR = "x86_64"
@@ -307,18 +306,17 @@ class Segment:
 
     @property
     def launcher_is_alive(self) -> bool:
-        """Whether the process that made the segment, of any version, still runs."""
-        words = self.words
-        if words[Head.VERSION] < LOCKED_SINCE:
-            # In earlier versions that word is the start time of the process.
-            return words[Head.MAGIC] == MAGIC and is_alive(
-                words[Head.LAUNCHER_PID], words[Head.LAUNCHER_NAMESPACE]
-            )
+        """Whether the process that made the segment still runs."""
         return is_locked(self.fd, _LIFE)
 
     def await_launcher(self, timeout_s: float) -> bool:
         """Wait until the launcher has ended or closed the rack; return False after the timeout."""
-        return await_unlocked(self.fd, _LIFE, timeout_s)
+        deadline = time.monotonic() + timeout_s
+        while self.launcher_is_alive:
+            if time.monotonic() >= deadline:
+                return False
+            time.sleep(LOOK_S)
+        return True
 
     @property
     def run_is_over(self) -> bool:

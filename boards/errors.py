@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,10 @@ class Mistake:
         """Return the mistake as one line."""
         value = "" if self.value is None else f" = {shown(self.value)}"
         return f"{one_line(self.place, LONGEST_PLACE)}{value}: {one_line(self.why, LONGEST_REASON)}"
+
+
+Mistakes = Iterator[Mistake]
+"""What a rule yields."""
 
 
 class ConfigError(BoardError):

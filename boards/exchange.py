@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.message import Field, Message, MessageType
+from rack.levels.fields import tick
 
 if TYPE_CHECKING:
     # A look at a running rack must not import the levels.
@@ -48,9 +49,7 @@ def _fields(label: str) -> tuple[Field, Field]:
         " before the first"
     )
     taken = f"release of the cycle that took it; {NEVER} before the first"
-    return Field(f"{label}_{AGE}", "i8", "tick", age), Field(
-        f"{label}_{TAKEN}", "i8", "tick", taken
-    )
+    return tick(f"{label}_{AGE}", age), tick(f"{label}_{TAKEN}", taken)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from rack.levels.compiled import compiled
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int_]
+Mask = NDArray[np.bool_]
 
 LEAST_PIVOT = 1e-12
 """Diagonal element of a Cholesky factor below which a matrix counts as singular."""

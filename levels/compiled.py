@@ -2,7 +2,8 @@
 
 A few hundred numpy calls on six numbers were most of a servo cycle: each costs a microsecond,
 whatever it computes. A function marked `@compiled` is ordinary numpy code; called directly it runs
-as such, the reference of its tests. Alternatives considered: a C extension (users would need a
+as such, the reference of its tests. One marked with its types, `@compiled_for`, can be loaded
+before a run: see `Executor.preload`. Alternatives considered: a C extension (users would need a
 compiler), `jit` at import (numba takes 0.4 s to import, and most commands compute nothing).
 
 Without `fastmath` the order of operations is the source's, so the bits do not depend on the
@@ -33,6 +34,8 @@ DIGEST = 16
 CURE = "XDG_CACHE_HOME=FOLDER names one that can be written"
 _P = ParamSpec("_P")
 _R = TypeVar("_R", covariant=True)
+_A = ParamSpec("_A")
+_T = TypeVar("_T")
 
 
 def unheard(function: str) -> None:
@@ -47,8 +50,9 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     """Mark a function for compilation. Arguments are numbers, arrays and records; it may call
     others marked so."""
 
-    def __init__(self, function: Callable[_P, _R]) -> None:
+    def __init__(self, function: Callable[_P, _R], types: str = "") -> None:
         self._function = function
+        self._types = types
         self._machine: Callable[_P, _R] | None = None
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -63,6 +67,15 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
             self._machine = _jit(self)
         return self._machine
 
+    def preload(self) -> None:
+        """Load the machine code for the types with which the function is marked, if any."""
+        if self._types:
+            from numba.core.sigutils import normalize_signature
+
+            machine: Any = self.load()
+            types, _ = normalize_signature(f"({self._types},)")  # type: ignore[no-untyped-call]
+            machine.compile(types)
+
     def source(self) -> Iterator[bytes]:
         """Yield what determines the machine code: instructions, constants, and the values of names,
         functions that are called included. Comments, docstrings and places in files do not."""
@@ -76,6 +89,24 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
             if name in known:
                 yield name.encode()
                 yield from _value(known[name])
+
+
+def compiled_for(types: str) -> Callable[[Callable[_A, _T]], compiled[_A, _T]]:
+    """Mark a function for compilation, before a run, for arguments of these types.
+
+    Args:
+        types: Types as numba writes them: "f8, i8, f8[:, ::1]" are a float, an integer and an
+            array in C order.
+    """
+    return lambda function: compiled(function, types)
+
+
+def preload(*modules: ModuleType) -> None:
+    """Load the machine code of all functions in modules that are marked with types."""
+    for module in modules:
+        for function in [*vars(module).values()]:
+            if isinstance(function, compiled):
+                function.preload()
 
 
 def _jit(marked: compiled[..., Any]) -> Any:

@@ -92,6 +92,7 @@ from rack.backplane.mailbox.queue import ALL
 from rack.backplane.message import Message, MessageType
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
+from rack.levels.compiled import preload
 from rack.levels.errors import ProgramError
 from rack.levels.faults import Fault
 from rack.levels.operator import Commands, Operation
@@ -273,7 +274,8 @@ class LevelSection:
     """Keys of `[task]`, checked before the launch; None: the level reads no program, or checks it
     by itself."""
     preloads: ClassVar[tuple[ModuleType, ...]] = ()
-    """Modules of which every process of the level needs the compiled functions."""
+    """Modules of which every process of the level needs the functions marked `compiled_for`: see
+    `rack.levels.compiled`."""
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
@@ -282,8 +284,7 @@ class LevelSection:
     def preload(cls) -> None:
         """Load what every process of the level needs, such as compiled code. Called once, before
         the crate forks."""
-        for module in cls.preloads:
-            module.preload()
+        preload(*cls.preloads)
 
     def self_test(self) -> None:
         """Raise `LevelError` when the level must not start: the board then holds SYSFAIL, and the

@@ -11,6 +11,7 @@ from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status
 from rack.backplane.words import Demand
+from rack.levels.fields import by_joint, flag, number, real, row, short_count, tick
 from rack.levels.operator import ANSWER, RESTS_ON
 
 WINDOW = 8
@@ -27,9 +28,6 @@ SECTIONS_A_LINE = 8
 keeps it."""
 SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
 """Most sections of constant jerk of one trajectory."""
-
-JOINTS = ("joints",)
-"""Shape of a field with one value per joint."""
 
 
 class Error(IntEnum):
@@ -84,26 +82,17 @@ ELEMENTAL_MOVE = MessageType(
     "elemental_move",
     1,
     (
-        Field("id", "u4", "1", "serial of the move, rising by one from 1; 0: empty"),
-        Field("action", "u2", "1", "index of the program's action that it serves"),
+        number("id", "serial of the move, rising by one from 1; 0: empty"),
+        short_count("action", "index of the program's action that it serves"),
         Field("verb", "u1", Verb, "what to do"),
-        Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
-        Field("position", "f8", "m", "tool position at the end", (3,)),
-        Field("quaternion", "f8", "1", "tool orientation at the end", (4,)),
-        Field(
-            "joints",
-            "f8",
-            "rad",
-            "where MOVE_JOINTS ends; with `posture`, near the end",
-            JOINTS,
+        row("object", "row of the object concerned in the world model; -1: none"),
+        real("position", "m", "tool position at the end", 3),
+        real("quaternion", "1", "tool orientation at the end", 4),
+        by_joint("joints", "rad", "where MOVE_JOINTS ends; with `posture`, near the end"),
+        flag(
+            "posture", "1: of the configurations at the pose, the one nearest to `joints` is wanted"
         ),
-        Field(
-            "posture",
-            "u1",
-            "1",
-            "1: of the configurations at the pose, the one nearest to `joints` is wanted",
-        ),
-        Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
+        real("by", "s", "simulated time by which it must be done; 0: any time"),
     ),
 )
 
@@ -111,11 +100,11 @@ TASK_PLAN = MessageType(
     "task_plan",
     1,
     (
-        Field("id", "u4", "1", "serial of the plan"),
+        number("id", "serial of the plan"),
         Field("error", "u2", Error, "why the program is refused; 0: it is not refused"),
         Field("reason", "S120", "ASCII", "the refusal, readable"),
-        Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
-        Field("count", "u2", "1", "moves that follow"),
+        real("earliest", "s", "with TOO_LATE: the earliest time that could be met"),
+        short_count("count", "moves that follow"),
         Field("moves", ELEMENTAL_MOVE, "", "the program, decomposed", (MOVES,)),
     ),
 )
@@ -124,8 +113,8 @@ TASK_COMMAND = command(
     "task_command",
     2,
     RESTS_ON,
-    Field("hold", "u1", "1", "1: ramp to rest and stay, whatever is under way"),
-    Field("count", "u2", "1", "moves that follow; id is the newest one's"),
+    flag("hold", "1: ramp to rest and stay, whatever is under way"),
+    short_count("count", "moves that follow; id is the newest one's"),
     Field("moves", ELEMENTAL_MOVE, "", "a window on the plan, oldest first", (WINDOW,)),
 )
 
@@ -133,43 +122,33 @@ TASK_STATUS = status(
     "task_status",
     2,
     *ANSWER,
-    Field("action", "u2", "1", "actions done"),
-    Field("actions", "u2", "1", "actions of the program"),
-    Field("moves_done", "u2", "1", "elemental moves done"),
-    Field("moves", "u2", "1", "elemental moves of the plan; 0 before there is one"),
-    Field("first", "u4", "1", "id under which the plan's first move is handed down"),
-    Field("detour", "u4", "1", "id of the move that an operator wants instead; 0: none"),
+    short_count("action", "actions done"),
+    short_count("actions", "actions of the program"),
+    short_count("moves_done", "elemental moves done"),
+    short_count("moves", "elemental moves of the plan; 0 before there is one"),
+    number("first", "id under which the plan's first move is handed down"),
+    number("detour", "id of the move that an operator wants instead; 0: none"),
 )
 
-OPERATED = Field(
-    "operated", "u1", "1", "1: an operator keeps this level, or one below it, from its own work"
-)
+OPERATED = flag("operated", "1: an operator keeps this level, or one below it, from its own work")
 
 MOVE_STATUS = status(
     "move_status",
     3,
     *ANSWER,
-    Field("done", "u4", "1", "newest elemental move done; 0: none yet"),
-    Field("current", "u4", "1", "elemental move under way; 0: none"),
-    Field("progress", "f8", "1", "part of its path done, 0 to 1"),
+    number("done", "newest elemental move done; 0: none yet"),
+    number("current", "elemental move under way; 0: none"),
+    real("progress", "1", "part of its path done, 0 to 1"),
     Field("verb", "u1", Verb, "of the move under way"),
-    Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
-    Field("planned", "u4", "1", "newest elemental move whose path is ready; 0: none yet"),
-    Field("end", "f8", "rad", "joint positions at the end of that path", JOINTS),
-    Field(
-        "replan",
-        "u4",
-        "1",
-        "open request to plan the current move anew from `start`; 0: none is open",
-    ),
-    Field("start", "f8", "rad", "joint positions where that motion holds", JOINTS),
-    Field("replans", "u4", "1", "plans made anew because something was in the way"),
+    row("held", "row of the object in the gripper; -1: none"),
+    number("planned", "newest elemental move whose path is ready; 0: none yet"),
+    by_joint("end", "rad", "joint positions at the end of that path"),
+    number("replan", "open request to plan the current move anew from `start`; 0: none is open"),
+    by_joint("start", "rad", "joint positions where that motion holds"),
+    number("replans", "plans made anew because something was in the way"),
     OPERATED,
-    Field(
-        "resting",
-        "u1",
-        "1",
-        "1: the arm rests, and the level that moves it has the operator's newest command",
+    flag(
+        "resting", "1: the arm rests, and the level that moves it has the operator's newest command"
     ),
 )
 
@@ -177,21 +156,15 @@ MOVE_PLAN = MessageType(
     "move_plan",
     1,
     (
-        Field("move", "u4", "1", "elemental move that the plan serves"),
-        Field("replan", "u4", "1", "request that it answers; 0: the first plan of the move"),
+        number("move", "elemental move that the plan serves"),
+        number("replan", "request that it answers; 0: the first plan of the move"),
         Field("error", "u2", Error, "why there is no plan; 0: there is"),
         Field("reason", "S120", "ASCII", "the error, readable"),
         Field("kind", "u1", SegmentKind, "path or gripper"),
-        Field("count", "u2", "1", "waypoints that follow"),
-        Field(
-            "waypoints", "f8", "rad", "collision-free path in joint space", (WAYPOINTS, "joints")
-        ),
-        Field(
-            "blend",
-            "f8",
-            "rad",
-            "length over which corner k is rounded, before and after it",
-            (WAYPOINTS,),
+        short_count("count", "waypoints that follow"),
+        real("waypoints", "rad", "collision-free path in joint space", WAYPOINTS, "joints"),
+        real(
+            "blend", "rad", "length over which corner k is rounded, before and after it", WAYPOINTS
         ),
     ),
 )
@@ -200,25 +173,23 @@ SEGMENT = MessageType(
     "segment",
     1,
     (
-        Field("id", "u4", "1", "serial of the segment, rising by one from 1; 0: empty"),
-        Field("move", "u4", "1", "elemental move that it serves"),
+        number("id", "serial of the segment, rising by one from 1; 0: empty"),
+        number("move", "elemental move that it serves"),
         Field("kind", "u1", SegmentKind, "path or gripper"),
-        Field("object", "i2", "1", "object held, or to be grasped; -1: none"),
-        Field(
-            "touch", "u1", "1", "1: the object may touch supports and fingers (approach, depart)"
-        ),
-        Field("count", "u2", "1", "waypoints that follow"),
-        Field(
+        row("object", "object held, or to be grasped; -1: none"),
+        flag("touch", "1: the object may touch supports and fingers (approach, depart)"),
+        short_count("count", "waypoints that follow"),
+        real(
             "waypoints",
-            "f8",
             "rad",
             "path in joint space, from where the motion starts",
-            (WAYPOINTS, "joints"),
+            WAYPOINTS,
+            "joints",
         ),
-        Field("blend", "f8", "rad", "length over which corner k is rounded", (WAYPOINTS,)),
-        Field("by", "f8", "s", "simulated time by which it must be done; 0: any time"),
-        Field("opening", "f8", "m or rad", "gripper joint position to go to, for GRIPPER"),
-        Field("force", "f8", "N or N m", "largest gripper force on the way and afterwards"),
+        real("blend", "rad", "length over which corner k is rounded", WAYPOINTS),
+        real("by", "s", "simulated time by which it must be done; 0: any time"),
+        real("opening", "m or rad", "gripper joint position to go to, for GRIPPER"),
+        real("force", "N or N m", "largest gripper force on the way and afterwards"),
     ),
 )
 
@@ -226,8 +197,8 @@ MOVE_COMMAND = command(
     "move_command",
     2,
     RESTS_ON,
-    Field("hold", "u1", "1", "1: ramp to rest on the path and stay"),
-    Field("count", "u2", "1", "segments that follow; id is the newest one's"),
+    flag("hold", "1: ramp to rest on the path and stay"),
+    short_count("count", "segments that follow; id is the newest one's"),
     Field("segments", SEGMENT, "", "segments to do, oldest first", (SEGMENTS,)),
 )
 
@@ -235,50 +206,38 @@ PRIMITIVE_STATUS = status(
     "primitive_status",
     3,
     *ANSWER,
-    Field("done", "u4", "1", "newest segment done; 0: none yet"),
-    Field("current", "u4", "1", "segment under way; 0: none"),
-    Field("progress", "f8", "1", "part of the segment's path done, 0 to 1"),
-    Field("blocked", "u1", "1", "1: motion holds because something is in the way"),
-    Field("resting", "u1", "1", "1: commanded velocity is zero"),
+    number("done", "newest segment done; 0: none yet"),
+    number("current", "segment under way; 0: none"),
+    real("progress", "1", "part of the segment's path done, 0 to 1"),
+    flag("blocked", "1: motion holds because something is in the way"),
+    flag("resting", "1: commanded velocity is zero"),
     OPERATED,
-    Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
-    Field("opening", "f8", "m or rad", "gripper joint position, measured"),
-    Field("position", "f8", "rad", "joint positions commanded last", JOINTS),
-    Field("earliest", "f8", "s", "with TOO_LATE: the earliest time that could be met"),
-    Field(
-        "ends",
-        "f8",
-        "s",
-        "simulated time at which the segment under way should be done; 0: not known",
-    ),
-    Field(
-        "wants", "u4", "1", "segment for which the level wants a trajectory of its planner; 0: none"
-    ),
-    Field("begin", "f8", "rad", "path parameter at which that trajectory is to begin, from rest"),
+    row("held", "row of the object in the gripper; -1: none"),
+    real("opening", "m or rad", "gripper joint position, measured"),
+    by_joint("position", "rad", "joint positions commanded last"),
+    real("earliest", "s", "with TOO_LATE: the earliest time that could be met"),
+    real("ends", "s", "simulated time at which the segment under way should be done; 0: not known"),
+    number("wants", "segment for which the level wants a trajectory of its planner; 0: none"),
+    real("begin", "rad", "path parameter at which that trajectory is to begin, from rest"),
 )
 
 TRAJECTORY = MessageType(
     "trajectory",
     1,
     (
-        Field("segment", "u4", "1", "segment that it serves"),
+        number("segment", "segment that it serves"),
         Field("error", "u2", Error, "why there is none; 0: there is"),
         Field("reason", "S120", "ASCII", "the error, readable"),
-        Field("begin", "f8", "rad", "path parameter at which it begins"),
-        Field("duration", "f8", "s", "from rest to rest"),
-        Field(
-            "earliest",
-            "f8",
-            "s",
-            "simulated time at which the segment could be done at the earliest",
-        ),
-        Field("count", "u2", "1", "sections that follow"),
-        Field(
+        real("begin", "rad", "path parameter at which it begins"),
+        real("duration", "s", "from rest to rest"),
+        real("earliest", "s", "simulated time at which the segment could be done at the earliest"),
+        short_count("count", "sections that follow"),
+        real(
             "sections",
-            "f8",
             "s, 1, 1/s, 1/s2, 1/s3",
             "start, s, ds, dds, jerk of the path parameter",
-            (SECTIONS, 5),
+            SECTIONS,
+            5,
         ),
     ),
 )
@@ -287,76 +246,51 @@ JOINT_SET_POINT = command(
     "joint_set_point",
     2,
     RESTS_ON,
-    Field("due", "i8", "tick", "tick at which the arm should be there; 0: no set point yet, hold"),
-    Field("position", "f8", "rad", "joint positions", JOINTS),
-    Field("velocity", "f8", "rad/s", "joint velocities", JOINTS),
+    tick("due", "tick at which the arm should be there; 0: no set point yet, hold"),
+    by_joint("position", "rad", "joint positions"),
+    by_joint("velocity", "rad/s", "joint velocities"),
     # For a servo level that feeds acceleration forward; the default one derives it from positions
     # and velocities.
-    Field("acceleration", "f8", "rad/s2", "joint accelerations", JOINTS),
-    Field("opening", "f8", "m or rad", "gripper joint position to go to"),
-    Field("force", "f8", "N or N m", "largest gripper force"),
-    Field("held", "i2", "1", "row of the object in the gripper; -1: none"),
+    by_joint("acceleration", "rad/s2", "joint accelerations"),
+    real("opening", "m or rad", "gripper joint position to go to"),
+    real("force", "N or N m", "largest gripper force"),
+    row("held", "row of the object in the gripper; -1: none"),
 )
 
 SERVO_PLAN = MessageType(
     "servo_plan",
     1,
     (
-        Field(
-            "inertia",
-            "f8",
-            "kg m2",
-            "joint-space inertia, the object held included",
-            ("joints", "joints"),
+        real(
+            "inertia", "kg m2", "joint-space inertia, the object held included", "joints", "joints"
         ),
-        Field("held", "i2", "1", "object included; -1: none"),
-        Field("payload_mass", "f8", "kg", "mass in the gripper"),
-        Field("payload_offset", "f8", "m", "its centre, in the frame of the tool", (3,)),
+        row("held", "object included; -1: none"),
+        real("payload_mass", "kg", "mass in the gripper"),
+        real("payload_offset", "m", "its centre, in the frame of the tool", 3),
     ),
 )
 
 DRIVEN_ARM = (
-    Field(
-        "position",
-        "f8",
-        "rad",
-        "joint positions, measured; estimated for suspect sensors",
-        JOINTS,
-    ),
-    Field("velocity", "f8", "rad/s", "joint velocities, likewise", JOINTS),
-    Field(
-        "torque",
-        "f8",
-        "N m",
-        "torque given to the arm in this cycle, after the limit gate",
-        JOINTS,
-    ),
-    Field("target", "f8", "rad", "where the joints are wanted in this cycle", JOINTS),
-    Field("target_velocity", "f8", "rad/s", "likewise", JOINTS),
-    Field("opening", "f8", "m or rad", "gripper joint position, measured"),
-    Field("opening_velocity", "f8", "m/s or rad/s", "gripper joint velocity, measured"),
-    Field("grip_force", "f8", "N or N m", "force given to the gripper"),
-    Field("holding", "u1", "1", "1: no fresh set point, the arm ramps to rest and stays"),
-    Field(
-        "stopped",
-        "u1",
-        "1",
-        "1: set points are not followed: a demand, an operator, a fault, or brakes",
-    ),
-    Field("braked", "u1", "1", "1: the brakes are engaged"),
+    by_joint("position", "rad", "joint positions, measured; estimated for suspect sensors"),
+    by_joint("velocity", "rad/s", "joint velocities, likewise"),
+    by_joint("torque", "N m", "torque given to the arm in this cycle, after the limit gate"),
+    by_joint("target", "rad", "where the joints are wanted in this cycle"),
+    by_joint("target_velocity", "rad/s", "likewise"),
+    real("opening", "m or rad", "gripper joint position, measured"),
+    real("opening_velocity", "m/s or rad/s", "gripper joint velocity, measured"),
+    real("grip_force", "N or N m", "force given to the gripper"),
+    flag("holding", "1: no fresh set point, the arm ramps to rest and stays"),
+    flag("stopped", "1: set points are not followed: a demand, an operator, a fault, or brakes"),
+    flag("braked", "1: the brakes are engaged"),
     Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
-    Field("clipped", "u4", "1", "cycles in which the limit gate cut a torque or a set point"),
-    Field("touches", "u4", "1", "unintended contacts, counted at every substep"),
-    Field(
+    number("clipped", "cycles in which the limit gate cut a torque or a set point"),
+    number("touches", "unintended contacts, counted at every substep"),
+    number(
         "violations",
-        "u4",
-        "1",
         "substeps in which the arm drove a position, velocity or torque beyond its limit",
     ),
-    Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
-    Field(
-        "slowed", "u1", "1", "1: speeds are scaled down by robot.bring_up, until the release of it"
-    ),
+    number("pushed", "substeps in which a blow pushed a joint beyond a limit"),
+    flag("slowed", "1: speeds are scaled down by robot.bring_up, until the release of it"),
 )
 """Fields of the status of a level that drives an arm."""
 
@@ -366,33 +300,25 @@ ARM_STATE = MessageType(
     "arm_state",
     3,
     (
-        Field("tick", "i8", "tick", "tick that the state belongs to"),
-        Field("clipped", "u4", "1", "cycles in which the limit gate cut a command"),
-        Field("touches", "u4", "1", "unintended contacts"),
-        Field("violations", "u4", "1", "substeps in which the arm broke a limit"),
-        Field("pushed", "u4", "1", "substeps in which a blow pushed a joint beyond a limit"),
+        tick("tick", "tick that the state belongs to"),
+        number("clipped", "cycles in which the limit gate cut a command"),
+        number("touches", "unintended contacts"),
+        number("violations", "substeps in which the arm broke a limit"),
+        number("pushed", "substeps in which a blow pushed a joint beyond a limit"),
         Field("struck", "i4", "tick", "ticks for which the motion is still that of a blow"),
         Field("waited", "i4", "tick", "ticks since the last command"),
-        Field("braked", "u1", "1", "1: the brakes are engaged"),
-        Field("rest", "f8", "rad", "where engaged brakes hold the joints", JOINTS),
-        Field(
-            "position",
-            "f8",
-            "rad",
-            "joint positions as the servo level estimates them",
-            JOINTS,
-        ),
-        Field("velocity", "f8", "rad/s", "joint velocities, likewise", JOINTS),
-        Field("doubt", "f8", "rad", "largest error of those positions", JOINTS),
-        Field(
+        flag("braked", "1: the brakes are engaged"),
+        by_joint("rest", "rad", "where engaged brakes hold the joints"),
+        by_joint("position", "rad", "joint positions as the servo level estimates them"),
+        by_joint("velocity", "rad/s", "joint velocities, likewise"),
+        by_joint("doubt", "rad", "largest error of those positions"),
+        tick(
             "kept",
-            "i8",
-            "tick",
             "ticks for which faults have kept the arm from its set points: see ArmParams.patience",
         ),
         Field("error", "u2", Error, "latched fault; 0: none"),
         Field("reason", "S120", "ASCII", "that fault, readable"),
-        Field("state", "f8", "", "of the simulated cell, see rack.levels.robot.state", ("state",)),
+        real("state", "", "of the simulated cell, see rack.levels.robot.state", "state"),
     ),
 )
 
@@ -400,10 +326,10 @@ SCENE = MessageType(
     "scene",
     1,
     (
-        Field("position", "f8", "m", "body origins as sensed", ("bodies", 3)),
-        Field("quaternion", "f8", "1", "body orientations as sensed", ("bodies", 4)),
-        Field("tool_position", "f8", "m", "tool as sensed", (3,)),
-        Field("tool_quaternion", "f8", "1", "tool as sensed", (4,)),
+        real("position", "m", "body origins as sensed", "bodies", 3),
+        real("quaternion", "1", "body orientations as sensed", "bodies", 4),
+        real("tool_position", "m", "tool as sensed", 3),
+        real("tool_quaternion", "1", "tool as sensed", 4),
     ),
 )
 
@@ -411,15 +337,13 @@ WORLD_MODEL = MessageType(
     "world_model",
     1,
     (
-        Field(
+        number(
             "revision",
-            "u4",
-            "1",
             "rises when a body starts to move and when it rests again; 0: nothing sensed",
         ),
-        Field("position", "f8", "m", "body origins", ("bodies", 3)),
-        Field("quaternion", "f8", "1", "body orientations", ("bodies", 4)),
-        Field("velocity", "f8", "m/s", "body velocities, estimated", ("bodies", 3)),
-        Field("sensed", "i8", "tick", "cycle in which the newest scene was taken over"),
+        real("position", "m", "body origins", "bodies", 3),
+        real("quaternion", "1", "body orientations", "bodies", 4),
+        real("velocity", "m/s", "body velocities, estimated", "bodies", 3),
+        tick("sensed", "cycle in which the newest scene was taken over"),
     ),
 )

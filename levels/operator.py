@@ -16,6 +16,7 @@ import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import REASON_BYTES, Field, Message, command
+from rack.levels.fields import flag, number, real
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,25 +81,22 @@ OPERATOR_COMMAND = command(
     2,
     Field("what", "u1", Operation, "what to do"),
     Field("goal", "u1", Goal, "form of the goal"),
-    Field("count", "u1", "1", "joints that follow"),
-    Field("joints", "f8", "rad", "joint positions, for goal joints", (MAX_JOINTS,)),
-    Field("position", "f8", "m", "of the tool, for goals pose and direction", (3,)),
-    Field("quaternion", "f8", "1", "of the tool, for goal pose", (4,)),
-    Field("direction", "f8", "1", "of the tool's z axis, for goal direction", (3,)),
+    flag("count", "joints that follow"),
+    real("joints", "rad", "joint positions, for goal joints", MAX_JOINTS),
+    real("position", "m", "of the tool, for goals pose and direction", 3),
+    real("quaternion", "1", "of the tool, for goal pose", 4),
+    real("direction", "1", "of the tool's z axis, for goal direction", 3),
     Field(
         "name", f"S{NAME_BYTES}", "ASCII", "what a setting sets, or the level's own command to do"
     ),
 )
 
-RESTS_ON = Field(
-    "operator",
-    "u4",
-    "1",
-    "newest command of an operator, here or above, that this rests on; 0: none",
+RESTS_ON = number(
+    "operator", "newest command of an operator, here or above, that this rests on; 0: none"
 )
 ANSWER = (
     RESTS_ON,
-    Field("order", "u4", "1", "command of an operator that this answers, new or not; 0: none yet"),
+    number("order", "command of an operator that this answers, new or not; 0: none yet"),
     Field("answer", "u1", Answer, "this level's answer to it"),
     Field(
         "standing",

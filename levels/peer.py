@@ -10,6 +10,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType
+from rack.levels.fields import number, real, tick
 
 DRIFT_PPM = 100
 """Largest difference between the rates of two clocks: each crystal within 50 ppm."""
@@ -34,30 +35,20 @@ PEER = MessageType(
             "1",
             "number of the launch that is there, or was last; 0: none, or in lockstep",
         ),
-        Field("launches", "u4", "1", "its launches seen so far: a number above 1 means restarts"),
-        Field("losses", "u4", "1", "how often it was lost"),
-        Field("since", "i8", "tick", "since when it is there, or lost"),
-        Field("offset", "f8", "s", "its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"),
-        Field(
-            "uncertainty",
-            "f8",
-            "s",
-            "largest error of the offset; -1: not measured yet; 0 in lockstep",
+        number("launches", "its launches seen so far: a number above 1 means restarts"),
+        number("losses", "how often it was lost"),
+        tick("since", "since when it is there, or lost"),
+        real("offset", "s", "its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"),
+        real(
+            "uncertainty", "s", "largest error of the offset; -1: not measured yet; 0 in lockstep"
         ),
-        Field(
-            "round_trip",
-            "f8",
-            "s",
-            "shortest recent round trip; -1: not measured yet; 0 in lockstep",
-        ),
-        Field(
+        real("round_trip", "s", "shortest recent round trip; -1: not measured yet; 0 in lockstep"),
+        number(
             "steps",
-            "u4",
-            "1",
             "how often its clock or ours was found to have stepped, as when a machine sleeps",
         ),
-        Field("ahead", "f8", "s", "its simulated time less that of this rack, at the same instant"),
-        Field("speed", "f8", "1", "its simulated seconds in a real one"),
+        real("ahead", "s", "its simulated time less that of this rack, at the same instant"),
+        real("speed", "1", "its simulated seconds in a real one"),
     ),
 )
 

@@ -4,15 +4,18 @@ had for it."""
 from __future__ import annotations
 
 import importlib
+import inspect
 import os
 import signal
 import sys
 from contextlib import suppress
 from functools import cache
 from types import ModuleType
+from typing import TypeVar
 
 from rack.backplane.process import die_with_parent, how_ended, readable
 
+T = TypeVar("T")
 SLOW_S = 2.0
 IMPORT_S = 60.0
 """Time after which a user hears that a module is still being imported, and after which it is
@@ -65,6 +68,27 @@ def module_and_name(reference: str, is_tried: bool = True) -> tuple[ModuleType, 
         SystemExit,
     ) as error:  # a user's module may raise anything while it is imported
         raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
+
+
+def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
+    """Return the subclass of `base` that "package.module:Class" names. Raises `LookupError` with
+    the reason. `is_tried` is that of `module_and_name`."""
+    module, name = module_and_name(reference, is_tried)
+    found = getattr(module, name, None)
+    if not isinstance(found, type) or not issubclass(found, base):
+        kinds = [
+            n
+            for n, c in inspect.getmembers(module, inspect.isclass)
+            if issubclass(c, base) and c is not base
+        ]
+        what = "has no class" if found is None else f"has no {base.__name__} named"
+        raise LookupError(
+            f"module '{module.__name__}' {what} '{name}'; it has: {', '.join(kinds) or 'none'}"
+        )
+    if inspect.isabstract(found):
+        missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
+        raise LookupError(f"class '{name}' lacks: {missing}")
+    return found
 
 
 # A config is checked for many mistakes, and each may need the module.

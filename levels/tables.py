@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import inspect
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import pairwise
@@ -30,7 +30,7 @@ from pydantic.fields import FieldInfo
 
 from rack.backplane.bounded_toml import load_toml
 from rack.levels.errors import LevelError
-from rack.levels.references import module_and_name
+from rack.levels.references import find_class
 
 # No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them
 # stay finite. pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
@@ -157,22 +157,11 @@ def set_live(params: Params, setting: str) -> tuple[Params, str]:
 
 
 def named_class(reference: str, base: type[T]) -> type[T]:
-    """Return the class that "package.module:Class" names. Raises `ValueError`: it is missing, or no
-    whole `base`."""
+    """Return the subclass of `base` that "package.module:Class" names. Raises `ValueError`."""
     try:
-        module, name = module_and_name(reference)
+        return find_class(reference, base)
     except LookupError as error:
         raise ValueError(str(error)) from error
-    found = getattr(module, name, None)
-    if found is None:
-        raise ValueError(f"module '{module.__name__}' has no class '{name}'")
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise ValueError(f"'{name}' is not a subclass of {base.__module__}.{base.__name__}")
-    if inspect.isabstract(found):
-        raise ValueError(
-            f"class '{name}' lacks: {', '.join(sorted(getattr(found, '__abstractmethods__', ())))}"
-        )
-    return found
 
 
 class SensorConfig(Table):
@@ -382,12 +371,19 @@ class RobotConfig(Table):
     """keys of this table whose values were guessed, as in gripper.force: an arm that is not
     simulated is not enabled before each is confirmed, by removing it here"""
 
-    @property
-    def per_joint(self) -> dict[str, tuple[Any, ...] | None]:
-        """The lists with one value per joint, by key; None: not given."""
+    def misfits(self) -> Iterator[tuple[str, Any, str]]:
+        """Yield key, values and reason for every list without one value per joint."""
+        joints = len(self.joints)
         keys = ("home", "start", "velocity", "acceleration", "jerk", "torque", "position")
         lists = {key: getattr(self, key) for key in keys}
-        return {**lists, "calibration.offset": self.calibration.offset}
+        lists["calibration.offset"] = self.calibration.offset
+        for key, values in lists.items():
+            if values is not None and len(values) != joints:
+                yield key, values, f"{len(values)} values; permitted: {joints}, one per joint"
+        for key, values in self.sensors or ():
+            if isinstance(values, tuple) and len(values) != joints:
+                permitted = f"one for all joints, or {joints}, one per joint"
+                yield f"sensors.{key}", values, f"{len(values)} values; permitted: {permitted}"
 
     @field_validator("guessed")
     @classmethod

@@ -6,11 +6,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.algebra import Array, Mask
+from rack.levels.compiled import compiled, compiled_for
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import SCENE, WORLD_MODEL
 from rack.levels.tables import Positive, Table, read_params
@@ -58,19 +57,7 @@ class WorldModel(Executor):
     @classmethod
     def preload(cls) -> None:
         """Load the compiled function."""
-        poses = np.zeros((1, 7))
-        rules = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-        vectors = np.zeros((1, 3))
-        find_motion.load()(
-            vectors,
-            np.zeros((1, 4)),
-            poses,
-            poses,
-            np.zeros(1, dtype=bool),
-            np.zeros(1),
-            vectors,
-            rules,
-        )
+        find_motion.preload()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Update from a new scene; when one is missing, keep poses and set velocities to zero."""
@@ -104,13 +91,15 @@ class WorldModel(Executor):
         return self._find(scene.position, scene.quaternion, *memory, velocity, rules)
 
 
-@compiled
+@compiled_for(
+    "f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], b1[::1], f8[::1], f8[:,::1], UniTuple(f8, 6)"
+)
 def find_motion(
     position: Array,  # (bodies, 3), m: as sensed
     quaternion: Array,  # (bodies, 4)
     last: Array,  # (bodies, 7): the same in the last scene; set to this one
     rest: Array,  # (bodies, 7): where bodies rested last
-    moving: NDArray[np.bool_],  # (bodies,)
+    moving: Mask,  # (bodies,)
     slow_s: Array,  # (bodies,): time for which they have been slow
     velocity: Array,  # (bodies, 3), m/s: set; zero for bodies at rest
     rules: tuple[float, float, float, float, float, float],

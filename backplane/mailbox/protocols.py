@@ -53,7 +53,10 @@ class MailboxLock:
     def acquire(self) -> bool:
         """Take the lock within its bound; False when a living holder keeps it."""
         if not self._semaphore.acquire(self._wait_s):
-            self._check_holder()
+            holder = self._box[_OWNER]
+            # It may have released the lock, and ended, since.
+            if holder and state_of(holder) in GONE + STOPPED and self._box[_OWNER] == holder:
+                self.held_up += 1
         # After a timeout, the kernel's lock is free if the semaphore's holder is dead; one of
         # several waiters gets it. After a successful wait it may be taken: such a waiter got in
         # between the two steps and is the owner.
@@ -61,12 +64,6 @@ class MailboxLock:
             return False
         self._box[_OWNER] = self._pid
         return True
-
-    def _check_holder(self) -> None:
-        holder = self._box[_OWNER]
-        # It may have released the lock, and ended, since.
-        if holder and state_of(holder) in GONE + STOPPED and self._box[_OWNER] == holder:
-            self.held_up += 1
 
     def release(self) -> None:
         """Release the lock. Only its owner may."""

@@ -179,7 +179,9 @@ class QueueReader(Reader):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
-        self.taken = self._last_position(segment)
+        written = int(Reader(segment, taken_name(name)).peek().value.taken)
+        taken, rest = divmod(self._box[_POSITION], 3)
+        self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
         # The value of a reading without a new message, until there is one.
         if self.taken and self._obtain(self.taken):
@@ -202,26 +204,39 @@ class QueueReader(Reader):
         earlier = list[Message]()
         head = box[_HEAD]
         last = min(box[_SENT], self.taken + self._depth)
-        if head > last:
-            self._blame_intruder(head)
+        if head > last and self.slots.fetch(head) and not self.slots.is_lawful(self._signature):
+            # Count a message that is not the writer's, and that its next one will replace: it is
+            # not taken.
+            self.statistics.bad_reads += 1
+            self._count_forged()
         while count < most and self._sees(self.taken + 1, last, tick):
             before = bytes(self.message.raw) if count else b""
             if not self._obtain(self.taken + 1):
-                self._count_bad(self.taken + 1)
+                # Count the fault of the message fetched last, which is not good.
+                slots = self.slots
+                statistics = self.statistics
+                statistics.bad_reads += 1
+                if slots.serial != self.taken + 1:
+                    statistics.lost += 1
+                elif not slots.is_sound:
+                    statistics.corrupt += 1
+                else:
+                    self._count_forged()
             else:
                 if count:
                     earlier.append(Message(self.slots.dtype, memoryview(bytearray(before))))
                 count += 1
             self.taken += 1
-        self._publish_position(last, tick, now)
+        newest = self.taken
+        while self._sees(newest + 1, last, tick):
+            newest += 1
+        self._box[_POSITION] = 3 * self.taken
+        position = self._position
+        _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
+        position.write(tick, now)
         if not count:
             return self._unchanged
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
-
-    def _last_position(self, segment: Segment) -> int:
-        written = int(Reader(segment, taken_name(self.spec.name)).peek().value.taken)
-        taken, rest = divmod(self._box[_POSITION], 3)
-        return written if rest else max(written, taken)
 
     def _sees(self, serial: int, last: int, tick: int) -> bool:
         """Say whether a message may be read, or is not there to wait for; no good one is visible
@@ -230,34 +245,6 @@ class QueueReader(Reader):
             return False
         ahead = self._heads[serial & self._mask][_VISIBLE] - tick
         return ahead <= 0 or (ahead > self._farthest and not self.slots.fetch(serial))
-
-    def _publish_position(self, last: int, tick: int, now: int | None) -> None:
-        newest = self.taken
-        while self._sees(newest + 1, last, tick):
-            newest += 1
-        self._box[_POSITION] = 3 * self.taken
-        position = self._position
-        _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
-        position.write(tick, now)
-
-    def _count_bad(self, serial: int) -> None:
-        """Count the fault of the message fetched last, which is not good."""
-        slots = self.slots
-        statistics = self.statistics
-        statistics.bad_reads += 1
-        if slots.serial != serial:
-            statistics.lost += 1
-        elif not slots.is_sound:
-            statistics.corrupt += 1
-        else:
-            self._count_forged()
-
-    def _blame_intruder(self, serial: int) -> None:
-        """Count a message that is not the writer's, and that its next one will replace: it is not
-        taken."""
-        if self.slots.fetch(serial) and not self.slots.is_lawful(self._signature):
-            self.statistics.bad_reads += 1
-            self._count_forged()
 
     def close(self) -> None:
         """Release the claim."""

@@ -146,7 +146,9 @@ class Slots:
         words[_STAMP] = monotonic_ns()
         self.places[at][:] = self.record
         if damage:
-            self._flip(serial, damage)
+            message = self.places[serial & self.mask][SLOT_HEAD_SIZE:]
+            for bit in damage:
+                message[bit >> 3] ^= 1 << (bit & 7)
         box[0] = serial
         return intruder
 
@@ -154,11 +156,6 @@ class Slots:
         """Publish a serial without filling its slot."""
         self.words[_SERIAL] += 1
         self.box[0] = self.words[_SERIAL]
-
-    def _flip(self, serial: int, bits: Sequence[int]) -> None:
-        message = self.places[serial & self.mask][SLOT_HEAD_SIZE:]
-        for bit in bits:
-            message[bit >> 3] ^= 1 << (bit & 7)
 
     def holds(self, serial: int) -> bool:
         """Say whether that serial's slot holds its message, not an older or a newer one."""

@@ -105,7 +105,12 @@ class SilenceWatch:
         newest = self._reader.newest
         age = tick - newest
         if age >= self.quiet:
-            self._investigate(tick, age)
+            pid = pid_of(self._slots.box[_CLAIMANT])
+            # The loss may be marked already, and a new process may exist that does not cycle yet.
+            if age >= self._stale_after and (self._block[_LOST] or self._task.is_gone(pid, tick)):
+                self._report(Alarm.STALE, tick, age)
+            elif self._is_mute(tick):
+                self._report(Alarm.MUTE, tick, age)
             if tick - max(newest, self._task.since) >= self._lost_after:
                 return True
         return self.is_writer_lost(tick)
@@ -115,14 +120,6 @@ class SilenceWatch:
         # From the tick after the loss: within that tick the answer would depend on which process is
         # faster.
         return self._reader.newest != NOT_YET and 0 < self._block[_LOST] <= tick
-
-    def _investigate(self, tick: int, age: int) -> None:
-        pid = pid_of(self._slots.box[_CLAIMANT])
-        # The loss may be marked already, and a new process may exist that does not cycle yet.
-        if age >= self._stale_after and (self._block[_LOST] or self._task.is_gone(pid, tick)):
-            self._report(Alarm.STALE, tick, age)
-        elif self._is_mute(tick):
-            self._report(Alarm.MUTE, tick, age)
 
     def _is_mute(self, tick: int) -> bool:
         """Say whether the writer has finished a release that writes a message, and the newest is of

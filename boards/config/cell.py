@@ -22,7 +22,7 @@ def with_derived(config: RackConfig) -> RackConfig:
     robot = config.robot
     if robot is None or (robot.joints and robot.tool and robot.home):
         return config
-    from rack.levels.robot.derived import derived
+    from rack.levels.robot.lookup import derived
 
     try:
         return config.model_copy(update={"robot": derived(robot)})

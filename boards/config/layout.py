@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -293,7 +292,12 @@ def _specs(kind: MessageType, of: np.dtype) -> tuple[FieldSpec, ...]:
         if isinstance(field.kind, MessageType):
             type_name = f"V{scalar.itemsize}"
             inner = _specs(field.kind, scalar)
-        unit, values = _unit(field.unit)
+        unit = field.unit
+        values: tuple[tuple[str, int], ...] = ()
+        if not isinstance(unit, str):
+            # An enum: its numbers have names.
+            values = tuple((number.name.lower(), int(number)) for number in unit)
+            unit = unit.__name__
         specs.append(
             FieldSpec(
                 name=field.name,
@@ -308,10 +312,3 @@ def _specs(kind: MessageType, of: np.dtype) -> tuple[FieldSpec, ...]:
             )
         )
     return tuple(specs)
-
-
-def _unit(unit: str | type[IntEnum]) -> tuple[str, tuple[tuple[str, int], ...]]:
-    """Return the name of a unit, and the names of its numbers if it is an enum."""
-    if isinstance(unit, str):
-        return unit, ()
-    return unit.__name__, tuple((number.name.lower(), int(number)) for number in unit)

@@ -31,7 +31,6 @@ from rack.boards.classes import find_class
 from rack.boards.crate.line import received
 from rack.boards.crate.output import HostOutput
 from rack.boards.crate.requests import (
-    CellConfig,
     Compiling,
     Ended,
     Forked,
@@ -143,7 +142,12 @@ class Crate:
             if reference not in self._preloaded and not self._is_preloaded(reference):
                 return
         if wanted.cell is not None:
-            _compile_cell(wanted.cell)
+            # Compile the cell, once for all boards. A cell with mistakes is the Rack's to
+            # report.
+            from rack.levels.robot.cell import build_cell
+
+            with suppress(RobotError):
+                build_cell(wanted.cell.robot, wanted.cell.scene, wanted.cell.clock_ns)
         compiled.on_compile = compiled.unheard
         gc.freeze()
         gc.enable()
@@ -299,14 +303,6 @@ class Crate:
     def _reap_ended(self, timeout_ms: int | None) -> None:
         for pidfd, _ in self._poll.poll(timeout_ms):
             self._reap(pidfd)
-
-
-def _compile_cell(cell: CellConfig) -> None:
-    """Compile the cell, once for all boards. A cell with mistakes is the Rack's to report."""
-    from rack.levels.robot.cell import build_cell
-
-    with suppress(RobotError):
-        build_cell(cell.robot, cell.scene, cell.clock_ns)
 
 
 def main() -> None:

@@ -125,10 +125,3 @@ def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
             wanted.setdefault(obtained_core(core), []).append(task)
     both = sorted(wanted.keys() & held.keys()) if config.clock.mode == "realtime" else []
     return [f"core {core}, requested by {', '.join(wanted[core])}: {held[core]}" for core in both]
-
-
-def occupied(held: Mapping[int, Holder]) -> list[str]:
-    """Return a line for every core if other racks occupy all of them: the launch is slow then, and
-    a rack in lockstep too."""
-    cores = os.sched_getaffinity(0)
-    return [f"core {core}: {held[core]}" for core in sorted(cores)] if cores <= held.keys() else []

@@ -43,7 +43,11 @@ class OneProcess:
 
     def __init__(self, config: RackConfig) -> None:
         plan = resolve(config)
-        if boards := [spec.name for spec in plan.layout.mailboxes if needs_boards(spec)]:
+        if boards := [
+            spec.name
+            for spec in plan.layout.mailboxes
+            if spec.exchanges or spec.capacity or spec.interrupt is not None
+        ]:
             why = "a queue, an exchange or interrupts, which only a rack with boards has"
             raise LaunchError(f"{', '.join(boards)}: {why}")
         if plan.hosts:
@@ -108,11 +112,6 @@ class OneProcess:
         """The number of the newest message of each mailbox that has one, as in `newest`."""
         newest = {name: post.newest(self.tick - 1) for name, post in self._posts.items()}
         return {name: found[0] for name, found in newest.items() if found is not None}
-
-
-def needs_boards(spec: MailboxSpec) -> bool:
-    """Say whether what a mailbox holds depends on boards, and not on ticks alone."""
-    return bool(spec.exchanges or spec.capacity or spec.interrupt is not None)
 
 
 class Post:

@@ -29,12 +29,12 @@ from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.config.commands import asked, request
 from rack.boards.config.resolved import classes, load, resolve
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.alarm_events import AlarmWatch, RungAlarm
+from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.lateness import judge_lost_cycles
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.neighbours import conflicts, holders, occupied, placed
+from rack.boards.crate.neighbours import conflicts, holders, placed
 from rack.boards.crate.patience import Patience, RackAwaited, await_opened
 from rack.boards.crate.recovery import HostBoards, LostBoards, Recovery, Supervision
 from rack.boards.crate.requests import (
@@ -174,7 +174,7 @@ class Rack:
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
         # Reported first, because the next steps take long on occupied cores.
-        for note in shared or occupied(held):
+        for note in shared:
             self._journal.add("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
@@ -189,7 +189,12 @@ class Rack:
         self.segment = self._journal.segment = Segment.create(
             plan.layout, self.config.text(), plan.published.text()
         )
-        self._set_words()
+        words = self.segment.words
+        clock = self.config.clock
+        # The latch is set at first: until it is reset, the brakes stay engaged.
+        words[System.EMERGENCY_STOP] = 1
+        words[System.LOCKSTEP] = clock.mode == "lockstep"
+        words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
         if self._origin is not None:
             import_module(RESTORING).continue_in(self.segment, self._origin)
         semaphores.create(plan.layout)
@@ -208,14 +213,6 @@ class Rack:
         self._inject()
         for note in (*moved, *plan.notes(self.segment)):
             self._journal.add("ready", "", note)
-
-    def _set_words(self) -> None:
-        words = self.segment.words
-        clock = self.config.clock
-        # The latch is set at first: until it is reset, the brakes stay engaged.
-        words[System.EMERGENCY_STOP] = 1
-        words[System.LOCKSTEP] = clock.mode == "lockstep"
-        words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
 
     def _await_ready(self) -> None:
         patience = Patience(self._journal, LAUNCH_S)
@@ -332,10 +329,19 @@ class Rack:
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
             self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
-            self._record_stop()
+            if self._why_stopped and self._stop_by is None:
+                self._stop_by = time.monotonic() + STOP_S
+                self._journal.add("stop", "", self._why_stopped)
             self._record_printed()
             for rung in self._alarms.drain():
-                self._act_on(rung)
+                # Record the event of an alarm, and kill a process that hangs.
+                self._journal.keep(rung.event)
+                if rung.alarm == Alarm.HANG:
+                    task = pick(self._plan.layout.tasks, rung.subject, "task")
+                    self._recovery.end_hanging(task.name)
+                elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self._pids.get(CLOCK):
+                    # Only the clock that was reported: its successor may be running by now.
+                    self._recovery.end_hanging(CLOCK)
             for board in self._heartbeat.hanging():
                 self._journal.add(
                     "detection", "rack", f"'{board}' is not responding", "hang", subject=board
@@ -362,11 +368,6 @@ class Rack:
     def _record_printed(self) -> None:
         for line in self._line.printed():
             self._journal.add("ready" if line.startswith(UNKEPT) else "printed", "", line)
-
-    def _record_stop(self) -> None:
-        if self._why_stopped and self._stop_by is None:
-            self._stop_by = time.monotonic() + STOP_S
-            self._journal.add("stop", "", self._why_stopped)
 
     def command(
         self, level: str, what: str, tick: int | None = None, **goal: object
@@ -415,16 +416,6 @@ class Rack:
             case None:
                 self._losses.lose_crate()
 
-    def _act_on(self, rung: RungAlarm) -> None:
-        """Record the event of an alarm, and kill a process that hangs."""
-        self._journal.keep(rung.event)
-        if rung.alarm == Alarm.HANG:
-            task = pick(self._plan.layout.tasks, rung.subject, "task")
-            self._recovery.end_hanging(task.name)
-        elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self._pids.get(CLOCK):
-            # Only the clock that was reported: its successor may be running by now.
-            self._recovery.end_hanging(CLOCK)
-
     def _end(self) -> None:
         """Record the end of the run (cause, ticks, digest) and let the boards end."""
         for rung in self._alarms.drain():
@@ -447,7 +438,10 @@ class Rack:
             # Written so that NaN is too far.
             faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
         self._end_boards()
-        self._await_last_cycles()
+        # Wait until boards have finished the cycles that they have begun, at most LAST_S.
+        patience = Patience(self._journal, LAST_S)
+        while any(map(self._is_cycling, self._pids)) and not patience.is_over:
+            self._listen(patience.left_s)
         late, excused = judge_lost_cycles(self.segment, self.config, stop)
         self.outcome = Outcome(
             cause=cause,
@@ -461,12 +455,6 @@ class Rack:
             excused=tuple(excused),
         )
         self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
-
-    def _await_last_cycles(self) -> None:
-        """Wait until boards have finished the cycles that they have begun, at most `LAST_S`."""
-        patience = Patience(self._journal, LAST_S)
-        while any(map(self._is_cycling, self._pids)) and not patience.is_over:
-            self._listen(patience.left_s)
 
     def _is_cycling(self, name: str) -> bool:
         if self._losses.is_beyond_help or name not in self.segment.map.blocks:
@@ -495,7 +483,10 @@ class Rack:
         try:
             if hasattr(self, "segment"):
                 self._end_boards()
-            if self._losses.given_up or self._has_lost():
+            if self._losses.given_up or (
+                hasattr(self, "segment")
+                and any(self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks)
+            ):
                 crate.ask(PowerOff())
             # A crate without boards may still be importing: do not wait for it.
             crate.close(LEAVE_S if self._pids else 0)
@@ -504,12 +495,6 @@ class Rack:
             remove_own(self.config.name)
             if hasattr(self, "segment"):
                 self.segment.close()
-
-    def _has_lost(self) -> bool:
-        """Say whether a board is lost, and so may not end by itself."""
-        return hasattr(self, "segment") and any(
-            self.segment.block(t.name)[Block.LOST] for t in self._plan.layout.tasks
-        )
 
     @property
     def _is_stopped(self) -> bool:

@@ -218,7 +218,13 @@ class FaultStage:
             # A running cycle finishes with the faults with which it began.
             self._rack.driver.settle()
         for entry in over:
-            self._finish(entry, tick)
+            entry.words[Entry.STAGE] = Stage.OVER
+            # Some end early: they strike once, or have lost their object.
+            entry.words[Entry.UNTIL] = min(entry[Entry.UNTIL], tick)
+            self._words[System.FAULTS] += 1
+            _step(entry).end(self._rack, entry, tick)
+            self._alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry[Entry.COUNT])
+            self._await_messages(entry)
         for entry in due:
             self._begin(entry, tick)
         active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
@@ -282,15 +288,6 @@ class FaultStage:
             self._phased.append(entry)
         else:
             _step(entry).begin(self._rack, entry, tick)
-
-    def _finish(self, entry: FaultEntry, tick: int) -> None:
-        entry.words[Entry.STAGE] = Stage.OVER
-        # Some end early: they strike once, or have lost their object.
-        entry.words[Entry.UNTIL] = min(entry[Entry.UNTIL], tick)
-        self._words[System.FAULTS] += 1
-        _step(entry).end(self._rack, entry, tick)
-        self._alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry[Entry.COUNT])
-        self._await_messages(entry)
 
     def _await_messages(self, entry: FaultEntry) -> None:
         layout = self._segment.layout

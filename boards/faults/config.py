@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from rack.backplane.checked import pick
-from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
+from rack.backplane.layout import FieldSpec, Layout
 from rack.levels.tables import Finite, Moment, Table, Tick
 
 CONDITION = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
@@ -81,7 +81,11 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
     if found[1] not in mailboxes:
         raise LookupError(f"no mailbox '{found[1]}'; mailboxes: {', '.join(mailboxes)}")
     mailbox = layout.mailboxes[mailboxes[found[1]]]
-    fields = _integers(mailbox)
+    fields = {
+        f.name: f
+        for f in mailbox.fields
+        if not f.fields and not f.shape and np.dtype(f.kind).kind in "iu"
+    }
     if found[2] not in fields:
         raise LookupError(
             f"'{mailbox.name}' has no integer field '{found[2]}'; integer fields:"
@@ -97,15 +101,6 @@ def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
     field = pick(mailbox.fields, when[1], "field")
     names = {number: name for name, number in field.values}
     return f"{mailbox.name}.{field.name} == {names.get(when[2], when[2])}"
-
-
-def _integers(mailbox: MailboxSpec) -> dict[str, FieldSpec]:
-    """Return the fields that a condition may test: scalar integers."""
-    return {
-        f.name: f
-        for f in mailbox.fields
-        if not f.fields and not f.shape and np.dtype(f.kind).kind in "iu"
-    }
 
 
 def _value(text: str, field: FieldSpec) -> int:

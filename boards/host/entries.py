@@ -14,11 +14,12 @@ from pydantic import ValidationError, model_validator
 from rack.backplane.mailbox.host_ring import HostReader
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer, open_writer
-from rack.backplane.message import Field, MessageType, fill_counts
+from rack.backplane.message import MessageType, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block
 from rack.boards.wiring import Rows
+from rack.levels.fields import number, tick
 from rack.levels.level import Ports
 from rack.levels.tables import LAST_TICK, Table
 
@@ -31,22 +32,13 @@ ENTRY = MessageType(
     "adapter_entry",
     1,
     (
-        Field("passed", "u4", "1", "messages passed to the other side"),
-        Field(
-            "refused", "u4", "1", "messages refused: damaged, forged, or not what its type permits"
-        ),
-        Field("superseded", "u4", "1", "messages that a newer one overtook before the exchange"),
-        Field(
-            "full", "u4", "1", "messages that the host board could not send, since too many waited"
-        ),
-        Field("waiting", "u4", "1", "messages that wait for the next cycles"),
-        Field(
-            "arrived",
-            "i8",
-            "tick",
-            "tick at which the newest message reached the other side; -1: none yet",
-        ),
-        Field("age", "i8", "tick", "time since that message was written; -1: none yet"),
+        number("passed", "messages passed to the other side"),
+        number("refused", "messages refused: damaged, forged, or not what its type permits"),
+        number("superseded", "messages that a newer one overtook before the exchange"),
+        number("full", "messages that the host board could not send, since too many waited"),
+        number("waiting", "messages that wait for the next cycles"),
+        tick("arrived", "tick at which the newest message reached the other side; -1: none yet"),
+        tick("age", "time since that message was written; -1: none yet"),
     ),
 )
 """One entry, in the status of its bridge."""

@@ -69,15 +69,12 @@ class InterruptHandler:
         if inbox.inbox.most_waiting > self._block[_WAITING]:
             self._block[_WAITING] = inbox.inbox.most_waiting
         if inbox.inbox.lost != sum(self._lost):
-            self._report(tick)
-
-    def _report(self, tick: int) -> None:
-        """Count the messages lost in the inbox, and raise an alarm for each mailbox."""
-        for at, (line, episodes) in enumerate(self._lines):
-            if lost := line.lost - self._lost[at]:
-                self._lost[at] = line.lost
-                self._block[_LOST] += lost
-                episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
+            # Count the messages lost in the inbox, and raise an alarm for each mailbox.
+            for at, (line, episodes) in enumerate(self._lines):
+                if lost := line.lost - self._lost[at]:
+                    self._lost[at] = line.lost
+                    self._block[_LOST] += lost
+                    episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
 
 
 def interrupted(

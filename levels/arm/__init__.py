@@ -1,9 +1,9 @@
 """The arm: its interface to the servo level, the simulated one, and the faults injected between the
 two."""
 
+from rack.levels import compiled
 from rack.levels.arm import drives, poses, substeps
-from rack.levels.arm.arm import Arm, DriveState, JointTarget, Link, Sensed, find_arm
-from rack.levels.arm.calibration import CalibratedLink
+from rack.levels.arm.arm import Arm, CalibratedLink, DriveState, JointTarget, Link, Sensed, find_arm
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.present import PresentLink
@@ -28,5 +28,4 @@ __all__ = [
 
 def preload() -> None:
     """Load the compiled functions of an arm, for any robot: see `Executor.preload`."""
-    for module in (dynamics, substeps, drives, poses):
-        module.preload()
+    compiled.preload(dynamics, substeps, drives, poses)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import Array, cholesky_solve, mat_vec, solve
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled, compiled_for
 from rack.levels.robot.dynamics import BIAS_ROW, FRICTION_SPEED, INERTIA_ROW, STATE_ROWS, Dynamics
 from rack.levels.robot.limits import EDGE_TIMING_S, Bounds, Encoders
 
@@ -133,7 +133,7 @@ class LimitGate:
         return speed_towards(distance, speed, self._fastest, self._braking, self._period_s)
 
 
-@compiled
+@compiled_for("f8[::1], f8[:,::1], f8[:,::1], f8")
 def is_clear(
     torque: Array,
     evaluation: Array,  # of the equation of motion: (3 + joints, joints)
@@ -177,7 +177,7 @@ def is_clear(
     return True
 
 
-@compiled
+@compiled_for("f8[:,::1], f8[:,::1], f8[:,::1], f8, i8[:,::1], f8[::1]")
 def give(
     torques: Array,  # (3, joints), N m: asked for, as commanded, as given
     evaluation: Array,  # this and the next two as for `is_clear`, evaluated at any state
@@ -241,7 +241,7 @@ class CoarseSensors:
         return sample
 
 
-@compiled
+@compiled_for("f8[:,::1], i8, i8, f8[:,::1], f8[:,::1]")
 def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Array) -> None:
     """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to
     multiples of `step`."""
@@ -260,7 +260,7 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
                 )
 
 
-@compiled
+@compiled_for("i8, i8, i8")
 def uniform(seed: int, tick: int, count: int) -> Array:
     """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick
     alone."""
@@ -276,13 +276,3 @@ def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return bits ^ (bits >> np.uint64(31))
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    none = np.zeros(0)
-    table = np.zeros((6, 0))
-    places = np.zeros((4, 0), dtype=int)
-    is_clear.load()(none, table, table, 1.0)
-    give.load()(table, table, table, 1.0, places, none)
-    sense_coarsely.load()(table, 0, 0, table, table)

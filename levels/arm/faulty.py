@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.arm.arm import Arm, JointTarget, Link, Sensed
 from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
@@ -78,7 +77,7 @@ class FaultyLink:
         most = self._most() if self._motors else None
         self._arm.weaken(most)
 
-    def _joints(self, fault: Fault) -> NDArray[np.bool_]:
+    def _joints(self, fault: Fault) -> Mask:
         return (
             np.full(len(self._limits), True)
             if fault.joint < 0

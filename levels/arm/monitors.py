@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.backplane.watch.alarms import Alarm
+from rack.levels.algebra import Mask
 from rack.levels.arm.substeps import Substeps
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell, unintended_contacts
@@ -49,7 +50,7 @@ class LimitMonitor:
         self._count(wrong, time_s, struck)
         return True
 
-    def _count(self, wrong: NDArray[np.bool_], time_s: float, struck: bool) -> None:
+    def _count(self, wrong: Mask, time_s: float, struck: bool) -> None:
         steps = wrong.any(axis=(1, 2))
         if struck:
             pushed = steps & ~wrong[:, 2].any(axis=1) & np.isfinite(self._seen).all(axis=(1, 2))
@@ -112,7 +113,7 @@ class ContactMonitor:
         first, second = (geom_name(self._model, geom) for geom in pair)
         return f"'{first}' touches '{second}'"
 
-    def _held(self, data: mujoco.MjData) -> NDArray[np.bool_]:
+    def _held(self, data: mujoco.MjData) -> Mask:
         """Mark (ngeom,) the geoms of free bodies that the gripper touches."""
         pairs = data.contact.geom
         others = pairs[self._gripper[pairs].any(axis=1)].ravel()

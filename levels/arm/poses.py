@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.messages import SCENE
 from rack.levels.robot.cell import Cell, sizes
 from rack.levels.robot.engine import mj_kinematics, mju_mat_to_quat, one_view
@@ -46,7 +46,7 @@ def poses(cell: Cell, data: mujoco.MjData) -> PoseViews:
     )
 
 
-@compiled
+@compiled_for("i8, i8, i8[::1], f8[::1], f8[::1], i8, f8[::1]")
 def show(
     model: int,
     data: int,
@@ -62,13 +62,3 @@ def show(
         if places[number] >= 0:
             scene[number] = memory[places[number]]
     mju_mat_to_quat(scene[quaternion:].ctypes.data, turned.ctypes.data)
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data = mujoco.MjData(model)
-    turned = np.eye(3).ravel()
-    show.load()(
-        model._address, data._address, np.zeros(0, dtype=int), turned, turned, 0, np.zeros(4)
-    )

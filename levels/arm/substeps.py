@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.algebra import Array, Mask
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
     INTEGRATION,
@@ -42,7 +42,7 @@ class Substeps(NamedTuple):
     contacts: NDArray[np.int32]  # (1,), their number
     geoms: NDArray[np.int32]  # (room, 2), of the contacts
     distance: Array  # (room,), m
-    touch: NDArray[np.bool_]  # (ngeom, ngeom), True where a contact is unintended
+    touch: Mask  # (ngeom, ngeom), True where a contact is unintended
 
     @property
     def seen(self) -> Array:
@@ -73,7 +73,7 @@ def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int)
     )
 
 
-@compiled
+@compiled_for("i8, i8, i4[::1], f8[::1]")
 def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -> None:
     """Fill `state` as `save_state` does; `asleep` is MuJoCo's `tree_asleep`."""
     mj_get_state(model, data, state.ctypes.data, INTEGRATION)
@@ -82,7 +82,10 @@ def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -
         state[first + tree] = asleep[tree]
 
 
-@compiled
+@compiled_for(
+    "i8, f8, i8, i8, i8[:,::1], f8[::1], f8[:,:,::1], i4[::1], f8[:,::1], i4[:], i4[::1], "
+    "i4[:,:], f8[:], b1[:,::1]"
+)
 def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 us
     begin: int,
     end_s: float,
@@ -97,7 +100,7 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     contacts: NDArray[np.int32],
     geoms: NDArray[np.int32],
     distance: Array,
-    touch: NDArray[np.bool_],
+    touch: Mask,
 ) -> int:
     """Make the steps of a tick from number `begin` on, up to one that needs a closer look; the tick
     ends at `end_s`.
@@ -134,16 +137,3 @@ def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 u
     time_s = np.full(1, end_s)  # exactly: what steps add up to differs in the last bit
     mj_set_state(model, data, time_s.ctypes.data, TIME)
     return len(seen)
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data = mujoco.MjData(model)
-    table = np.zeros((3, 3, 0))
-    touch = np.zeros((0, 0), dtype=bool)
-    states = np.zeros((2, state_size(model)))
-    own: list[Any] = [np.zeros((4, 0), dtype=int), np.zeros(0), table, data.tree_asleep]
-    own += [states, data.warning.number, *contact_views(model, data), touch]
-    advance.load()(1, 0.0, model._address, data._address, *own)
-    copy_state.load()(model._address, data._address, data.tree_asleep, states[0])

@@ -51,8 +51,3 @@ class WristSensor:
                 angle = 2.0 * math.pi * chance[AXES + axis]
                 sample[axis] += self._noise[axis] * length * math.cos(angle)
         return np.asarray(np.clip(sample, -self._range, self._range))
-
-
-def preload() -> None:
-    """Load the compiled function of this module."""
-    uniform.load()(STREAM, 0, 2 * AXES)

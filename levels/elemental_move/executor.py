@@ -79,7 +79,19 @@ class ElementalMoveExecutor(Executor):
         self._plans.take(read.plan, self._done, self._handed_down, write.status.end)
         self._take_window(command.value, status, segments)
         if not self._error:
-            self._take_done(status, segments)
+            # Count segments that are done; fail on a grasp that holds nothing.
+            while (taken := segments.take_done(status.done)) is not None:
+                self._done = int(taken["move"])
+                self._replans_of_move = 0
+                gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
+                if (
+                    gripper is not None
+                    and taken["opening"] == gripper.closed
+                    and self._is_shut(status)
+                ):
+                    self._fail(
+                        Error.GRASP_MISSED, f"{closed_so_far(gripper, status)}: it holds nothing"
+                    )
             self._check_below(status, segments)
         if not self._error:
             self._replan_if_blocked(status, segments, tick)
@@ -121,17 +133,6 @@ class ElementalMoveExecutor(Executor):
             self._done = self._handed_down = first - 1
             self._error = Error.NONE
             self._reason = ""
-
-    def _take_done(self, status: Message, segments: SegmentWindow) -> None:
-        """Count segments that are done; fail on a grasp that holds nothing."""
-        while (taken := segments.take_done(status.done)) is not None:
-            self._done = int(taken["move"])
-            self._replans_of_move = 0
-            gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
-            if gripper is not None and taken["opening"] == gripper.closed and self._is_shut(status):
-                self._fail(
-                    Error.GRASP_MISSED, f"{closed_so_far(gripper, status)}: it holds nothing"
-                )
 
     def _check_below(self, status: Message, segments: SegmentWindow) -> None:
         """Fail when the level below has failed, or the held object is lost."""
@@ -194,7 +195,15 @@ class ElementalMoveExecutor(Executor):
 
     def _hand_down(self, move: Any, segments: SegmentWindow, tick: int) -> bool:
         if move["verb"] in (Verb.GRASP, Verb.RELEASE):
-            return self._hand_down_gripper(move, segments)
+            gripper = self._gripper
+            if gripper is None:
+                self._fail(
+                    Error.UNREACHABLE, f"move {move['id']} needs a gripper; the robot has none"
+                )
+                return False
+            opening = gripper.closed if move["verb"] == Verb.GRASP else gripper.open
+            segments.add_gripper(move, opening, gripper.force)
+            return True
         plan = self._plans.of(int(move["id"]))
         if plan is None:
             return False
@@ -203,15 +212,6 @@ class ElementalMoveExecutor(Executor):
                 self._wait(plan, tick)
             return False
         segments.add_path(move, plan, self._time_below(float(move["by"])))
-        return True
-
-    def _hand_down_gripper(self, move: Any, segments: SegmentWindow) -> bool:
-        gripper = self._gripper
-        if gripper is None:
-            self._fail(Error.UNREACHABLE, f"move {move['id']} needs a gripper; the robot has none")
-            return False
-        opening = gripper.closed if move["verb"] == Verb.GRASP else gripper.open
-        segments.add_gripper(move, opening, gripper.force)
         return True
 
     def _wait(self, refusal: Message, tick: int) -> None:
@@ -261,15 +261,7 @@ class ElementalMoveExecutor(Executor):
         report.error = self._error
         report.reason = self._reason if self._error else waits
         report.operated = status.operated or self._orders.stands
-        self._report_move(command, status, segments, report)
-        self._report_plans(command, status, segments, report)
-        report.replan = self._request
-        report.start = status.position
-
-    def _report_move(
-        self, command: Message, status: Message, segments: SegmentWindow, report: Message
-    ) -> None:
-        """Report what is done, and the progress of the move under way."""
+        # Report what is done, and the progress of the move under way.
         under_way = segments.first if segments.count else None
         report.done = self._done
         report.held = status.held
@@ -283,11 +275,7 @@ class ElementalMoveExecutor(Executor):
             if report.current and under_way_at.size
             else Verb.NONE
         )
-
-    def _report_plans(
-        self, command: Message, status: Message, segments: SegmentWindow, report: Message
-    ) -> None:
-        """Report how far moves are planned: the planner continues from there."""
+        # Report how far moves are planned: the planner continues from there.
         report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
         end = self._plans.end(report.planned)
         if end is None:
@@ -297,6 +285,8 @@ class ElementalMoveExecutor(Executor):
             report.end = status.position
         elif end is not None:
             report.end = end
+        report.replan = self._request
+        report.start = status.position
 
     def _answer(self, read: Ports, write: Ports) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""

@@ -117,8 +117,28 @@ class ElementalMovePlanner(Planner):
             return False
         self._window = read_window(read.command.value)
         status = read.status.value
-        self._forget(status, tick)
-        self._note_grip(read)
+        # Drop paths that are done, and those that the executor should have acknowledged but
+        # has not.
+        late = tick - ACKNOWLEDGED_CYCLES * self.context.every
+        kept = [p for p in self._published if p.move.id > status.done]
+        lost = [p.move.id for p in kept if p.move.id > status.planned and p.visible_at <= late]
+        self._published = [p for p in kept if not lost or p.move.id < lost[0]]
+        # Store how the next object, still at rest, will be grasped; after a restart, how it
+        # is held.
+        world = read.world.value
+        held = read.primitive.value.held
+        done = read.status.value.done
+        if held < 0:
+            ahead = [
+                (m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done
+            ]
+            self._grip = next(
+                ((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None
+            )
+        elif self._grip is None or self._grip[0] != held:
+            scene = read.scene.value
+            tool = pose(scene.tool_position, scene.tool_quaternion)
+            self._grip = (held, grip_of(held, tool, scene))
         self._job = self._requested(read, tick) or self._blocked(read) or self._ahead(read)
         return self._job is not None and self._may_try(self._job, read.world.value.revision, tick)
 
@@ -138,7 +158,13 @@ class ElementalMovePlanner(Planner):
         except Refused as refused:
             write.error = refused.code
             write.reason = str(refused)
-            self._note_refusal(job, refused, read.world.value.revision, visible_at)
+            again_at = visible_at + round(self._params.retry / self.context.tick_s)
+            self._refusal = Refusal(
+                job.move.id, job.request, refused.code, read.world.value.revision, again_at
+            )
+            self._tries += 1
+            if not job.request:
+                self._published = [p for p in self._published if p.move.id < job.move.id]
             return
         count = len(path.waypoints)
         write.kind = SegmentKind.PATH
@@ -209,32 +235,6 @@ class ElementalMovePlanner(Planner):
                 situation = situation.after(earlier)
         return situation
 
-    def _forget(self, status: Message, tick: int) -> None:
-        """Drop paths that are done, and those that the executor should have acknowledged but has
-        not."""
-        late = tick - ACKNOWLEDGED_CYCLES * self.context.every
-        kept = [p for p in self._published if p.move.id > status.done]
-        lost = [p.move.id for p in kept if p.move.id > status.planned and p.visible_at <= late]
-        self._published = [p for p in kept if not lost or p.move.id < lost[0]]
-
-    def _note_grip(self, read: Ports) -> None:
-        """Store how the next object, still at rest, will be grasped; after a restart, how it is
-        held."""
-        world = read.world.value
-        held = read.primitive.value.held
-        done = read.status.value.done
-        if held < 0:
-            ahead = [
-                (m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done
-            ]
-            self._grip = next(
-                ((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None
-            )
-        elif self._grip is None or self._grip[0] != held:
-            scene = read.scene.value
-            tool = pose(scene.tool_position, scene.tool_quaternion)
-            self._grip = (held, grip_of(held, tool, scene))
-
     def _may_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
         """Return whether a job may be tried: a refused one only after a change of the world, or
         after `retry`."""
@@ -245,15 +245,6 @@ class ElementalMovePlanner(Planner):
         return refusal.error == Error.NO_PATH and (
             revision != refusal.revision or tick >= refusal.again_at
         )
-
-    def _note_refusal(
-        self, job: PlanningJob, refused: Refused, revision: int, visible_at: int
-    ) -> None:
-        again_at = visible_at + round(self._params.retry / self.context.tick_s)
-        self._refusal = Refusal(job.move.id, job.request, refused.code, revision, again_at)
-        self._tries += 1
-        if not job.request:
-            self._published = [p for p in self._published if p.move.id < job.move.id]
 
     def _note_path(self, job: PlanningJob, path: Path, visible_at: int) -> None:
         self._refusal = None

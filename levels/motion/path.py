@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rack.levels.algebra import Array, norm
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 
 COINCIDENT_RAD = 1e-7
 """Waypoints closer than this count as one, and a shorter blend counts as none."""
@@ -163,7 +163,7 @@ class BlendedPath:
         return PathBounds(first, second, third)
 
 
-@compiled
+@compiled_for("f8[:,::1], f8[:,:,::1], f8, f8[:,::1]")
 def set_point(
     marks: Array,  # (pieces, 3), rad: s where it begins, s of its waypoint, its blend; 0: a line
     table: Array,  # (pieces, 3, joints): the waypoint, rad, the direction there, its change
@@ -194,7 +194,7 @@ def set_point(
             point[2, j] = change[j] * second
 
 
-@compiled
+@compiled_for("f8[:,::1], f8[:,:,::1], f8[::1]")
 def points_at(marks: Array, table: Array, places: Array) -> Array:
     """Return the points of a path at `places` (n,), rad: (n, joints), rad."""
     points = np.empty((len(places), table.shape[2]))
@@ -203,14 +203,6 @@ def points_at(marks: Array, table: Array, places: Array) -> Array:
         set_point(marks, table, places[k], point)
         points[k] = point[0]
     return points
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    marks = np.zeros((1, 3))
-    table = np.zeros((1, 3, 1))
-    set_point.load()(marks, table, 0.0, table[0])
-    points_at.load()(marks, table, marks[0])
 
 
 def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:

@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.algebra import Array, Ints
+from rack.levels.compiled import compiled, compiled_for
 from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
@@ -254,7 +254,7 @@ class CollisionChecker:
         reached, opening = max(found)
         return float(opening) if reached > found[0][0] + self._margin else None
 
-    def _carriers(self) -> NDArray[np.int_]:
+    def _carriers(self) -> Ints:
         """Return the geoms of the fixed bodies that carry the arm: some links are always near
         them."""
         m = self.cell.model
@@ -287,14 +287,12 @@ class CollisionChecker:
             self._require(touched, supports, to_supports)
             self._require(gripper, supports, self._margin)
 
-    def _require(self, some: NDArray[np.int_], others: NDArray[np.int_], distance: float) -> None:
+    def _require(self, some: Ints, others: Ints, distance: float) -> None:
         self._required[some[:, None], others] = distance
         self._required[others[:, None], some] = distance
 
 
-def farthest(
-    model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int_], axis: ArrayLike
-) -> float:
+def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike) -> float:
     """Return how far bounding boxes of geoms reach along `axis` (3,), a unit vector, from the
     origin, m."""
     # A box's extent along an axis: its half sizes times the axis in its own frame.
@@ -309,7 +307,10 @@ def farthest(
     return float(np.max(reached))
 
 
-@compiled
+@compiled_for(
+    "i8, i8, i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], i4[::1], i4[:,:], "
+    "f8[:], i8, f8, f8[:,::1]"
+)
 def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     model: int,  # address
     data: int,  # address
@@ -355,13 +356,3 @@ def carry(pose: Array, tool: Array, turned: Array, offset: Array) -> None:
     quaternion = np.empty(4)
     mju_mat_to_quat(quaternion.ctypes.data, turned.ctypes.data)
     mju_mul_quat(pose[3:].ctypes.data, quaternion.ctypes.data, offset[3:].ctypes.data)
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
-    none = np.zeros(0)
-    path = np.zeros((0, 0))
-    arrays = np.zeros(0, dtype=int), none, np.zeros(3), np.zeros(9), np.zeros(7), path
-    room = contact_views(data.model, data)
-    first_blocked.load()(data.model._address, data._address, *arrays, *room, -1, 0.0, path)

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Ints
 from rack.levels.planning.payload import SIDES, Payloads
 from rack.levels.planning.pose import Pose, site_pose
 from rack.levels.robot.cell import Cell
@@ -30,7 +30,7 @@ MOVED = 1e-6
 class FixedJaw:
     """The jaw of a cell's gripper, and the geoms that stand still with it."""
 
-    def __init__(self, cell: Cell, geoms: NDArray[np.int_], side: float) -> None:
+    def __init__(self, cell: Cell, geoms: Ints, side: float) -> None:
         self._cell = cell
         self._geoms = geoms
         self._side = side  # of the tool's y axis: 1 or -1

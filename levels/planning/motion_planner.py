@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from rack.levels import compiled
 from rack.levels.algebra import Array, mat_vec, norm
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
@@ -43,9 +44,7 @@ def preload() -> None:
     """Load what every process that plans motions needs."""
     import numpy.random  # noqa: F401  # numpy imports it at its first use
 
-    collision.preload()
-    paths.preload()
-    path_planner.preload()
+    compiled.preload(collision, paths, path_planner)
 
 
 class MotionPlanner:

@@ -15,7 +15,7 @@ import numpy as np
 from ompl import base, geometric, util
 
 from rack.levels.algebra import Array, norm
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.messages import WAYPOINTS
 from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.motion.trajectory import make_trajectory
@@ -236,7 +236,7 @@ class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
         return self._free(halved.load()(self._values(one, other), count))
 
 
-@compiled
+@compiled_for("f8[:,::1], i8")
 def halved(ends: Array, count: int) -> Array:
     """Return the places at which a line between `ends` (2, joints) in `count` parts is checked,
     (count, joints): its end, its middle, the middles of the halves, and so on."""
@@ -256,11 +256,6 @@ def halved(ends: Array, count: int) -> Array:
                 stretches[known] = half
                 known += 1
     return places
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    halved.load()(np.zeros((2, 0)), 1)
 
 
 def _simplified(

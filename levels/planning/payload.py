@@ -13,9 +13,8 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Ints
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose, pose, site_pose
@@ -152,7 +151,7 @@ class Payloads:
         # A single finger closes on a jaw of the body that carries it.
         return self._jaws_of(fingers, openings) or self._jaws_of(cell.gripper_geoms, openings)
 
-    def _jaws_of(self, fingers: NDArray[np.int_], openings: Array) -> list[Jaws]:
+    def _jaws_of(self, fingers: Ints, openings: Array) -> list[Jaws]:
         """Return the jaws that geoms make at these openings, while there are any."""
         cell = self._cell
         data = self._data
@@ -172,7 +171,7 @@ class Payloads:
             jaws.append(Jaws(float(opening), gap, length, (sides[0][1], sides[1][1])))
         return jaws
 
-    def _nearest(self, geoms: NDArray[np.int_], start: float, way: float) -> tuple[float, int]:
+    def _nearest(self, geoms: Ints, start: float, way: float) -> tuple[float, int]:
         """Return distance, m, and id of the first geom on the tool's y axis from `start`, m; inf:
         none."""
         model = self._cell.model

@@ -116,7 +116,10 @@ class PrimitiveExecutor(Executor):
         serials = window(read.command.value)
         self._plans.accept(read.plan, serials)
         if servo.error == Error.DISABLED:
-            self._await_enabling(servo)
+            # Plan from where the arm is: while it is not enabled, it may be moved by hand.
+            self._displaced = True
+            if self._memory is None:
+                self._position[:] = servo.position
         if self._tracking.update(read.status):
             self._resume(servo, tick)
         self._sight.update(read.world, servo.position, tick)
@@ -130,12 +133,6 @@ class PrimitiveExecutor(Executor):
         self._write_set_point(write.command, tick)
         self._write_status(read, write.status, serials, tick)
         self._answer(write, read.command.value.operator)
-
-    def _await_enabling(self, servo: Message) -> None:
-        """Plan from where the arm is: while it is not enabled, it may be moved by hand."""
-        self._displaced = True
-        if self._memory is None:
-            self._position[:] = servo.position
 
     def _resume(self, servo: Message, tick: int) -> None:
         """Continue from the position at which the servo holds the arm."""

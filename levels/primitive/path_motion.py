@@ -120,7 +120,16 @@ class PathMotion:
         np.multiply(d2q_ds2, ds * ds, out=acceleration)
         acceleration += np.multiply(dq_ds, dds, out=self._scratch)
         if self._bridged_s < self._bridging_s:
-            self._bridge(duration_s)
+            # Add the remaining distance to the path: a quintic from one to zero, at rest at
+            # both ends.
+            self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
+            u = self._bridged_s / self._bridging_s
+            per_s = 1.0 / self._bridging_s
+            left = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
+            rate = -30.0 * u**2 * (1.0 - u) ** 2 * per_s
+            change = -60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) * per_s**2
+            for value, factor in zip(self.set_point, (left, rate, change), strict=True):
+                value += np.multiply(self._offset, factor, out=self._scratch)
         if self.time_s >= self.trajectory.duration:
             self._come_to_rest()
         return self.set_point
@@ -149,15 +158,3 @@ class PathMotion:
         self.stopping = False
         self.set_point.velocity.fill(0.0)
         self.set_point.acceleration.fill(0.0)
-
-    def _bridge(self, duration_s: float) -> None:
-        """Add the remaining distance to the path: a quintic from one to zero, at rest at both
-        ends."""
-        self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
-        u = self._bridged_s / self._bridging_s
-        per_s = 1.0 / self._bridging_s
-        left = 1.0 - u**3 * (10.0 + u * (6.0 * u - 15.0))
-        rate = -30.0 * u**2 * (1.0 - u) ** 2 * per_s
-        change = -60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) * per_s**2
-        for value, factor in zip(self.set_point, (left, rate, change), strict=True):
-            value += np.multiply(self._offset, factor, out=self._scratch)

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.level import LevelContext
 from rack.levels.robot import lookup
@@ -55,21 +56,21 @@ class Cell:
     model: mujoco.MjModel
     """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons.
     Keyframe 0 is the start, the gripper open."""
-    qpos: NDArray[np.int_]  # (joints,), the arm's joints in qpos
-    dof: NDArray[np.int_]  # (joints,), the same in qvel
-    actuators: NDArray[np.int_]  # (joints,), their motors in ctrl; of a hand, its flexors
-    home: NDArray[np.float64]  # (joints,), rad: where tasks return to
-    begin: NDArray[np.float64]  # (joints,), rad: positions at the start
+    qpos: Ints  # (joints,), the arm's joints in qpos
+    dof: Ints  # (joints,), the same in qvel
+    actuators: Ints  # (joints,), their motors in ctrl; of a hand, its flexors
+    home: Array  # (joints,), rad: where tasks return to
+    begin: Array  # (joints,), rad: positions at the start
     homing: bool  # drives know no position before they are enabled: they find their reference
     tool: int  # site
     gripper: Gripper | None  # None: there is none
-    arm_geoms: NDArray[np.int_]  # geoms that the arm moves, gripper included
-    gripper_geoms: NDArray[np.int_]  # those of hand and fingers
-    bodies: NDArray[np.int_]  # in the order of `scene.bodies`
-    object_qpos: NDArray[np.int_]  # (objects,), first of 7 addresses of each object
-    mocap: NDArray[np.int_]  # (obstacles,), mocap ids
-    supports: NDArray[np.int_]  # geoms
-    touch: NDArray[np.bool_]  # (ngeom, ngeom), True where a contact is unintended
+    arm_geoms: Ints  # geoms that the arm moves, gripper included
+    gripper_geoms: Ints  # those of hand and fingers
+    bodies: Ints  # in the order of `scene.bodies`
+    object_qpos: Ints  # (objects,), first of 7 addresses of each object
+    mocap: Ints  # (obstacles,), mocap ids
+    supports: Ints  # geoms
+    touch: Mask  # (ngeom, ngeom), True where a contact is unintended
     bounds: Bounds  # that the arm never exceeds
     limits: Limits  # of planned motion
     encoders: Encoders  # resolution and noise of its sensors
@@ -156,7 +157,7 @@ def index(
     robot: RobotConfig,
     scene: SceneConfig,
     motors: list[str],
-    torque: NDArray[np.float64],
+    torque: Array,
 ) -> Cell:
     """Find everything that the config names in the compiled model, the torques of a hand there.
     Raises `RobotError`."""
@@ -212,11 +213,11 @@ def index(
 
 def unintended_pairs(
     model: mujoco.MjModel,
-    arm: NDArray[np.int_],
-    gripper: NDArray[np.int_],
-    objects: NDArray[np.int_],
-    supports: NDArray[np.int_],
-) -> NDArray[np.bool_]:
+    arm: Ints,
+    gripper: Ints,
+    objects: Ints,
+    supports: Ints,
+) -> Mask:
     """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
 
     Intended are an object on a support, an object in the gripper, the parts of one object and the
@@ -233,9 +234,7 @@ def unintended_pairs(
     return touch
 
 
-def pressed_pairs(
-    model: mujoco.MjModel, wrist: Wrist | None, supports: NDArray[np.int_]
-) -> NDArray[np.bool_]:
+def pressed_pairs(model: mujoco.MjModel, wrist: Wrist | None, supports: Ints) -> Mask:
     """Return (ngeom, ngeom), True for a support and what hangs on the wrist sensor: their contact
     is measured."""
     pressed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
@@ -245,9 +244,7 @@ def pressed_pairs(
     return pressed
 
 
-def unintended_contacts(
-    data: mujoco.MjData, touch: NDArray[np.bool_], within: float = 0.0
-) -> NDArray[np.int32]:
+def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -> NDArray[np.int32]:
     """Return the pairs of geoms, (n, 2), in unintended contact, or `within` a distance, m; `touch`
     is that of `Cell`."""
     contact = data.contact
@@ -259,8 +256,8 @@ def _gripper(
     model: mujoco.MjModel,
     config: GripperConfig | None,
     joint: int | None,
-    linked: NDArray[np.bool_],
-    arm: NDArray[np.int_],
+    linked: Mask,
+    arm: Ints,
 ) -> Gripper | None:
     if config is None or joint is None:
         return None
@@ -313,7 +310,7 @@ def overlapping_links(cell: Cell) -> list[tuple[str, str]]:
     return [(one, other) for one, other in named if one and other]
 
 
-def start_qpos(cell: Cell, position: NDArray[np.float64]) -> NDArray[np.float64]:
+def start_qpos(cell: Cell, position: Array) -> Array:
     """Return qpos of a start: arm at `position`, gripper and its linkage open, the rest as in the
     model."""
     qpos = np.array(cell.model.qpos0)
@@ -323,7 +320,7 @@ def start_qpos(cell: Cell, position: NDArray[np.float64]) -> NDArray[np.float64]
     return qpos
 
 
-def check_start(cell: Cell, robot: RobotConfig, key: str, position: NDArray[np.float64]) -> None:
+def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> None:
     """Raise `RobotError` when the start at robot.`key` is outside the limits, too heavy to hold, in
     unintended contact, or not finite."""
     for name, q, (low, high) in zip(robot.joints, position, cell.limits.position, strict=True):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import Array, each
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
     mj_com_pos,
@@ -151,7 +151,7 @@ def addresses(
     )
 
 
-@compiled
+@compiled_for("i8, i8, i8[:,::1], f8[::1], f8[:,:,::1]")
 def evaluate(
     model: int, data: int, places: NDArray[np.int64], memory: Array, evaluations: Array
 ) -> None:
@@ -187,7 +187,7 @@ def evaluate(
     given[BIAS_ROW:] = newest[BIAS_ROW:]
 
 
-@compiled
+@compiled_for("f8, f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1], f8[::1], f8[:,:,::1], f8[:,::1]")
 def carry(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     mass: float,
     offset: Array,
@@ -223,19 +223,3 @@ def carry(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
             bias[joint] += force * acceleration
             for other in range(count):
                 inertia[joint, other] += force * jacobian[dof[other]]
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data = mujoco.MjData(model)
-    places = np.zeros((4, 0), dtype=int)
-    none = np.zeros(0)
-    at = (model._address, data._address)
-    evaluations = np.zeros((2, 3, 0))
-    place = np.zeros(3)
-    evaluate.load()(*at, places, none, evaluations)
-    jacobians = np.zeros((2, 3, 0))
-    carry.load()(
-        0.0, place, *at, places[0], 0, place, np.zeros(9), place, jacobians, evaluations[0]
-    )

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -74,7 +75,7 @@ mj_set_state = native("mj_setState", 4)
 mj_update_sleep = native("mj_updateSleep", 2)
 
 
-def one_view(*arrays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def one_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return the memory from the first to the last of some arrays of one `MjData`, and where in it
     each begins.
 
@@ -105,7 +106,7 @@ class ContactViews(NamedTuple):
 
     number: NDArray[np.int32]  # (1,)
     geoms: NDArray[np.int32]  # (room, 2), of which the first `number` are contacts
-    distance: NDArray[np.float64]  # (room,), m; likewise
+    distance: Array  # (room,), m; likewise
 
 
 def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:

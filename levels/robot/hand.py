@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot import lookup
 from rack.levels.robot.model import drives_arm, listed, remove
@@ -32,20 +32,19 @@ class Hand:
     flexors, extensors."""
 
     names: tuple[str, ...]  # of the fingers
-    tips: NDArray[np.int_]  # (fingers,), sites at their tips
-    forces: NDArray[
-        np.int_
-    ]  # (fingers, 3), in sensordata: of contacts on the body of the tip, in the world's frame
-    fingers: NDArray[np.bool_]  # (fingers, joints), True where a joint is the finger's
-    actuators: NDArray[np.int_]  # (2, joints), of the tendons, in ctrl
-    arms: NDArray[np.float64]  # (joints,), m: of both tendons of a joint, without sign
+    tips: Ints  # (fingers,), sites at their tips
+    # (fingers, 3), in sensordata: of contacts on the body of the tip, in the world's frame
+    forces: Ints
+    fingers: Mask  # (fingers, joints), True where a joint is the finger's
+    actuators: Ints  # (2, joints), of the tendons, in ctrl
+    arms: Array  # (joints,), m: of both tendons of a joint, without sign
     least: float  # N: below it, a tendon is slack
     rest: float  # N: mean tension of a pair at rest
-    most: NDArray[np.float64]  # (joints,), N: largest tension of either tendon
+    most: Array  # (joints,), N: largest tension of either tendon
     closed: float  # N/m: stiffness of a tendon whose valve is closed
 
     @property
-    def torque(self) -> NDArray[np.float64]:
+    def torque(self) -> Array:
         """Largest torque of a joint either way, (joints,), N m: one tendon at most, the other at
         least."""
         return np.asarray(self.arms * self.most - self.arms * self.least)
@@ -105,7 +104,7 @@ def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
 
 def fit_tendons(
     spec: mujoco.MjSpec, robot: RobotConfig, hand: HandConfig, step_s: float
-) -> tuple[list[str], NDArray[np.float64]]:
+) -> tuple[list[str], Array]:
     """Remove the drives of the hand's joints other than its tendons; return the flexors and the
     joints' torque limits.
 
@@ -225,9 +224,7 @@ def _no_tension(model: mujoco.MjModel, actuator: int, least: float) -> str:
     return ""
 
 
-def _arms(
-    model: mujoco.MjModel, robot: RobotConfig, actuators: NDArray[np.int_]
-) -> NDArray[np.float64]:
+def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
     """Return the moment arms (joints,), m. Raises `RobotError` where two tendons are no pair of a
     joint."""
     joints = np.array([model.joint(name).id for name in robot.joints])
@@ -257,7 +254,7 @@ def _arms(
     return arms
 
 
-def _no_arm(robot: RobotConfig, joint: str, own: list[NDArray[np.float64]], sign: float) -> str:
+def _no_arm(robot: RobotConfig, joint: str, own: list[Array], sign: float) -> str:
     """Return why a tendon does not suit its joint, by its moments (joints,) at several positions;
     empty: it does."""
     number = robot.joints.index(joint)
@@ -281,9 +278,7 @@ def _no_arm(robot: RobotConfig, joint: str, own: list[NDArray[np.float64]], sign
     return ""
 
 
-def actuator_moments(
-    model: mujoco.MjModel, joints: NDArray[np.int_], position: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def actuator_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:
     """Return the moments of all actuators on `joints` at a position of these, (actuators, joints),
     m."""
     data = mujoco.MjData(model)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array, Ints
 from rack.levels.errors import RobotError
 from rack.levels.tables import RobotConfig, SensorConfig
 
@@ -50,11 +50,9 @@ class Bounds:
     Slides have m and N where hinges have rad and N m.
     """
 
-    position: NDArray[
-        np.float64
-    ]  # (joints, 2), rad: low and high; -inf and inf for a joint without
-    velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
-    torque: NDArray[np.float64]  # (joints,), N m, both ways
+    position: Array  # (joints, 2), rad: low and high; -inf and inf for a joint without
+    velocity: Array  # (joints,), rad/s, both ways
+    torque: Array  # (joints,), N m, both ways
 
 
 @dataclass(frozen=True)
@@ -62,11 +60,11 @@ class Limits:
     """Limits of planned motion: the bounds, less some room for tracking, and the config's
     smoothness."""
 
-    position: NDArray[np.float64]  # (joints, 2), rad: low and high
-    velocity: NDArray[np.float64]  # (joints,), rad/s, both ways
-    acceleration: NDArray[np.float64]  # (joints,), rad/s2, both ways
-    jerk: NDArray[np.float64]  # (joints,), rad/s3, both ways
-    torque: NDArray[np.float64]  # (joints,), N m, both ways
+    position: Array  # (joints, 2), rad: low and high
+    velocity: Array  # (joints,), rad/s, both ways
+    acceleration: Array  # (joints,), rad/s2, both ways
+    jerk: Array  # (joints,), rad/s3, both ways
+    torque: Array  # (joints,), N m, both ways
 
 
 @dataclass(frozen=True)
@@ -74,12 +72,12 @@ class Encoders:
     """Resolution and noise of the joints' sensors; of velocities, rad/s, they are these over
     `EDGE_TIMING_S`."""
 
-    resolution: NDArray[np.float64]  # (joints,), rad: step of a position
-    noise: NDArray[np.float64]  # (joints,), rad: standard deviation of a position
+    resolution: Array  # (joints,), rad: step of a position
+    noise: Array  # (joints,), rad: standard deviation of a position
     latency_ticks: int = 0  # age of a sample when it is read
-    off_late: NDArray[np.float64] | float = 0.0  # (joints,), rad: largest error due to that
-    speed_off_late: NDArray[np.float64] | float = 0.0  # (joints,), rad/s: likewise
-    offset: NDArray[np.float64] | None = None  # (joints,), rad: added to what the drives give
+    off_late: Array | float = 0.0  # (joints,), rad: largest error due to that
+    speed_off_late: Array | float = 0.0  # (joints,), rad/s: likewise
+    offset: Array | None = None  # (joints,), rad: added to what the drives give
 
     @classmethod
     def of(cls, robot: RobotConfig, tick_s: float, default: SensorConfig | None = None) -> Encoders:
@@ -108,17 +106,17 @@ class Encoders:
         return not (self.resolution.any() or self.noise.any())
 
     @property
-    def off(self) -> NDArray[np.float64]:
+    def off(self) -> Array:
         """Largest error of a good position, (joints,), rad."""
         return self._off_sampled + self.off_late
 
     @property
-    def speed_off(self) -> NDArray[np.float64]:
+    def speed_off(self) -> Array:
         """Largest error of a good velocity, (joints,), rad/s."""
         return self._off_sampled / EDGE_TIMING_S + self.speed_off_late
 
     @property
-    def _off_sampled(self) -> NDArray[np.float64]:
+    def _off_sampled(self) -> Array:
         return np.asarray(0.5 * self.resolution + SIGMAS * self.noise)
 
 
@@ -153,9 +151,7 @@ def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPat
     )
 
 
-def joint_bounds(
-    model: mujoco.MjModel, joints: NDArray[np.int_], robot: RobotConfig, torque: NDArray[np.float64]
-) -> Bounds:
+def joint_bounds(model: mujoco.MjModel, joints: Ints, robot: RobotConfig, torque: Array) -> Bounds:
     """Return the bounds; where config and model both limit a position, the tighter limit applies.
 
     Raises `RobotError` for an empty range.

@@ -20,9 +20,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot.lookup import below
 from rack.levels.robot.model import JOINT_DRIVES, SCALAR_JOINTS, listed
@@ -58,7 +57,7 @@ class Linkage:
 
     driven: int  # address of the driven joint in qpos
     openings: Array  # (k,), rising, m or rad
-    joints: NDArray[np.int_]  # (n,), addresses in qpos of the joints that follow
+    joints: Ints  # (n,), addresses in qpos of the joints that follow
     positions: Array  # (n, k), m or rad
     yields: bool  # couplings contradict each other or a stop: where it settles is approximate
 
@@ -72,8 +71,8 @@ class Linkage:
 def solve_linkage(
     model: mujoco.MjModel,
     config: GripperConfig,
-    hand: NDArray[np.bool_],
-    arm: NDArray[np.int_],
+    hand: Mask,
+    arm: Ints,
 ) -> Linkage:
     """Return the linkage of a gripper in the bodies `hand` (nbody,), between open and closed; `arm`
     are the arm's own joints.
@@ -110,8 +109,8 @@ class _Solver:
         self,
         model: mujoco.MjModel,
         config: GripperConfig,
-        hand: NDArray[np.bool_],
-        arm: NDArray[np.int_],
+        hand: Mask,
+        arm: Ints,
     ) -> None:
         self._config = config
         self._model = copy.copy(model)
@@ -255,9 +254,7 @@ class _Solver:
         return np.asarray(self._data.efc_J).reshape(-1, self._model.nv)
 
 
-def check_commanded(
-    model: mujoco.MjModel, config: GripperConfig, carried: NDArray[np.bool_]
-) -> None:
+def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
     """Raise `RobotError` for an actuator, not the gripper's own, of a joint of those `carried`
     (njnt,) by the hand."""
     for k in range(model.nu):

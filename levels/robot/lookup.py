@@ -8,10 +8,16 @@ from itertools import chain
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Ints, Mask
 from rack.levels.errors import RobotError
-from rack.levels.robot.model import compile_spec, listed, load_spec
+from rack.levels.robot.model import (
+    JOINT_DRIVES,
+    check_number,
+    compile_spec,
+    listed,
+    load_spec,
+)
 from rack.levels.tables import RobotConfig, SceneConfig
 
 NOUNS = {
@@ -43,7 +49,7 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
 
 def find_all(
     model: mujoco.MjModel, kind: mujoco.mjtObj, names: tuple[str, ...], place: str
-) -> NDArray[np.int_]:
+) -> Ints:
     """Return the ids of named elements. Raises `RobotError`."""
     return np.array([find(model, kind, name, place) for name in names], dtype=int)
 
@@ -79,7 +85,7 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
                 yield str(error)
 
 
-def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None) -> int:
+def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
     """Return the id of the tool's site, on one of the bodies `moved` (nbody,) by the arm; None: on
     any.
 
@@ -91,9 +97,7 @@ def tool_site(model: mujoco.MjModel, name: str, moved: NDArray[np.bool_] | None)
     return tool
 
 
-def gripper_joint(
-    model: mujoco.MjModel, robot: RobotConfig, moved: NDArray[np.bool_]
-) -> int | None:
+def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: Mask) -> int | None:
     """Return the id of the gripper's joint; None: the arm has no gripper. Raises `RobotError`."""
     if robot.gripper is None:
         return None
@@ -107,7 +111,7 @@ def gripper_joint(
     return joint
 
 
-def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> NDArray[np.bool_]:
+def hand(model: mujoco.MjModel, gripper: int | None, arm: Ints) -> Mask:
     """Mark (nbody,) the body that carries the gripper's linkage, and its descendants.
 
     The driven joint may be anywhere in the linkage; the joints `arm` are not part of it.
@@ -124,7 +128,7 @@ def hand(model: mujoco.MjModel, gripper: int | None, arm: NDArray[np.int_]) -> N
     return below(model, model.body_parentid[[body]])
 
 
-def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+def free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the ids of the objects' free joints. Raises `RobotError` for a body without one."""
     joints = model.body_jntadr[bodies]
     for body, joint in zip(bodies, joints, strict=True):
@@ -136,7 +140,7 @@ def free_joints(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.i
     return np.asarray(joints, dtype=int)
 
 
-def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int_]:
+def mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the mocap ids of the obstacles. Raises `RobotError` for a body without one."""
     for body in bodies:
         if model.body_mocapid[body] < 0:
@@ -147,7 +151,7 @@ def mocap_ids(model: mujoco.MjModel, bodies: NDArray[np.int_]) -> NDArray[np.int
     return np.asarray(model.body_mocapid[bodies], dtype=int)
 
 
-def below(model: mujoco.MjModel, roots: NDArray[np.int_]) -> NDArray[np.bool_]:
+def below(model: mujoco.MjModel, roots: Ints) -> Mask:
     """Mark (nbody,) the bodies `roots` and their descendants."""
     marked = np.zeros(model.nbody, dtype=bool)
     marked[roots] = True
@@ -156,7 +160,7 @@ def below(model: mujoco.MjModel, roots: NDArray[np.int_]) -> NDArray[np.bool_]:
     return marked
 
 
-def geoms_of(model: mujoco.MjModel, bodies: NDArray[np.bool_]) -> NDArray[np.int_]:
+def geoms_of(model: mujoco.MjModel, bodies: Mask) -> Ints:
     """Return the ids of the geoms on the bodies marked (nbody,)."""
     return np.flatnonzero(bodies[model.geom_bodyid])
 
@@ -164,3 +168,32 @@ def geoms_of(model: mujoco.MjModel, bodies: NDArray[np.bool_]) -> NDArray[np.int
 def geom_name(model: mujoco.MjModel, geom: int) -> str:
     """Return a geom's name or, when it has none, its body's."""
     return model.geom(geom).name or f"body {model.body(model.geom_bodyid[geom]).name}"
+
+
+def derived(robot: RobotConfig) -> RobotConfig:
+    """Return the table with its joints, tool and home. Raises `RobotError`."""
+    model = compile_spec(load_spec(robot.model), robot.model)
+    joints = robot.joints or _driven(model, robot)
+    if not joints:
+        raise RobotError("robot.joints: none named, and none in the model has an actuator")
+    check_number(joints)
+    kind = mujoco.mjtObj.mjOBJ_JOINT
+    ids = [find(model, kind, name, "robot.joints") for name in joints]
+    start = model.key_qpos[0] if model.nkey else model.qpos0
+    home = start[model.jnt_qposadr[ids]].tolist()
+    last = int(model.jnt_bodyid[ids[-1]])
+    carried = below(model, np.array([last]))
+    sites = [model.site(k).name for k in np.flatnonzero(carried[model.site_bodyid])]
+    named = [name for name in sites if name] or [model.body(last).name]
+    found = {"joints": joints, "tool": robot.tool or named[-1], "home": robot.home or tuple(home)}
+    return robot.model_copy(update=found)
+
+
+def _driven(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
+    """Return the joints with an actuator, base to tool, but the gripper's."""
+    of_joint = np.isin(model.actuator_trntype, JOINT_DRIVES)
+    driven = np.unique(model.actuator_trnid[of_joint, 0])
+    names = [str(model.joint(k).name) for k in driven]
+    gripper = robot.gripper
+    own = () if gripper is None else (gripper.joint, *(given.joint for given in gripper.follow))
+    return tuple(name for name in names if name not in own)

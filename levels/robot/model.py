@@ -7,8 +7,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.robot.model_file import ModelReader
 from rack.levels.robot.state import SLEEP
@@ -92,16 +92,8 @@ def check_number(joints: Sequence[str]) -> None:
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
     """Raise `RobotError` for a list of the wrong length, and for a joint that is missing, not
     scalar or named twice."""
-    wanted = len(robot.joints)
-    for name, values in robot.per_joint.items():
-        if values is not None and len(values) != wanted:
-            raise RobotError(f"robot.{name}: {len(values)} values; one per joint: {wanted}")
-    for name, given in robot.sensors or ():
-        if isinstance(given, tuple) and len(given) != wanted:
-            raise RobotError(
-                f"robot.sensors.{name}: {len(given)} values; one for all joints, or one per joint:"
-                f" {wanted}"
-            )
+    for key, _, why in robot.misfits():
+        raise RobotError(f"robot.{key}: {why}")
     for name in robot.joints:
         joint = spec.joint(name)
         if joint is None:
@@ -145,7 +137,7 @@ def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
     spec.add_key(name="start")
 
 
-def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], NDArray[np.float64]]:
+def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Array]:
     """Replace the drives of the arm's joints in `spec`; return the motors' names and torque limits
     (joints,), N m.
 
@@ -275,7 +267,7 @@ def drive_limit(actuator: mujoco.MjsActuator) -> float:
     return min((x for x in limits if x > 0), default=0.0)
 
 
-def reach(limited: mujoco.mjtLimited, span: NDArray[np.float64]) -> float:
+def reach(limited: mujoco.mjtLimited, span: Array) -> float:
     """Return the largest symmetric range within `span`; 0: there is none."""
     if limited == mujoco.mjtLimited.mjLIMITED_FALSE or not span[0] < span[1]:
         return 0.0

@@ -12,9 +12,8 @@ from copy import copy
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import norm
+from rack.levels.algebra import Array, norm
 from rack.levels.robot.engine import INTEGRATION, mj_update_sleep
 from rack.levels.tables import SceneConfig
 
@@ -28,20 +27,20 @@ def state_size(model: mujoco.MjModel) -> int:
     return int(mujoco.mj_stateSize(model, INTEGRATION)) + int(model.ntree)
 
 
-def save_state(model: mujoco.MjModel, data: mujoco.MjData, state: NDArray[np.float64]) -> None:
+def save_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
     """Fill `state`, (state_size,)."""
     trees = state.size - model.ntree
     mujoco.mj_getState(model, data, state[:trees], INTEGRATION)
     state[trees:] = data.tree_asleep
 
 
-def view_state(model: mujoco.MjModel, data: mujoco.MjData, state: NDArray[np.float64]) -> None:
+def view_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
     """Set `data`, of which nothing sleeps, to a state but for sleep: enough to look at it."""
     end = mujoco.mj_stateSize(model, INTEGRATION)
     mujoco.mj_setState(model, data, np.ascontiguousarray(state[:end]), INTEGRATION)
 
 
-def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: NDArray[np.float64]) -> None:
+def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
     """Set `data` to a state, so that its next steps are those of the data that was saved."""
     data.tree_asleep[:] = -1
     mj_update_sleep(model._address, data._address)

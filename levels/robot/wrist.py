@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot.model import listed
 from rack.levels.tables import WristConfig
@@ -22,15 +22,13 @@ class Wrist(NamedTuple):
     force's."""
 
     site: int
-    addresses: NDArray[np.int_]  # (6,), of its numbers in sensordata
+    addresses: Ints  # (6,), of its numbers in sensordata
     range: tuple[float, float]  # of each component, both ways
     most: tuple[float, float]  # of a contact: beyond it the arm stops
     noise: tuple[float, float]  # standard deviation of a component
 
 
-def find_wrist(
-    model: mujoco.MjModel, config: WristConfig | None, moved: NDArray[np.bool_]
-) -> Wrist | None:
+def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -> Wrist | None:
     """Return the sensor on one of the bodies `moved` (nbody,) by the arm; None: there is none.
     Raises `RobotError`."""
     if config is None:

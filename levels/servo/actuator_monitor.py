@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
@@ -177,7 +177,7 @@ class ActuatorMonitor:
         return bool(self._most <= certain + hidden or (more > certain and rise < RISE_PART * more))
 
 
-@compiled
+@compiled_for("f8[:,::1], f8, f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]")
 def left_over(
     table: Array,  # (13 + joints, joints): rows as below
     half_rate: float,  # 1/s: of the cycles
@@ -232,11 +232,3 @@ def left_over(
         for k in range(len(velocity)):
             inertia_before[j, k] = inertia[j, k]
     return verdict
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    square = np.zeros((1, 1))
-    left_over.load()(
-        np.zeros((14, 1)), 1.0, 1.0, np.zeros((3, 1)), np.zeros((2, 1)), square, np.zeros(1)
-    )

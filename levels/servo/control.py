@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import JointTarget, find_arm
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
@@ -117,7 +117,7 @@ class ComputedTorque:
         return self._torque
 
 
-@compiled
+@compiled_for("f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]")
 def set_torque(
     table: Array,  # (5, joints): rows as below
     wanted: Array,  # (3, joints): rad, rad/s, rad/s2
@@ -206,9 +206,3 @@ class Grip:
             return self._kept
         force = self._stiffness * (self._opening - opening) - self._damping * velocity
         return min(max(force, -self._limit), self._limit)
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    square = np.zeros((1, 1))
-    set_torque.load()(np.zeros((5, 1)), np.zeros((3, 1)), np.zeros((2, 1)), square, np.zeros(1))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 
 REST = 6
 """Row of a curve's table: where the joints rest after it."""
@@ -48,7 +48,7 @@ class Curve:
         return motion
 
 
-@compiled
+@compiled_for("f8[:,::1], f8, f8, f8, f8, f8[:,::1]")
 def set_motion(
     table: Array, duration_s: float, ends_s: float, time_s: float, ahead_s: float, motion: Array
 ) -> None:
@@ -104,7 +104,7 @@ class Bridge(Curve):
         return bool(is_within.load()(self.table, self.duration_s, acceleration))
 
 
-@compiled
+@compiled_for("f8[:,::1], f8, f8, f8, f8[::1], f8[::1], f8, f8[:,::1]")
 def set_bridge(
     before: Array,
     before_duration_s: float,
@@ -127,7 +127,7 @@ def set_bridge(
     table[3] = first + second - 2.0 * way
 
 
-@compiled
+@compiled_for("f8[:,::1], f8, f8[::1]")
 def is_within(table: Array, duration_s: float, acceleration: Array) -> bool:
     """Return whether the acceleration of a cubic is within bounds, rad/s2: it is largest at one of
     the ends."""
@@ -181,12 +181,3 @@ class Passage(Decay):
         super().__init__(start - end, np.zeros_like(start), fastest, hardest)
         self.table[0] += end
         self.table[REST] += end
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    table = np.zeros((REST + 1, 1))
-    joints = np.zeros(1)
-    set_motion.load()(table, 1.0, 1.0, 0.0, 0.0, table[:3])
-    set_bridge.load()(table, 1.0, 1.0, 0.0, joints, joints, 1.0, table)
-    is_within.load()(table, 1.0, joints)

@@ -4,13 +4,14 @@ report."""
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import BY_DEMAND
+from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import (
     Arm,
@@ -26,9 +27,19 @@ from rack.levels.arm import (
 )
 from rack.levels.arm.faulty import STEPS
 from rack.levels.arm.guard import kept_bounds
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.errors import RobotError
-from rack.levels.level import Demand, Executor, Fault, Finding, LevelContext, Output, Ports, Reading
+from rack.levels.level import (
+    Demand,
+    Executor,
+    Fault,
+    Finding,
+    LevelContext,
+    Misfits,
+    Output,
+    Ports,
+    Reading,
+)
 from rack.levels.messages import SCENE, Error
 from rack.levels.operator import Operation, Orders
 from rack.levels.robot.cell import cell_of, sensed_by
@@ -138,15 +149,13 @@ class ArmDriver(Executor):
         """Load the compiled functions of the level and of its arm."""
         super().preload()
         preload()
-        for module in (sensor_monitor, actuator_monitor):
-            module.preload()
-        joints = np.zeros((3, 1))
-        show.load()(np.zeros(8), joints[0], joints[0], joints, joints, joints[0], 0.0, 0.0, 0.0)
+        compiled.preload(sensor_monitor, actuator_monitor)
+        show.preload()
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield a hand, whose tendons have a board of another kind, and an arm whose samples are
         too coarse to guard it."""
         robot = context.robot
@@ -440,7 +449,7 @@ def numbers(message: Message, first: str, last: str) -> Array:
     return np.frombuffer(message.raw[begin:end])
 
 
-@compiled
+@compiled_for("f8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8, f8, f8")
 def show(
     status: Array,  # (5 joints + 3,): set, its fields from `position` to `grip_force`
     state: Array,  # (3 joints,): set, its fields from `position` to `doubt`

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,11 +10,11 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.level import Input, LevelContext, Ports, Verdict
+from rack.levels.level import Input, LevelContext, Misfits, Ports, Verdict
 from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SERVO_PLAN, SERVO_STATUS
 from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot.dynamics import Terms
-from rack.levels.servo import control, reference
+from rack.levels.servo import control, curves, reference
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams, SetPointLaw
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver
@@ -49,7 +49,7 @@ class ServoExecutor(ArmDriver):
         **dict.fromkeys(DRIVES, ()),
     }
     params: ClassVar[type[ServoParams]] = ServoParams
-    preloads = (control, reference)
+    preloads = (control, curves, reference)
     gives_set_points = True
 
     def __init__(self, context: LevelContext) -> None:
@@ -79,7 +79,7 @@ class ServoExecutor(ArmDriver):
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Iterable[tuple[str, Any, str]]:
+    ) -> Misfits:
         """Yield control modifications that do not suit the law, and what `ArmDriver` yields."""
         yield from super().misfits(context, above, below)
         yield from misfits_of(context)

@@ -16,7 +16,7 @@ one that fails.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -25,7 +25,7 @@ from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext
+from rack.levels.level import LevelContext, Misfits
 from rack.levels.operator import NAME_BYTES
 from rack.levels.robot.cell import cell_of
 from rack.levels.servo.curves import Motion
@@ -190,7 +190,7 @@ def names_of(params: Mapping[str, Any]) -> Sequence[str]:
     return tuple(found) if isinstance(found, Mapping) else ()
 
 
-def misfits_of(context: LevelContext) -> Iterable[tuple[str, Any, str]]:
+def misfits_of(context: LevelContext) -> Misfits:
     """Yield the modifications of a board that do not suit its law: see `Executor.misfits`."""
     params = read_params(
         ModifiableParams, {"modifications": context.params.get("modifications", {})}

@@ -6,16 +6,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.operator import DRIVES, SETTINGS, Commands, Operation, Orders, joints_of
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
-
-Mask = NDArray[np.bool_]
 
 
 class OperatorControl:
@@ -100,7 +97,12 @@ class OperatorControl:
             if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
                 self._way.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
-            self._arrive()
+            # React to the arm's arrival at its goal.
+            if not self.orders.stands and self._way:
+                self._way.pop()
+            if self.orders.stands or not self._way:
+                self.stands = self.orders.stands
+                self.orders.done()
         return motion
 
     def _aim(self) -> Array | None:
@@ -108,11 +110,3 @@ class OperatorControl:
         if self.orders.standing is Operation.SETPOINT:
             return self._goal
         return self._way[-1] if not self.orders.stands and self._way else None
-
-    def _arrive(self) -> None:
-        """React to the arm's arrival at its goal."""
-        if not self.orders.stands and self._way:
-            self._way.pop()
-        if self.orders.stands or not self._way:
-            self.stands = self.orders.stands
-            self.orders.done()

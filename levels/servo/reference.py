@@ -13,9 +13,8 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.limits import Bounds, Limits
-from rack.levels.servo import curves
 from rack.levels.servo.curves import Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
 
 MAX_ACCELERATION = 2.0
@@ -211,7 +210,7 @@ class Reference:
         return wanted
 
 
-@compiled
+@compiled_for("f8[::1], f8[::1], f8[::1], f8[::1], f8[::1]")
 def admit(position: Array, velocity: Array, low: Array, high: Array, fastest: Array) -> int:
     """Cut a set point at its bounds, (joints,) each; return `WRONG`, `CUT` or `WITHIN`."""
     verdict = WITHIN
@@ -226,10 +225,3 @@ def admit(position: Array, velocity: Array, low: Array, high: Array, fastest: Ar
             verdict = CUT
         position[j], velocity[j] = allowed
     return verdict
-
-
-def preload() -> None:
-    """Load the compiled functions of set points and curves."""
-    curves.preload()
-    joints = np.zeros(1)
-    admit.load()(joints, joints, joints, joints, joints)

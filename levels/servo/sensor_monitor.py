@@ -7,18 +7,15 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.arm import Sensed
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.servo.control import ArmParams
-
-Mask = NDArray[np.bool_]
 
 FIT_RAD = 5e-5
 """Permitted difference between a position and the integrated velocities: 20 times that of faultless
@@ -206,11 +203,6 @@ class SensorMonitor:
         least = np.maximum(np.abs(self._qd) - self._speed_room, 0.0)
         self._claimed[:] = np.where(unchanged, self._claimed + passed_s * least, 0.0)
 
-    def _is_still(self) -> Mask:
-        return np.asarray(
-            (self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown)
-        )
-
     def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
         q = self._q
@@ -224,7 +216,9 @@ class SensorMonitor:
         if not self._coarse:
             self._claim(unchanged, passed_s)
         frozen = self._claimed > self._room
-        still = self._is_still()
+        still = np.asarray(
+            (self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown)
+        )
         begins = not self.faulty
         room += passed_s * np.abs(qd - last_qd)
         steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room
@@ -311,7 +305,7 @@ class SensorMonitor:
         slower = np.copysign(np.maximum(speed - self._braking * time_s, 0.0), self.velocity)
         np.copyto(self.velocity, slower, where=joints)
 
-    def _name(self, alarm: Alarm, wrong: Mask, values: Array | NDArray[np.int_]) -> None:
+    def _name(self, alarm: Alarm, wrong: Mask, values: Array | Ints) -> None:
         if wrong.any():
             joint = int(wrong.argmax())
             self._ring(Finding(alarm, joint, float(values[joint])))
@@ -341,7 +335,7 @@ class SensorMonitor:
         self._rung.clear()
 
 
-@compiled
+@compiled_for("f8[:,::1], b1, f8[::1], f8[::1], f8[:,::1], f8, f8, f8, b1, b1")
 def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     table: Array,  # (19, joints): rows as below
     coarse: bool,
@@ -415,11 +409,3 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
         last_q[j] = position[j] = q[j]
         last_qd[j] = velocity[j] = qd[j]
     return TAKEN
-
-
-def preload() -> None:
-    """Load this module's compiled functions."""
-    joints = np.zeros(1)
-    check.load()(
-        np.zeros((19, 1)), False, joints, joints, np.zeros((2, 1)), 0.0, 0.0, 0.0, False, False
-    )

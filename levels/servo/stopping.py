@@ -174,7 +174,11 @@ class Stopping:
         elif not demand:
             self._kept += passed
             if self._kept >= self._most:
-                return self._latch(cause)
+                # Latch the fault: the brakes stay engaged.
+                self.error = self.cause = cause.error
+                self.reason = f"{cause.text}; not over within {self._params.patience:g} s"
+                self.findings.append(Finding(Alarm.LATCHED, cause.joint, cause.value))
+                return Reaction.BRAKE
         if demand:
             self.reason = (
                 f"demand '{demand.name.lower()}' on the arm, until boards and emergency stop are in"
@@ -233,10 +237,3 @@ class Stopping:
             self._retry_at = None
             return Reaction.NONE
         return self._on_failure if tick < retry_at else Reaction.HOLD
-
-    def _latch(self, cause: Cause) -> Reaction:
-        """Latch the fault: the brakes stay engaged."""
-        self.error = self.cause = cause.error
-        self.reason = f"{cause.text}; not over within {self._params.patience:g} s"
-        self.findings.append(Finding(Alarm.LATCHED, cause.joint, cause.value))
-        return Reaction.BRAKE

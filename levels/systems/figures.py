@@ -10,8 +10,8 @@ from pydantic import Field as Parameter
 
 from rack.backplane.message import Message, MessageType, State, status
 from rack.backplane.process import compute_until
+from rack.levels.fields import tick
 from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
-from rack.levels.systems.fields import tick
 from rack.levels.tables import Table, read_params
 
 FIGURE_PLAN = MessageType(

@@ -69,7 +69,15 @@ class TaskExecutor(Executor):
         below = read.status.value
         if not self._error:
             self._follow(plan, below)
-            self._check_times(plan, tick)
+            # Fail when an action is not done by its time.
+            now_s = tick * self.context.tick_s + self._ahead_s
+            done = self._actions_done(plan)
+            for k in range(done, len(self._actions)):
+                by_s = self._actions[k].by
+                if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
+                    why = f", {self._actions[k]}, was not done by {by_s:g} s"
+                    self._error = Error.TOO_LATE
+                    self._reason = self._about(k, why)
         self._done = self._step_aside(plan, below)
         waits = self._reason_to_wait(read.status)
         if self._state(plan) == State.EXECUTING:
@@ -125,17 +133,6 @@ class TaskExecutor(Executor):
     def _step_aside(self, plan: Message, below: Message) -> int:
         """Interrupt the program for an operator; return how many moves of the plan are done."""
         return self._detour.step(plan, self._done, below)
-
-    def _check_times(self, plan: Message, tick: int) -> None:
-        """Fail when an action is not done by its time."""
-        now_s = tick * self.context.tick_s + self._ahead_s
-        done = self._actions_done(plan)
-        for k in range(done, len(self._actions)):
-            by_s = self._actions[k].by
-            if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
-                why = f", {self._actions[k]}, was not done by {by_s:g} s"
-                self._error = Error.TOO_LATE
-                self._reason = self._about(k, why)
 
     def _reason_to_wait(self, below: Reading) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it

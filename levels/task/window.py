@@ -59,7 +59,7 @@ class ShownWindow:
         """
         is_begun = below.current == self.first + done
         if not is_free(plan, done) and (is_begun or not is_free(plan, done - 1)):
-            return next_free(plan, done), False
+            return next(k for k in range(done, plan.count + 1) if is_free(plan, k)), False
         return done, True
 
     def show(self, plan: Message, done: int, command: Message, until: int) -> None:
@@ -96,12 +96,6 @@ def is_free(plan: Message, k: int) -> bool:
     """Return whether move `k` of the plan is a free motion; before the first and after the last
     move, True."""
     return not 0 <= k < plan.count or int(plan.moves["verb"][k]) in FREE
-
-
-def next_free(plan: Message, done: int) -> int:
-    """Return the first free motion of the plan from move `done` on; without one, the end of the
-    plan."""
-    return next(k for k in range(done, plan.count + 1) if is_free(plan, k))
 
 
 class Detour:

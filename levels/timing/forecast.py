@@ -130,12 +130,6 @@ def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
         )
     if known and not has_cores:
         yield "cores are those of the config; this machine lacks some of them"
-    if without := [name for name, board in rack.boards.items() if board.budget is None]:
-        names = ", ".join(without)
-        yield (
-            "no budget, so not judged and not counted (set one in the config, or use --from RUN):"
-            f" {names}"
-        )
     sharing = [task for task in rack.tasks if task.cost_ns and not task.priority]
     crowded = [
         task.name for task in sharing if sum(other.core == task.core for other in sharing) > 1

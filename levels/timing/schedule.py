@@ -164,7 +164,17 @@ class _Runner:
         step = self._steps[0]
         end = min(now_ns + step.time_ns - self._spent_ns, until_ns)
         if step.unit is not None:
-            self._draw(step.unit, now_ns, end)
+            last = self.spans[-1] if self.spans else None
+            if last is not None and (last.unit, last.end_ns, last.release_ns) == (
+                step.unit,
+                now_ns,
+                self._release,
+            ):
+                self.spans[-1] = replace(last, end_ns=end)
+            else:
+                self.spans.append(
+                    Span(self.task.name, self.task.core, step.unit, now_ns, end, self._release)
+                )
         self._spent_ns += end - now_ns
         if self._spent_ns == step.time_ns:
             self._spent_ns = 0
@@ -192,19 +202,6 @@ class _Runner:
     def _end(self, now_ns: int) -> None:
         self._ends.setdefault(self._release, now_ns)
         self.ready_at = self._release + self.task.period_ns + self.task.jitter_ns
-
-    def _draw(self, unit: Unit, start_ns: int, end_ns: int) -> None:
-        last = self.spans[-1] if self.spans else None
-        if last is not None and (last.unit, last.end_ns, last.release_ns) == (
-            unit,
-            start_ns,
-            self._release,
-        ):
-            self.spans[-1] = replace(last, end_ns=end_ns)
-        else:
-            self.spans.append(
-                Span(self.task.name, self.task.core, unit, start_ns, end_ns, self._release)
-            )
 
     def jobs(self, until_ns: int) -> Iterator[Job]:
         """Yield the jobs released before `until_ns`; call it once the schedule is complete."""

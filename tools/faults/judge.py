@@ -142,7 +142,12 @@ class _Judge:
                 used.add(id(best.event))
             elif self._is_brief(strike):
                 strike = replace(strike, tick=-1)
-            horizon = self._horizon(place, windows[place][1])
+            # Reactions up to this tick are of this fault: then the next one strikes, or it is
+            # long over.
+            later = [
+                s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick
+            ]
+            horizon = min([*later, windows[place][1] + 1])
             judgement = self._judgement(strike, best, horizon)
             is_too_early = self._last < strike.tick + (judgement.recovery_bound or 0)
             if not judgement.is_recovered and is_too_early and strike.ends < NEVER:
@@ -196,11 +201,6 @@ class _Judge:
         )
         return [self._detection(event, strike) for event in fitting]
 
-    def _owed(self, strike: Strike) -> tuple[str, ...]:
-        """Return the mailboxes that must have a new message after a fault: those that are periodic,
-        or else all."""
-        return tuple(filter(self._is_periodic, strike.affected)) or strike.affected
-
     def _is_periodic(self, mailbox: str) -> bool:
         """Return whether a mailbox has a message in every period: no plan, queue or news has, nor a
         host board's."""
@@ -245,15 +245,9 @@ class _Judge:
         bound_ms = (RACK_NS + MEMORY_NS) * 1e-6 if event.kind == DIED else None
         return Detection(event, delay, bound, delay_ms, bound_ms)
 
-    def _horizon(self, place: int, last: int) -> int:
-        """Return the tick up to which reactions are of this fault: the next one strikes then, or it
-        is long over."""
-        later = [s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick]
-        return min([*later, last + 1])
-
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
         record = strike.record
-        owed = self._owed(strike)
+        owed = tuple(filter(self._is_periodic, strike.affected)) or strike.affected
         after = aftermath(strike, self._events, horizon, owed)
         found = best.event.tick if best else strike.tick
         # Ticks from the strike within which every reaction must be undone.

@@ -64,7 +64,14 @@ class LiveRack:
             self._print_waiting(entry)
             act_on_core(self._segment, entry)
         elif fault.tick is None and fault.when is None:
-            self._await_begin(entry)
+            held = self._segment.words
+            if not self._wait_until(
+                lambda: entry.stage != Stage.WAITING or held[System.HELD] > 0, BEGIN_S
+            ):
+                why = f"the clock has not begun it within {BEGIN_S:g} s"
+                raise Failure(f"{self._described(entry)}: {why}")
+            if not held[System.HELD]:
+                self._check_begun(entry)
         if wait:
             self._await_end(entry, timeout_s)
         return {**self._document(entry), "message": self._state(entry)}
@@ -149,16 +156,6 @@ class LiveRack:
                 return False
             time.sleep(LOOK_S)
         return True
-
-    def _await_begin(self, entry: FaultEntry) -> None:
-        held = self._segment.words
-        if not self._wait_until(
-            lambda: entry.stage != Stage.WAITING or held[System.HELD] > 0, BEGIN_S
-        ):
-            why = f"the clock has not begun it within {BEGIN_S:g} s"
-            raise Failure(f"{self._described(entry)}: {why}")
-        if not held[System.HELD]:
-            self._check_begun(entry)
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:
         """Wait until a fault, or the run, is over. Raises `Failure` after `timeout_s`, or when it

@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot.hand import actuator_moments
 from rack.levels.robot.linkage import tied_joints
@@ -160,9 +160,7 @@ def _refers(element: ElementTree.Element, gone: set[tuple[str, str]]) -> bool:
     return False
 
 
-def _longest(
-    model: mujoco.MjModel, scalar: NDArray[np.bool_], driven: set[int]
-) -> tuple[int, list[int]]:
+def _longest(model: mujoco.MjModel, scalar: Mask, driven: set[int]) -> tuple[int, list[int]]:
     """Find the longest arm: the way with the most joints that ends at a driven one, if any is.
 
     Args:

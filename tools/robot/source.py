@@ -55,8 +55,23 @@ def read_source(path: Path) -> Source:
         source = _urdf(path, root)
     else:
         raise RobotError(f"model '{path}': <{root.tag}>; valid: <mujoco> (MJCF), <robot> (URDF)")
-    _name_all(source.spec)
-    _stiffen(source)
+    # Name what has no name: a config names bodies, joints and actuators.
+    for kind in ("body", "joint", "actuator"):
+        elements = {
+            "body": source.spec.bodies[1:],
+            "joint": source.spec.joints,
+            "actuator": source.spec.actuators,
+        }[kind]
+        for number, element in enumerate(elements):
+            element.name = element.name or f"{kind} {number}"
+    # Make dry friction what it says, unless the model says how soon it acts.
+    dry = [joint for joint in source.spec.joints if joint.frictionloss > 0.0]
+    slack = [joint for joint in dry if joint.solref_friction[0] == SLACK_S]
+    for joint in slack:
+        joint.solref_friction[:] = DRY_SOLREF
+        joint.solimp_friction[:2] = DRY_SOLIMP
+    if slack:
+        source.notes.append(f"dry friction acts within {1e3 * DRY_SOLREF[0]:g} ms")
     try:
         model = source.compiled()
     except RobotError as error:
@@ -206,25 +221,6 @@ def _mesh(path: Path, name: str, meshes: str) -> Path:
         raise RobotError(f"model '{path}': no mesh '{name}': {why}; valid: {', '.join(READ)}")
     check_asset(found, path)
     return found
-
-
-def _name_all(spec: mujoco.MjSpec) -> None:
-    """Name what has no name: a config names bodies, joints and actuators."""
-    for kind in ("body", "joint", "actuator"):
-        elements = {"body": spec.bodies[1:], "joint": spec.joints, "actuator": spec.actuators}[kind]
-        for number, element in enumerate(elements):
-            element.name = element.name or f"{kind} {number}"
-
-
-def _stiffen(source: Source) -> None:
-    """Make dry friction what it says, unless the model says how soon it acts."""
-    dry = [joint for joint in source.spec.joints if joint.frictionloss > 0.0]
-    slack = [joint for joint in dry if joint.solref_friction[0] == SLACK_S]
-    for joint in slack:
-        joint.solref_friction[:] = DRY_SOLREF
-        joint.solimp_friction[:2] = DRY_SOLIMP
-    if slack:
-        source.notes.append(f"dry friction acts within {1e3 * DRY_SOLREF[0]:g} ms")
 
 
 def copy_model(source: Source, path: Path) -> None:

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from rack.boards.events import Event
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Ints
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.state import view_state
@@ -59,7 +58,7 @@ def frame_of(model: mujoco.MjModel, body: int) -> str:
     return WORLD if body == 0 else f"body/{model.body(body).name or body}"
 
 
-def moving_bodies(model: mujoco.MjModel) -> NDArray[np.int_]:
+def moving_bodies(model: mujoco.MjModel) -> Ints:
     """Return the bodies moved by joints or as mocap bodies, and all attached to them."""
     moves = np.zeros(model.nbody, dtype=bool)
     for body in range(1, model.nbody):  # parents come first

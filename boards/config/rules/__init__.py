@@ -8,7 +8,7 @@ are already reported. Faults and commands, which may come live too, have rules o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
 from types import ModuleType
@@ -17,7 +17,7 @@ from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.rules import boards, levels, mailboxes
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.wiring import Wiring
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 
 NETWORK = "rack.boards.config.rules.lan"
 """The rules of `[adapter.lan]`, by name: a rack without a network loads neither them nor what they
@@ -32,12 +32,12 @@ def network_rules(config: RackConfig) -> ModuleType | None:
     return import_module(NETWORK) if is_wanted else None
 
 
-def _of_network(name: str, wiring: Wiring) -> Iterator[Mistake]:
+def _of_network(name: str, wiring: Wiring) -> Mistakes:
     if (rules := network_rules(wiring.config)) is not None:
         yield from getattr(rules, name)(wiring)
 
 
-Rule = Callable[[Wiring], Iterator[Mistake]]
+Rule = Callable[[Wiring], Mistakes]
 RULES: tuple[Rule, ...] = (
     boards.boards,
     boards.hosts,

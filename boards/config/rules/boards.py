@@ -4,7 +4,7 @@ static schedule."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
 
 from rack.backplane.address_map import CLOCK
@@ -22,7 +22,7 @@ from rack.boards.config.schema import (
 )
 from rack.boards.config.timing import PLANNER_BUDGET, frames
 from rack.boards.config.wiring import Wiring
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 
 RESERVED = (CLOCK, "above", "below", "own")
 """Names with a special meaning in the wiring of ports."""
@@ -30,7 +30,7 @@ PLANNER_TRANSFER = ("exchange_ms", "update_ms")
 BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 
 
-def boards(wiring: Wiring) -> Iterator[Mistake]:
+def boards(wiring: Wiring) -> Mistakes:
     """Check the name, the neighbours and the planner of each board."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, board in wiring.config.board.items():
@@ -42,7 +42,7 @@ def boards(wiring: Wiring) -> Iterator[Mistake]:
         yield from _planner(place, board)
 
 
-def hosts(wiring: Wiring) -> Iterator[Mistake]:
+def hosts(wiring: Wiring) -> Mistakes:
     """Check the name and the neighbours of each host board."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, host in wiring.config.host.items():
@@ -53,9 +53,7 @@ def hosts(wiring: Wiring) -> Iterator[Mistake]:
         yield from _neighbours(f"{place}.below", host.below, known, "board")
 
 
-def _neighbours(
-    place: str, names: Sequence[str], boards: Sequence[str], what: str
-) -> Iterator[Mistake]:
+def _neighbours(place: str, names: Sequence[str], boards: Sequence[str], what: str) -> Mistakes:
     for name in names:
         if name not in boards:
             yield Mistake(
@@ -64,13 +62,13 @@ def _neighbours(
     yield from repeated(place, names)
 
 
-def _name(place: str, name: str) -> Iterator[Mistake]:
+def _name(place: str, name: str) -> Mistakes:
     if not BOARD_NAME.fullmatch(name) or name in RESERVED:
         why = f"permitted: a-z, 0-9 and _, at most 31, except {', '.join(RESERVED)}"
         yield Mistake(place, None, f"invalid name for a board; {why}")
 
 
-def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
+def _planner(place: str, board: BoardConfig) -> Mistakes:
     has_planner = board.planner is not None
     is_loose = board.coupling == "loose"
     if has_planner != (board.coupling != "none"):
@@ -105,7 +103,7 @@ def _planner(place: str, board: BoardConfig) -> Iterator[Mistake]:
                     )
 
 
-def circles(wiring: Wiring) -> Iterator[Mistake]:
+def circles(wiring: Wiring) -> Mistakes:
     """Find a circle among levels: a walk from level to level would not end."""
     config = wiring.config
     links = list(config.links())
@@ -137,7 +135,7 @@ def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str
     ]
 
 
-def slots(wiring: Wiring) -> Iterator[Mistake]:
+def slots(wiring: Wiring) -> Mistakes:
     """Check that each slot holds one board."""
     taken: dict[int, str] = {}
     for name, board in wiring.config.board.items():
@@ -149,7 +147,7 @@ def slots(wiring: Wiring) -> Iterator[Mistake]:
                 taken[slot] = place
 
 
-def ends(wiring: Wiring) -> Iterator[Mistake]:
+def ends(wiring: Wiring) -> Mistakes:
     """Check that no more than one board ends the run."""
     ending = [name for name, board in wiring.config.board.items() if board.ends_run]
     for name in ending[1:]:
@@ -160,7 +158,7 @@ def ends(wiring: Wiring) -> Iterator[Mistake]:
         )
 
 
-def record(wiring: Wiring) -> Iterator[Mistake]:
+def record(wiring: Wiring) -> Mistakes:
     """Check that a recording which keeps everything is not asked for what surrounds a fault."""
     table = wiring.config.record
     if table.keep is None:
@@ -173,7 +171,7 @@ LONGEST_MAJOR = 10_000
 """Longest major frame, ticks: the timing model computes two of them."""
 
 
-def clock(wiring: Wiring) -> Iterator[Mistake]:
+def clock(wiring: Wiring) -> Mistakes:
     """Check the tick in simulated time and in real time."""
     config = wiring.config
     clock = wiring.config.clock
@@ -193,7 +191,7 @@ def clock(wiring: Wiring) -> Iterator[Mistake]:
         yield Mistake("clock.speed", clock.speed, why)
 
 
-def rates(wiring: Wiring) -> Iterator[Mistake]:
+def rates(wiring: Wiring) -> Mistakes:
     """Check that the period of each board is given once, is on the clock's grid, and is not too
     long."""
     for name, board in wiring.config.board.items():
@@ -220,7 +218,7 @@ def rates(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake(f"board.{name}.phase", board.phase, why)
 
 
-def polling(wiring: Wiring) -> Iterator[Mistake]:
+def polling(wiring: Wiring) -> Mistakes:
     """Refuse a board that busy-waits on a shared core: at a real-time priority it would starve the
     others."""
     config = wiring.config
@@ -232,7 +230,7 @@ def polling(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake(f"board.{name}.wake", "poll", why)
 
 
-def reservations(wiring: Wiring) -> Iterator[Mistake]:
+def reservations(wiring: Wiring) -> Mistakes:
     """Check that each board can reserve processor time, if the clock's scheduler needs that."""
     config = wiring.config
     if config.clock.scheduler == "fixed-priority":
@@ -253,7 +251,7 @@ def reservations(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake("clock.scheduler", config.clock.scheduler, why)
 
 
-def schedule(wiring: Wiring) -> Iterator[Mistake]:
+def schedule(wiring: Wiring) -> Mistakes:
     """Check a static schedule; its boards only if its frames are right."""
     table = wiring.config.schedule
     if table is not None:
@@ -261,7 +259,7 @@ def schedule(wiring: Wiring) -> Iterator[Mistake]:
         yield from found or _cycles(wiring, table)
 
 
-def _frames(table: ScheduleConfig, clock_ns: int) -> Iterator[Mistake]:
+def _frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
     tick_ms = clock_ns * 1e-6
     minor, major = frames(table, clock_ns)
     if minor < 1 or abs(minor * tick_ms - table.minor_ms) > 1e-6 * tick_ms:
@@ -285,7 +283,7 @@ def _nearest(value: float, step: float) -> str:
     return " or ".join(f"{number * step:.12g}" for number in (below, below + 1) if number)
 
 
-def _cycles(wiring: Wiring, table: ScheduleConfig) -> Iterator[Mistake]:
+def _cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
     clock_ns = wiring.config.clock_ns
     minor, major = frames(table, clock_ns)
     tick_ms = clock_ns * 1e-6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from functools import partial
 
 from pydantic import ValidationError
@@ -12,7 +12,7 @@ from rack.boards.config.cell import built_cell
 from rack.boards.config.mistakes import at_key, mistakes_of
 from rack.boards.config.published import Levels, PublishedLevel
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 from rack.levels.errors import LevelError, RobotError
 from rack.levels.operator import NAMED, Commands, Goal, Operation, goal_names, listed
 from rack.levels.tables import read_setting
@@ -53,7 +53,7 @@ def command_mistakes(
 
 def _mistakes(
     place: str, command: CommandConfig, config: RackConfig, published: Levels
-) -> Iterator[Mistake]:
+) -> Mistakes:
     at = partial(at_key, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
@@ -82,7 +82,7 @@ def _mistakes(
             )
 
 
-def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Iterator[Mistake]:
+def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:
     """Check that there is one goal, of a form that the level accepts."""
     wanted = known[command.said]
     given = command.goals
@@ -109,7 +109,7 @@ def _key(goal: Goal) -> str:
     return keys.get(goal, goal.name.lower())
 
 
-def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Iterator[Mistake]:
+def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
     """Check that an operation that gives a name, and no other, gives one that its level knows."""
     if command.said not in NAMED:
         if command.name is not None:
@@ -125,7 +125,7 @@ def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Iterator
         )
 
 
-def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Iterator[Mistake]:
+def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
     """Check that a command sets a live parameter of its level to a valid value."""
     name = at_key(place, "name")
     try:
@@ -146,7 +146,7 @@ def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Itera
         yield from mistakes_of(error, table, given, params)
 
 
-def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Iterator[Mistake]:
+def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistakes:
     robot = config.robot
     if robot is None:
         yield Mistake(place, list(joints), "the rack has no arm")

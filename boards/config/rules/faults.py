@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
@@ -11,7 +11,7 @@ from rack.backplane.mailbox.queue import is_position
 from rack.boards.config.mistakes import at_key
 from rack.boards.config.published import Levels
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 from rack.boards.faults.config import FaultConfig, condition
 from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.levels.tables import RobotConfig
@@ -61,9 +61,15 @@ class FaultRules:
     layout: Layout | None = None
     unspecified: Collection[str] = ()
 
-    def mistakes(self) -> Iterator[Mistake]:
+    def mistakes(self) -> Mistakes:
         """Yield every mistake in the fault."""
-        yield from self._once_each()
+        # Check that its begin and its end are each given in one way.
+        for keys in (("tick", "at", "when"), ("for", "cycles")):
+            given = [key for key in keys if self._value(key) is not None]
+            for key in given[1:]:
+                yield self._mistake(
+                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
+                )
         fault = self.fault
         places = (*self.config.tasks(), *self.config.hosts())
         tasks: dict[str, Role] = {place.name: place.role for place in places}
@@ -83,16 +89,7 @@ class FaultRules:
             except LookupError as error:
                 yield self._mistake("when", str(error.args[0]))
 
-    def _once_each(self) -> Iterator[Mistake]:
-        """Check that its begin and its end are each given in one way."""
-        for keys in (("tick", "at", "when"), ("for", "cycles")):
-            given = [key for key in keys if self._value(key) is not None]
-            for key in given[1:]:
-                yield self._mistake(
-                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
-                )
-
-    def _of_kind(self, kind: Kind) -> Iterator[Mistake]:
+    def _of_kind(self, kind: Kind) -> Mistakes:
         if kind.realtime and self.config.clock.mode == "lockstep":
             why = (
                 f"{kind.name} needs real time: in lockstep time waits for every task; run without"
@@ -119,7 +116,7 @@ class FaultRules:
             )
         yield from self._parameters(kind)
 
-    def _parameters(self, kind: Kind) -> Iterator[Mistake]:
+    def _parameters(self, kind: Kind) -> Mistakes:
         known = {parameter.name: parameter for parameter in kind.parameters}
         for name, value in self.fault.parameters.items():
             if name not in known:
@@ -131,7 +128,7 @@ class FaultRules:
             if parameter.default is None and parameter.name not in self.fault.parameters:
                 yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
 
-    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Iterator[Mistake]:
+    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
         """Check that the task can be struck by such a fault."""
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
@@ -173,7 +170,7 @@ class FaultRules:
         is_known = place.partition(".")[0].strip() not in self.unspecified
         return self.layout if is_known else None
 
-    def _mailboxes(self, kind: Kind, layout: Layout) -> Iterator[Mistake]:
+    def _mailboxes(self, kind: Kind, layout: Layout) -> Mistakes:
         every = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
         # The position of a queue's reader is not written through a port.
         written = {
@@ -211,7 +208,7 @@ class FaultRules:
                 )
                 yield self._mistake("mailbox", why)
 
-    def _without(self, keys: Iterable[str], why: str) -> Iterator[Mistake]:
+    def _without(self, keys: Iterable[str], why: str) -> Mistakes:
         """Check that none of these keys is given."""
         for key in keys:
             if self._value(key) is not None:

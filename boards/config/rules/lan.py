@@ -19,7 +19,7 @@ from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeats
 from rack.boards.config.schema import LAN, LanConfig, RackConfig
 from rack.boards.config.wiring import Wiring, is_taken
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
 from rack.boards.lan.endpoint import Endpoint
@@ -33,7 +33,7 @@ _OWN = re.compile(rf"\bboard\.{LAN}(\.params)?(?=[.\[]|\b)")
 _MAILBOX = f"mailbox {LAN}."
 
 
-def lan(wiring: Wiring) -> Iterator[Mistake]:
+def lan(wiring: Wiring) -> Mistakes:
     """Check what shows without the ports of the boards."""
     config = wiring.config
     table = wiring.config.adapter.lan
@@ -69,7 +69,7 @@ def lan(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake(PLACE, None, f'{why}; permitted: clock.mode = "lockstep"')
 
 
-def _names(table: LanTable, rack: str) -> Iterator[Mistake]:
+def _names(table: LanTable, rack: str) -> Mistakes:
     """Check names of racks and ports: none twice, none of this rack, none that the adapter itself
     needs."""
     taken = {
@@ -107,7 +107,7 @@ def _names(table: LanTable, rack: str) -> Iterator[Mistake]:
         yield Mistake(f"{PLACE}.peers", alike, why)
 
 
-def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Iterator[Mistake]:
+def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mistakes:
     of = ("of the adapter", "cycle")
     try:
         every = ticks_of(entry.rate_hz, cycle_ns, "exchange", of, FASTEST_HZ)
@@ -124,7 +124,7 @@ def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Iter
             yield Mistake(f"{place}.max_age_ms", entry.max_age_ms, f"{why}; permitted: no less")
 
 
-def _priority(config: RackConfig, table: LanConfig) -> Iterator[Mistake]:
+def _priority(config: RackConfig, table: LanConfig) -> Mistakes:
     """Require a priority above the neighbours', if there are real-time ones: else others lose sight
     of this rack."""
     others = [place for place in config.tasks() if place.core == table.core and place.board != LAN]
@@ -140,7 +140,7 @@ def _priority(config: RackConfig, table: LanConfig) -> Iterator[Mistake]:
         )
 
 
-def entries(wiring: Wiring) -> Iterator[Mistake]:
+def entries(wiring: Wiring) -> Mistakes:
     """Check what the entries name: mailboxes of this rack, and message types."""
     table = wiring.config.adapter.lan
     if table is None:
@@ -190,7 +190,7 @@ SOON = timedelta(days=30)
 """Time before the end of certificates from which a launch warns."""
 
 
-def network(wiring: Wiring) -> Iterator[Mistake]:
+def network(wiring: Wiring) -> Mistakes:
     """Check the endpoints, judged by the config alone."""
     table = wiring.config.adapter.lan
     if table is None:
@@ -255,7 +255,7 @@ def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
     return ""
 
 
-def credential_mistakes(config: RackConfig) -> Iterator[Mistake]:
+def credential_mistakes(config: RackConfig) -> Mistakes:
     """Yield what is wrong with the files of the credentials on this machine, now."""
     table = config.adapter.lan
     if table is None or table.certificates is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 from pydantic import ValidationError
 
@@ -13,7 +13,7 @@ from rack.backplane.regular_file import check_regular_file
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.mistakes import mistakes_of, repeated
 from rack.boards.config.wiring import Wiring
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, LevelContext
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -22,7 +22,7 @@ MAX_SEGMENT_BYTES = 2**30
 MAX_MODEL_BYTES = 2**30
 
 
-def params(wiring: Wiring) -> Iterator[Mistake]:
+def params(wiring: Wiring) -> Mistakes:
     """Check each board's parameters against the declarations of its executor's and planner's
     classes."""
     for table, kind in wiring.params:
@@ -34,7 +34,7 @@ def params(wiring: Wiring) -> Iterator[Mistake]:
             yield from mistakes_of(error, kind, given, f"{table}.params")
 
 
-def programs(wiring: Wiring) -> Iterator[Mistake]:
+def programs(wiring: Wiring) -> Mistakes:
     """Check `[task]` against the programs declared by the levels' classes."""
     config = wiring.config
     for kind in wiring.programs:
@@ -47,7 +47,7 @@ def programs(wiring: Wiring) -> Iterator[Mistake]:
                 yield Mistake(f"task.{key}", value, why)
 
 
-def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Iterator[Mistake]:
+def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
     """Check that the rack knows each size that a message needs."""
     for mailbox, (ports, output) in wiring.writers.items():
         try:
@@ -56,7 +56,7 @@ def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Iterator[Mistake]:
             yield Mistake(f"mailbox {mailbox}", ports.task, str(error))
 
 
-def memory(layout: Layout) -> Iterator[Mistake]:
+def memory(layout: Layout) -> Mistakes:
     """Check the size of the segment, and name the largest mailbox."""
     size = AddressMap(layout).size
     if size > MAX_SEGMENT_BYTES:
@@ -69,7 +69,7 @@ def memory(layout: Layout) -> Iterator[Mistake]:
         yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
 
 
-def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Iterator[Mistake]:
+def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes:
     """Ask each level whether its neighbours suit it; `contexts` by board, without boards that have
     mistakes."""
     for ports in wiring.tasks:
@@ -83,7 +83,7 @@ def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Iterator
                 yield Mistake(f"board.{ports.task}.{key}", value, why)
 
 
-def scene(wiring: Wiring) -> Iterator[Mistake]:
+def scene(wiring: Wiring) -> Mistakes:
     """Check the names of objects and obstacles."""
     scene = wiring.config.scene
     for kind, key, those in (
@@ -100,32 +100,24 @@ def scene(wiring: Wiring) -> Iterator[Mistake]:
     yield from repeated("scene.objects and scene.obstacles", scene.bodies)
 
 
-def robot(wiring: Wiring) -> Iterator[Mistake]:
+def robot(wiring: Wiring) -> Mistakes:
     """Check that the model is there, and that each list has a value per joint."""
     robot = wiring.config.robot
     if robot is None:
         return
-    joints = len(robot.joints)
     try:
         check_regular_file(robot.model, MAX_MODEL_BYTES)
     except OSError as error:
         yield Mistake("robot.model", str(robot.model), f"cannot be read: {error.strerror}")
-    for key, values in robot.per_joint.items():
-        if values is not None and len(values) != joints:
-            yield Mistake(
-                f"robot.{key}", values, f"{len(values)} values; permitted: {joints}, one per joint"
-            )
-    for key, values in robot.sensors or ():
-        if isinstance(values, tuple) and len(values) != joints:
-            why = f"{len(values)} values; permitted: one for all joints, or {joints}, one per joint"
-            yield Mistake(f"robot.sensors.{key}", values, why)
+    for key, values, why in robot.misfits():
+        yield Mistake(f"robot.{key}", values, why)
     if robot.hand is not None and robot.interface != "torque":
         why = "tendons of a hand take tensions; permitted: torque"
         yield Mistake("robot.interface", robot.interface, why)
     yield from repeated("robot.joints", robot.joints)
 
 
-def cell(wiring: Wiring) -> Iterator[Mistake]:
+def cell(wiring: Wiring) -> Mistakes:
     """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only
     names are checked."""
     config = wiring.config

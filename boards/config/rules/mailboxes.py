@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
 from rack.backplane.message import State
 from rack.boards.config.schema import LAN, TaskPlace
 from rack.boards.config.wiring import TaskPorts, Wiring, rewired
-from rack.boards.errors import Mistake
+from rack.boards.errors import Mistake, Mistakes
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
 
 PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 
 
-def ports(wiring: Wiring) -> Iterator[Mistake]:
+def ports(wiring: Wiring) -> Mistakes:
     """Check that each class is there, and that its inputs are connected as it declares."""
     config = wiring.config
     for place in (*config.tasks(), *config.hosts()):
@@ -26,7 +24,7 @@ def ports(wiring: Wiring) -> Iterator[Mistake]:
             yield from _connected(wiring, place, wiring.ports[place])
 
 
-def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Iterator[Mistake]:
+def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Mistakes:
     role = place.role
     table = place.table
     inputs = ", ".join(ports.kind.inputs) or "none"
@@ -51,7 +49,7 @@ def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Iterator[M
             )
 
 
-def writers(wiring: Wiring) -> Iterator[Mistake]:
+def writers(wiring: Wiring) -> Mistakes:
     """Check that each mailbox has one writer."""
     for ports in wiring.ports.values():
         for mailbox in ports.writes.values():
@@ -60,7 +58,7 @@ def writers(wiring: Wiring) -> Iterator[Mistake]:
                 yield Mistake(f"mailbox {mailbox}", ports.task, f"already written by {first.task}")
 
 
-def reads(wiring: Wiring) -> Iterator[Mistake]:
+def reads(wiring: Wiring) -> Mistakes:
     """Check that each mailbox that is read exists, and carries what the port needs."""
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
@@ -88,7 +86,7 @@ def _wired_at(ports: TaskPorts, port: str) -> str:
     return f"{place.table}.{key}.{port}"
 
 
-def statuses(wiring: Wiring) -> Iterator[Mistake]:
+def statuses(wiring: Wiring) -> Mistakes:
     """Check that the board that ends the run has a status, and in it a state."""
     for name, board in wiring.config.board.items():
         if not board.ends_run:
@@ -103,7 +101,7 @@ def statuses(wiring: Wiring) -> Iterator[Mistake]:
             )
 
 
-def sides(wiring: Wiring) -> Iterator[Mistake]:
+def sides(wiring: Wiring) -> Mistakes:
     """Check that only bus adapters read mailboxes of the other side."""
     for task in wiring.ports.values():
         for port, mailbox in task.sources:
@@ -140,7 +138,7 @@ NOT_OPERATED = {
 """Protocols that an operator's mailbox cannot have, and why."""
 
 
-def strict(wiring: Wiring) -> Iterator[Mistake]:
+def strict(wiring: Wiring) -> Mistakes:
     """Refuse everything that makes a run depend on timing, if the config says so."""
     config = wiring.config
     if not config.protocol.strict:
@@ -159,7 +157,7 @@ def strict(wiring: Wiring) -> Iterator[Mistake]:
                 yield Mistake(f"board.{name}.exchange.{port}.asynchronous", True, f"{why}: false")
 
 
-def exchange(wiring: Wiring) -> Iterator[Mistake]:
+def exchange(wiring: Wiring) -> Mistakes:
     """Check when boards read their ports, and that a mailbox is free for what they record of it."""
     for ports in wiring.tasks:
         if not ports.exchange or not ports.is_whole:
@@ -186,7 +184,7 @@ def exchange(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake(f"board.{ports.task}.exchange", None, why)
 
 
-def operated(wiring: Wiring) -> Iterator[Mistake]:
+def operated(wiring: Wiring) -> Mistakes:
     """Check that only the clock writes operators' mailboxes, never waits, and never finds one
     full."""
     for mailbox in wiring.operated:
@@ -202,7 +200,7 @@ def operated(wiring: Wiring) -> Iterator[Mistake]:
             )
 
 
-def mailboxes(wiring: Wiring) -> Iterator[Mistake]:
+def mailboxes(wiring: Wiring) -> Mistakes:
     """Check that the mailboxes exist whose protocol the config gives."""
     for mailbox in wiring.config.protocol.mailbox:
         if not wiring.is_known(mailbox):
@@ -211,7 +209,7 @@ def mailboxes(wiring: Wiring) -> Iterator[Mistake]:
             )
 
 
-def queues(wiring: Wiring) -> Iterator[Mistake]:
+def queues(wiring: Wiring) -> Mistakes:
     """Check which mailboxes are queues, their readers and their depths, if the two sides are
     apart."""
     if any(sides(wiring)):
@@ -235,7 +233,7 @@ def queues(wiring: Wiring) -> Iterator[Mistake]:
             yield Mistake(f"protocol.depth.{mailbox}", depth, why)
 
 
-def _queue(wiring: Wiring, mailbox: str) -> Iterator[Mistake]:
+def _queue(wiring: Wiring, mailbox: str) -> Mistakes:
     """Check one queue: exactly one port reads it, and its reader's position has a name of its
     own."""
     if taken_name(mailbox) in wiring.writers:
@@ -268,7 +266,7 @@ def _queue(wiring: Wiring, mailbox: str) -> Iterator[Mistake]:
         yield Mistake(f"mailbox {mailbox}", None, why)
 
 
-def asynchronous(wiring: Wiring) -> Iterator[Mistake]:
+def asynchronous(wiring: Wiring) -> Mistakes:
     """Check that what a port reads asynchronously can be read at once."""
     for ports in wiring.tasks:
         for port, mailbox in ports.sources:
@@ -285,7 +283,7 @@ def asynchronous(wiring: Wiring) -> Iterator[Mistake]:
                 yield Mistake(f"board.{ports.task}.exchange.{port}.asynchronous", True, why)
 
 
-def interrupts(wiring: Wiring) -> Iterator[Mistake]:
+def interrupts(wiring: Wiring) -> Mistakes:
     """Check that messages of which the config demands it can interrupt."""
     for mailbox, given in wiring.config.protocol.mailbox.items():
         why = ""

@@ -103,12 +103,21 @@ class Coordinator(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Read what the arms report, go on with the program, order what is next."""
         if not self._started:
-            self._recall(read)
+            # Continue from the last progress in the mailbox, after a restart of the board.
+            self._started = True
+            if read.last_progress.is_there:
+                self._agreement.recall(read.last_progress.value)
+                self._moves = read.last_progress.value.moves
         self._operated.take(read.operator)
         self._readings = {arm: getattr(read, f"report_{arm}") for arm in self._table.arms}
         held = self._reason_to_hold()
         if self._steps:
-            self._go_on(tick * self.context.tick_s)
+            agreement = self._agreement
+            step = agreement.step
+            moves = self._moves_of_step()[1]
+            agreement.advance(self._readings, tick * self.context.tick_s)
+            if agreement.step > step:
+                self._moves += moves
         waits = held or self._reason_to_wait()
         if self._steps:
             self._check_progress(waits, tick)
@@ -117,21 +126,6 @@ class Coordinator(Executor):
         self._agreement.write_to(write.progress)
         fill_counts(write.progress.record[["moves"]], (self._moves,))
         self._report(waits, write.status)
-
-    def _recall(self, read: Ports) -> None:
-        """Continue from the last progress in the mailbox, after a restart of the board."""
-        self._started = True
-        if read.last_progress.is_there:
-            self._agreement.recall(read.last_progress.value)
-            self._moves = read.last_progress.value.moves
-
-    def _go_on(self, now_s: float) -> None:
-        agreement = self._agreement
-        step = agreement.step
-        moves = self._moves_of_step()[1]
-        agreement.advance(self._readings, now_s)
-        if agreement.step > step:
-            self._moves += moves
 
     def _moves_of_step(self) -> tuple[int, int]:
         """Return how many moves of the present step are done, of how many."""

@@ -12,9 +12,9 @@ from typing import Annotated
 from pydantic import StringConstraints
 
 from rack.backplane.message import Field, MessageType, command, status
+from rack.levels.fields import by_joint, flag, number, real, short_count
 from rack.levels.messages import OPERATED, Error
 from rack.levels.operator import MAX_JOINTS, Goal
-from rack.levels.systems.fields import by_joint, flag, number, real
 
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 OBJECT_BYTES = 32
@@ -75,7 +75,7 @@ ACTION_FIELDS = (
     real("lift", "m", "height of a transfer's straight motions"),
     real("quaternion", "1", "of the tool, for goal pose", 4),
     real("direction", "1", "of the tool's z axis, for goal direction", 3),
-    Field("count", "u1", "1", "joints that follow"),
+    flag("count", "joints that follow"),
     real("joints", "rad", "joint positions, for goal joints", MAX_JOINTS),
     real("by", "s", "simulated time by which it must be done; 0: any time"),
 )
@@ -116,8 +116,8 @@ CELL_REPORT = status(
         "s",
         "in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time",
     ),
-    Field("moves_done", "u2", "1", "elemental moves of the order done"),
-    Field("moves", "u2", "1", "elemental moves of the order; 0 before it begins"),
+    short_count("moves_done", "elemental moves of the order done"),
+    short_count("moves", "elemental moves of the order; 0 before it begins"),
     flag("halted", "1: moves were withdrawn, the arm is held until it begins another order"),
     OPERATED,
     errors=Error,
@@ -148,13 +148,13 @@ CELL_PROGRESS = MessageType(
     2,
     (
         Field("phase", "u1", Phase, "of the present step"),
-        Field("step", "u2", "1", "steps done"),
-        Field("attempt", "u2", "1", "times that the present step was asked for before"),
+        short_count("step", "steps done"),
+        short_count("attempt", "times that the present step was asked for before"),
         Field("error", "u2", Error, "why the program ends early; 0: it does not"),
         Field("reason", "S120", "ASCII", "the error, readable"),
         real("ending", "s", "simulated time since when the arms are ended; 0: not yet"),
         real("begun", "s", "simulated time from which `by` counts; 0: not yet"),
-        Field("moves", "u2", "1", "elemental moves of the steps done"),
+        short_count("moves", "elemental moves of the steps done"),
     ),
 )
 """A coordinator's memory, from which it continues after a restart of its board."""

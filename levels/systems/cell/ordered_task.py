@@ -132,7 +132,15 @@ class OrderedTaskExecutor(TaskExecutor):
         elif taken.is_under_way and not self._begun:
             self._begin(read, request)
         write.status.echo = plan.id if plan.id == request.id else 0
-        self._fill_times(plan, request, write.report)
+        # Report the earliest end, and how long a promise holds, in the coordinator's time.
+        report = write.report
+        response = self._taken.response
+        report.earliest = 0.0
+        report.until = 0.0
+        if plan.id == request.id and response in PLANNED:
+            report.earliest = plan.earliest
+        if response is Response.POSSIBLE and request.by:
+            report.until = request.begin + request.ahead + request.by - plan.earliest
         below = read.status.value
         write.report.operated = below.operated or self._orders.stands
         return plan if self._begun and self._begun == plan.id else self._nothing
@@ -309,16 +317,6 @@ class OrderedTaskExecutor(TaskExecutor):
         elif taken.is_under_way and plan.count and self._done == plan.count:
             taken.answer(Response.DONE)
             self._orders_done += 1
-
-    def _fill_times(self, plan: Message, request: Message, report: Message) -> None:
-        """Report the earliest end, and how long a promise holds, in the coordinator's time."""
-        response = self._taken.response
-        report.earliest = 0.0
-        report.until = 0.0
-        if plan.id == request.id and response in PLANNED:
-            report.earliest = plan.earliest
-        if response is Response.POSSIBLE and request.by:
-            report.until = request.begin + request.ahead + request.by - plan.earliest
 
     def _answer(self, below: Message, write: Ports) -> None:
         super()._answer(below, write)

@@ -87,24 +87,20 @@ class CellProgram(Program):
                         action.by,
                         f"an earlier step has {latest:g}; permitted: later than that",
                     )
-                yield from _too_long(place, action)
+                # An order holds names and joints of limited length.
+                if isinstance(action, ArmTransfer) and not (
+                    action.object.isascii() and len(action.object) <= OBJECT_BYTES
+                ):
+                    yield (
+                        f"{place}.object",
+                        action.object,
+                        f"permitted in an order: at most {OBJECT_BYTES} ASCII characters",
+                    )
+                if isinstance(action, ArmGoto) and len(action.joints or ()) > MAX_JOINTS:
+                    yield (
+                        f"{place}.joints",
+                        list(action.joints or ()),
+                        f"permitted in an order: at most {MAX_JOINTS} joints",
+                    )
                 arms.add(action.arm)
             latest = max([latest, *(action.by or 0.0 for action in step.do)])
-
-
-def _too_long(place: str, action: ArmTransfer | ArmGoto | ArmHome) -> Misfits:
-    """Yield what does not fit into an order."""
-    if isinstance(action, ArmTransfer) and not (
-        action.object.isascii() and len(action.object) <= OBJECT_BYTES
-    ):
-        yield (
-            f"{place}.object",
-            action.object,
-            f"permitted in an order: at most {OBJECT_BYTES} ASCII characters",
-        )
-    if isinstance(action, ArmGoto) and len(action.joints or ()) > MAX_JOINTS:
-        yield (
-            f"{place}.joints",
-            list(action.joints or ()),
-            f"permitted in an order: at most {MAX_JOINTS} joints",
-        )

@@ -22,6 +22,7 @@ import numpy as np
 
 from rack.backplane.message import Field, Message, MessageType
 from rack.levels.algebra import Array
+from rack.levels.fields import flag, number
 
 MOST_SHARED = 4
 """Bodies that one rack shares, at most: the message has the same layout in every rack."""
@@ -35,19 +36,14 @@ SHARED_BODY = MessageType(
     1,
     (
         Field("name", f"S{NAME_BYTES}", "ASCII", "body, by its name in the model; empty: none"),
-        Field(
-            "claim",
-            "u4",
-            "1",
-            "number of the claim that stands, as far as this rack knows; 0: none yet",
-        ),
+        number("claim", "number of the claim that stands, as far as this rack knows; 0: none yet"),
         Field(
             "owner",
             f"S{NAME_BYTES}",
             "ASCII",
             "rack whose claim that is: its simulation moves the body",
         ),
-        Field("touched", "u1", "1", "1: the gripper of this rack touches it"),
+        flag("touched", "1: the gripper of this rack touches it"),
         Field(
             "position", "f8", "m", "body origin in this rack's simulation", (3,), (0.0, FARTHEST_M)
         ),

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.arm.simulated import SimulatedArm
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.lookup import below, geoms_of
@@ -32,7 +31,7 @@ class SharingArm(SimulatedArm):
         super().__init__(cell, scene, clock_ns, every, seed)
         self._kept: dict[int, Array] = {}  # row of a copy: where it stays, (7,)
         self._in_hand = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
-        self._parts: dict[int, NDArray[np.bool_]] = {}  # (ngeom,), by row: geoms of the object
+        self._parts: dict[int, Mask] = {}  # (ngeom,), by row: geoms of the object
 
     def is_touched(self, row: int) -> bool:
         """Return whether the gripper touches an object."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, norm
 from rack.levels.arm import wrist
@@ -81,7 +80,13 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         if self._since is None and read.felt.is_there:
             self._exceeded = read.felt.value.exceeded
         super().process(read, write, tick)
-        self._show_contact(write.wrench, tick)
+        wrench = write.wrench
+        contact = self.contact
+        wrench.tick = tick
+        wrench.saturated = contact.saturated
+        wrench.exceeded = self._exceeded
+        wrench.wrench = contact.wrench
+        wrench.sample = contact.raw
 
     def feel(self, tick: int) -> None:
         """Sense the contact; stop the arm if it is too strong."""
@@ -134,11 +139,3 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         terms = super().terms()
         terms.bias[:] -= self.contact.torque
         return terms
-
-    def _show_contact(self, wrench: Message, tick: int) -> None:
-        contact = self.contact
-        wrench.tick = tick
-        wrench.saturated = contact.saturated
-        wrench.exceeded = self._exceeded
-        wrench.wrench = contact.wrench
-        wrench.sample = contact.raw

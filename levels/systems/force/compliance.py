@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, norm
+from rack.levels.algebra import Array, Mask, norm
 from rack.levels.level import Ports, Reading
 from rack.levels.operator import ABOVE_LOST
 from rack.levels.systems.force.contact import AXIS_NAMES, HALVES
@@ -102,9 +101,7 @@ class ComplianceWatch:
 
     def _guard(self, compliance: Message) -> None:
         """End the motion once for a command whose guard is struck."""
-        beyond: NDArray[np.bool_] = (compliance.guard > 0.0) & (
-            np.abs(self.felt) > compliance.guard
-        )
+        beyond: Mask = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
         if beyond.any() and self.struck != compliance.id:
             self.struck = compliance.id
             self.axis = int(beyond.argmax())

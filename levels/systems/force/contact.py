@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, norm
+from rack.levels.algebra import Array, Mask, norm
 from rack.levels.systems.force.messages import AXES
 
 Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
@@ -29,7 +28,7 @@ class Wanted(NamedTuple):
     """What a request asks of a contact; the last four (6,), by axis. See `SERVER_REQUEST`."""
 
     frame: Array  # (4,)
-    selected: NDArray[np.bool_]
+    selected: Mask
     wrench: Array
     speed: Array
     guard: Array

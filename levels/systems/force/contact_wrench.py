@@ -7,12 +7,11 @@ contact. So no mass is entered twice, and a tool with joints of its own needs no
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.engine import mj_jac, mj_rne_post_constraint, one_view
@@ -66,7 +65,7 @@ class ContactWrench:
         self._set(*self._fixed, raw, acceleration, self.wrench, self.torque)
 
 
-@compiled
+@compiled_for("i8, i8, i8[::1], f8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1], f8[::1]")
 def set_contact(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     model: int,
     data: int,  # evaluated at the state
@@ -120,17 +119,3 @@ def set_contact(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.p
         for axis in range(3):
             torque[joint] += jacobians[0, axis, dof[joint]] * wrench[axis]
             torque[joint] += jacobians[1, axis, dof[joint]] * wrench[3 + axis]
-
-
-def preload() -> None:
-    """Load the compiled function of this module."""
-    model = mujoco.MjModel.from_xml_string("<mujoco/>")
-    data = mujoco.MjData(model)
-    none = np.zeros(0)
-    places = np.zeros(7, dtype=int)
-    memory = np.zeros(16)
-    wrench = np.zeros(AXES)
-    at = model._address, data._address
-    set_contact.load()(
-        *at, places, memory, places[:0], np.zeros((2, 3, 0)), wrench, none, wrench, none
-    )

@@ -11,7 +11,7 @@ from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Payload
-from rack.levels.servo import reference
+from rack.levels.servo import curves, reference
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.force.compliance import ComplianceWatch
 from rack.levels.systems.force.hybrid_law import HybridGains, HybridLaw
@@ -54,7 +54,7 @@ class HybridExecutor(WristLevel):
         "force": Output(FORCE_STATUS, rests_on="wrench"),
     }
     params = HybridGains
-    preloads = (dynamics, reference)
+    preloads = (curves, dynamics, reference)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -91,7 +91,20 @@ class HybridExecutor(WristLevel):
             write.command.due = 0
             self._moving[:] = 0.0
         self._report(read, write.status)
-        self._report_force(read.compliance.value, write.force)
+        force = write.force
+        watch = self._watch
+        force.echo = read.compliance.value.id
+        force.operator = read.compliance.value.operator
+        force.sensed = watch.sensed
+        force.wrench = watch.felt
+        force.offset = self._law.offset
+        force.struck = watch.struck
+        force.axis = watch.axis
+        force.wanted = 0.0 if watch.task is None else watch.task.wanted
+        force.selected = 0 if watch.task is None else watch.task.selected
+        resting = State.IDLE if watch.task is None else State.EXECUTING
+        force.state = State.HOLDING if watch.reason else resting
+        force.reason = watch.reason
 
     def _begin(self, position: Array, tick: int) -> None:
         """Begin at rest, without a difference from the motion."""
@@ -137,18 +150,3 @@ class HybridExecutor(WristLevel):
             status.state = State.HOLDING
         else:
             status.state = State.IDLE if self._reference.holding else State.EXECUTING
-
-    def _report_force(self, compliance: Message, force: Message) -> None:
-        watch = self._watch
-        force.echo = compliance.id
-        force.operator = compliance.operator
-        force.sensed = watch.sensed
-        force.wrench = watch.felt
-        force.offset = self._law.offset
-        force.struck = watch.struck
-        force.axis = watch.axis
-        force.wanted = 0.0 if watch.task is None else watch.task.wanted
-        force.selected = 0 if watch.task is None else watch.task.selected
-        resting = State.IDLE if watch.task is None else State.EXECUTING
-        force.state = State.HOLDING if watch.reason else resting
-        force.reason = watch.reason

@@ -17,10 +17,9 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from rack.levels.algebra import Array, gram, mat_vec, solve, transposed_mat_vec
+from rack.levels.algebra import Array, Mask, gram, mat_vec, solve, transposed_mat_vec
 from rack.levels.planning.pose import site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
@@ -64,7 +63,7 @@ class ForceTask(NamedTuple):
     """The axes of force, and the contact as it is. Vectors (6,) are in the task frame."""
 
     rotation: Array  # (3, 3), of the task frame in the world
-    selected: NDArray[np.bool_]  # (6,), axes of force
+    selected: Mask  # (6,), axes of force
     wanted: Array  # (6,), N, N m: of the tool on the surroundings, on axes of force
     # (6,), N, N m: of the tool on the surroundings; None: not known, so force axes rest.
     exerted: Array | None

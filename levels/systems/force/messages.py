@@ -12,8 +12,8 @@ from __future__ import annotations
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status
+from rack.levels.fields import flag, number, real, row, tick
 from rack.levels.operator import ANSWER, RESTS_ON
-from rack.levels.systems.fields import flag, number, real, tick
 from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, state_of
 
 AXES = 6
@@ -68,7 +68,7 @@ FORCE_STATUS = status(
         "offset", "m", "from where the motion alone would have the tool to where it is commanded", 3
     ),
     number("struck", "id of the newest command whose guard was struck; 0: none"),
-    Field("axis", "i2", "1", "axis on which that was; -1: none"),
+    row("axis", "axis on which that was; -1: none"),
 )
 """From the level of hybrid control to the motion server."""
 
@@ -134,7 +134,7 @@ SERVER_STATUS = MessageType(
         real("wanted", "N, N m", "the same as wanted, on the axes of force; others 0", AXES),
         flag("selected", "1: an axis of force", AXES),
         number("guarded", "newest request that a guard has ended; 0: none yet"),
-        Field("axis", "i2", "1", "axis on which that was; -1: none yet"),
+        row("axis", "axis on which that was; -1: none yet"),
     ),
 )
 """Requests as the server keeps them, from taking to end, and the contact."""

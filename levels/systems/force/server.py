@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.levels.level import Input, LevelContext, Output, Ports, Reading
+from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.messages import Error
 from rack.levels.systems.force.messages import (
     COMPLIANCE,
@@ -96,22 +96,19 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         for below in read.boards.values():
             if below.is_there:
                 self._sensed = below.value.position
-        self._feel(read.force)
-        self._miss_client()
-
-    def _feel(self, force: Reading) -> None:
-        """Take over the newest contact; a guard that was struck ends the request under way."""
-        status = force.value
+        # Take over the newest contact; a guard that was struck ends the request under way.
+        status = read.force.value
         work = self._work
         answers = (
-            force.is_there
-            and not force.is_lost
+            read.force.is_there
+            and not read.force.is_lost
             and status.echo == work.contact.id
             and status.sensed >= 0
         )
         work.force = status if answers else None
         if answers and status.struck == work.contact.id and work.contact.guard.any():
             work.strike(int(status.axis))
+        self._miss_client()
 
     def _miss_client(self) -> None:
         """Outlive a client that is lost."""
@@ -122,7 +119,11 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             if self._passed_s(self._heard) > params.silence and (
                 agenda.held or work.contact.complies
             ):
-                self._lose_client()
+                self._work.drop(RequestEnd.CANCELLED, "", Error.CLIENT)
+                if self._work.contact.complies:
+                    self._enter(Mode.HELD, f"forces are held for {self._params.hold:g} s")
+                else:
+                    self._enter(Mode.RELEASED, "the position is held")
         elif self._without is Mode.HELD and self._passed_s(self._since) > params.hold:
             work.contact.relax()
             self._enter(Mode.RELEASING, "forces go to zero")
@@ -131,13 +132,6 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             if is_over or (work.off() <= 1.0).all():
                 work.release()
                 self._enter(Mode.RELEASED, "forces released, the position is held")
-
-    def _lose_client(self) -> None:
-        self._work.drop(RequestEnd.CANCELLED, "", Error.CLIENT)
-        if self._work.contact.complies:
-            self._enter(Mode.HELD, f"forces are held for {self._params.hold:g} s")
-        else:
-            self._enter(Mode.RELEASED, "the position is held")
 
     def _enter(self, mode: Mode, what: str) -> None:
         self._without = mode

@@ -111,7 +111,16 @@ class HandExecutor(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
         hand = self.hand
-        self._catch_up(read.before, tick)
+        # Advance the hand to tick. A restarted board first restores it.
+        if not self._started:
+            self._started = True
+            if read.before.is_there:
+                self.hand.restore(read.before.value)
+                self._opened = True
+            self._closed_at = tick
+        self.hand.step(tick - self.hand.tick)
+        if self.hand.braked and self._closed_at is None:  # no tensions came in time
+            self._closed_at = tick
         self.orders.take(read.operator)
         sample = hand.sense()
         self.findings += self._slack.look(sample.tension, hand.wanted)
@@ -122,18 +131,6 @@ class HandExecutor(Executor):
         hand.save(write.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             hand.look(write.scene)
-
-    def _catch_up(self, before: Reading, tick: int) -> None:
-        """Advance the hand to `tick`. A restarted board first restores it."""
-        if not self._started:
-            self._started = True
-            if before.is_there:
-                self.hand.restore(before.value)
-                self._opened = True
-            self._closed_at = tick
-        self.hand.step(tick - self.hand.tick)
-        if self.hand.braked and self._closed_at is None:  # no tensions came in time
-            self._closed_at = tick
 
     def _drive(self, read: Ports, tick: int) -> None:
         """Give the valves the tensions of the boards above, or close them and say why."""

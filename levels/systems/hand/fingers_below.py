@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rack.levels.algebra import Ints
 from rack.levels.level import LevelContext, Reading
 from rack.levels.messages import Error
 
@@ -16,7 +16,7 @@ class FingersBelow:
     """Merges `FINGER_STATUS`es; each board fills what is its own. Points and forces are in the
     frame of the palm."""
 
-    def __init__(self, context: LevelContext, fingers: Sequence[NDArray[np.int_]]) -> None:
+    def __init__(self, context: LevelContext, fingers: Sequence[Ints]) -> None:
         """`fingers` are the joints of each finger, as indices of `robot.joints`."""
         self._joints = fingers
         joints = context.sizes["joints"]

@@ -130,12 +130,24 @@ class GraspExecutor(Executor):
         self._orders.take(read.operator)
         grasp.fingers.look(read.fingers)
         if read.world.value.revision:
-            self._see(read.world.value)
+            # Find the object in the world model.
+            close = self._closing()
+            if close is not None:
+                row = self._row(close)
+                self._grasp.object = self._from_world @ Pose(
+                    read.world.value.position[row], read.world.value.quaternion[row]
+                )
         if not self._started:
             self._started = True
             self._recall(read)
         waits = self._waits(read)
-        self._count_waiting(waits)
+        # Fail when something has kept the program for too long.
+        is_over = self._done == len(self._program.step) or self._orders.holds
+        self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
+        if self._waited_s > self._grasp.params.stalled and not self._failed.code:
+            self._failed = Refused(
+                Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}"
+            )
         if not waits and not self._failed.code and self._done < len(self._program.step):
             self._go_on(read)
         if waits or self._failed.code:
@@ -144,13 +156,6 @@ class GraspExecutor(Executor):
         grasp.target.operator = self._orders.basis
         write.command.copy_from(grasp.target)
         self._report(write.status, waits)
-
-    def _see(self, world: Message) -> None:
-        """Find the object in the world model."""
-        close = self._closing()
-        if close is not None:
-            row = self._row(close)
-            self._grasp.object = self._from_world @ Pose(world.position[row], world.quaternion[row])
 
     def _row(self, close: CloseStep) -> int:
         return self.context.scene.objects.index(close.object)
@@ -183,15 +188,6 @@ class GraspExecutor(Executor):
         if read.plan and not self._newest(read.plan).id and self._awaits_plan():
             return NO_PLAN.format(", ".join(read.plan))
         return ""
-
-    def _count_waiting(self, waits: str) -> None:
-        """Fail when something has kept the program for too long."""
-        is_over = self._done == len(self._program.step) or self._orders.holds
-        self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
-        if self._waited_s > self._grasp.params.stalled and not self._failed.code:
-            self._failed = Refused(
-                Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}"
-            )
 
     @staticmethod
     def _newest(plans: Mapping[str, Reading]) -> Message:

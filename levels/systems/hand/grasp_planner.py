@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from rack.levels.algebra import Array, norm, transposed_mat_vec
+from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.robot.cell import Cell
 from rack.levels.systems.hand.kinematics import FingerKinematics
@@ -145,7 +144,7 @@ class GraspPlanner:
                 nearest = distance
         return None if nearest > OUTSIDE_M else start + nearest * way
 
-    def _geoms(self, row: int) -> NDArray[np.int_]:
+    def _geoms(self, row: int) -> Ints:
         """Return the geoms of the object."""
         return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, norm
+from rack.levels.algebra import Array, Mask, norm
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose
@@ -65,7 +64,7 @@ class Grasp:
     fingers: FingersBelow
     target: Message  # the `GRASP_TARGET` that the steps fill
     grip: HandGrip
-    touching: NDArray[np.bool_]  # (fingers,)
+    touching: Mask  # (fingers,)
     close: CloseStep | None = None  # by which the object was, or is, gripped
     base: float = 0.0  # N: the grip wanted without a load
     object: Pose | None = None  # as sensed

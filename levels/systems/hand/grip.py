@@ -13,10 +13,9 @@ grip rises at once with the load sensed at the tips, and falls slowly after it.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from rack.levels.algebra import Array, norm
+from rack.levels.algebra import Array, Mask, norm
 from rack.levels.tables import NotNegative, Positive, Table
 
 FALL_N_S = 4.0
@@ -46,9 +45,7 @@ class HandGrip:
     """The grip of some fingers, of which one opposes the others. All forces are of the tips on the
     object."""
 
-    def __init__(
-        self, gains: GripGains, fingers: NDArray[np.bool_], opposing: int, period_s: float
-    ) -> None:
+    def __init__(self, gains: GripGains, fingers: Mask, opposing: int, period_s: float) -> None:
         """Grip with `fingers`, (fingers,), every `period_s`."""
         self._gains = gains
         self._period_s = period_s

@@ -16,12 +16,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.algebra import Array, Mask
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
 from rack.levels.servo.driver import numbers
@@ -42,7 +41,7 @@ class JointGains(Table):
 class JointLaw:
     """Sets the torques of some joints of a hand."""
 
-    def __init__(self, cell: Cell, driven: NDArray[np.bool_], gains: JointGains) -> None:
+    def __init__(self, cell: Cell, driven: Mask, gains: JointGains) -> None:
         """Drive the joints `driven`, (joints,)."""
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(len(driven))
@@ -82,7 +81,10 @@ class JointLaw:
             self.clipped += 1
 
 
-@compiled
+@compiled_for(
+    "UniTuple(f8, 2), UniTuple(f8, 2), f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], "
+    "f8[:,::1], f8[::1], f8[::1]"
+)
 def set_joint_torques(
     gains: tuple[float, float],  # stiffness, 1/s2, and damping, 1/s
     times: tuple[float, float],  # s: by which the sample, and the target, are taken on
@@ -120,12 +122,3 @@ def set_joint_torques(
             torque[j] = np.minimum(np.maximum(needed, -limit[j]), limit[j])  # NaN stays
             clipped = clipped or needed != torque[j]
     return clipped
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    joint = np.zeros(1)
-    table = np.zeros((4, 1))
-    set_joint_torques.load()(
-        (0.0,) * 2, (0.0,) * 2, table, table[:2], table, table[:1], table[:1], joint, joint
-    )

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
+from rack.levels.algebra import Mask
 from rack.levels.level import Executor, LevelContext, Misfits, Ports, Reading
 from rack.levels.operator import BELOW_LOST, HOLDABLE, Orders
 from rack.levels.robot.cell import cell_of
@@ -43,7 +43,7 @@ class HandLoop(Executor):
         self._numbers = [field.name for field in command.fields if field.kind == "f8"]
         self.commanded = False  # there was one
         # (joints,) or (fingers,), as in the status: those of this board.
-        self.driven: NDArray[np.bool_]
+        self.driven: Mask
         self._above = ", ".join(context.above)
         self._period = max(pace.every for pace in context.above.values())
         slowest = max(context.every, *(pace.every for pace in context.below.values()))
@@ -81,7 +81,12 @@ class HandLoop(Executor):
         self.orders.take(read.operator)
         if not self._met:
             if not hand.is_there:
-                self._wait(write.status)
+                status = write.status
+                status.driven = self.driven
+                status.sensed = -1
+                status.holding = True
+                status.stopped = True
+                status.reason = NO_HAND_YET
                 return
             self._met = True
             self.meet(read, hand.value)
@@ -126,13 +131,6 @@ class HandLoop(Executor):
                 self.command.copy_from(command.value)
                 self.commanded = True
                 self._taken = tick
-
-    def _wait(self, status: Message) -> None:
-        status.driven = self.driven
-        status.sensed = -1
-        status.holding = True
-        status.stopped = True
-        status.reason = NO_HAND_YET
 
     def _kept(self, read: Ports, tick: int) -> str:
         """Return why the hand does not follow the level above; empty: it does."""

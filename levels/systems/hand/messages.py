@@ -14,8 +14,8 @@ from enum import IntEnum
 
 from rack.backplane.message import Field, command, status
 from rack.backplane.words import Demand
+from rack.levels.fields import by_joint, flag, number, real, row, short_count, tick
 from rack.levels.operator import ANSWER, RESTS_ON
-from rack.levels.systems.fields import by_joint, flag, number, real, tick
 
 FLEXOR = 0
 EXTENSOR = 1
@@ -159,11 +159,11 @@ GRASP_STATUS = status(
     "grasp_status",
     1,
     *ANSWER,
-    Field("step", "u2", "1", "steps of the program that are done"),
-    Field("steps", "u2", "1", "steps of the program"),
+    short_count("step", "steps of the program that are done"),
+    short_count("steps", "steps of the program"),
     Field("kind", "u1", GraspKind, "of the step under way"),
     real("passed", "s", "time for which that step is under way"),
-    Field("object", "i2", "1", "row of the object grasped, in the world model; -1: none"),
+    row("object", "row of the object grasped, in the world model; -1: none"),
     flag("touching", "1: the finger touches the object", "fingers"),
     real("grip", "N", "internal force of the finger that opposes the others; they share it"),
     real("load", "N", "that the grasp makes up for: weight and pull", 3),
@@ -178,7 +178,7 @@ GRASP_PLAN = command(
     "grasp_plan",
     1,
     RESTS_ON,
-    Field("object", "i2", "1", "row of the object in the world model"),
+    row("object", "row of the object in the world model"),
     tick("sensed", "tick of the world model that it rests on"),
     by_joint("posture", "rad", "joint positions from which the fingers close"),
     real(

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Mask
 from rack.levels.arm.drives import CoarseSensors
 from rack.levels.arm.simulation import Simulation
 from rack.levels.robot.cell import Cell
@@ -95,7 +94,7 @@ class SimulatedHand(Simulation):
         self.braked = False
         self._data.ctrl[self.hand.actuators] = tension
 
-    def tear(self, torn: NDArray[np.bool_]) -> None:
+    def tear(self, torn: Mask) -> None:
         """Let the tendons marked, (2, joints), give no tension, and all others theirs."""
         self._model.actuator_gainprm[self.hand.actuators, 0] = np.where(torn, 0.0, 1.0)
 

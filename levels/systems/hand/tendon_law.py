@@ -20,12 +20,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.algebra import Array, Mask
+from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
 from rack.levels.servo.driver import numbers
@@ -54,9 +53,7 @@ class TendonLaw:
     """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew
     after a restart."""
 
-    def __init__(
-        self, hand: Hand, driven: NDArray[np.bool_], gains: TendonGains, context: LevelContext
-    ) -> None:
+    def __init__(self, hand: Hand, driven: Mask, gains: TendonGains, context: LevelContext) -> None:
         """Drive the joints `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
         least = np.full(joints, hand.least + gains.margin)
@@ -104,7 +101,9 @@ class TendonLaw:
             self.clipped += 1
 
 
-@compiled
+@compiled_for(
+    "UniTuple(f8, 4), UniTuple(f8, 2), f8[:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1]"
+)
 def set_tensions(
     # Mean tension, N, lead, share of a cycle in the lag, largest trim, N.
     numbers: tuple[float, float, float, float],
@@ -147,12 +146,3 @@ def set_tensions(
             reached[row, j] += share * (early - reached[row, j])
             tension[row, j] = np.minimum(np.maximum(early + trim[row, j], least[j]), most[j])
     return clipped
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    numbers = np.zeros(4)
-    pair = np.zeros((2, 1))
-    set_tensions.load()(
-        (0.0,) * 4, (0.0,) * 2, np.zeros((4, 1)), np.zeros((3, 2, 1)), numbers, numbers[:1], pair
-    )

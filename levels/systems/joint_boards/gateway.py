@@ -68,24 +68,24 @@ class JointGateway(Executor):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Hand references down, and statuses up."""
         self._take(read.command, tick)
-        self._give(write.command, tick)
-        self._report(read.statuses, write.status, tick)
+        newest = self._newest
+        due = newest.due + self.latency if newest.due else 0
+        if not due or due > max(self._due, tick):
+            write.command.raw[:] = newest.raw
+            self._due = write.command.due = due
+            self._frozen = False
+        elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
+            self._extrapolate(write.command)
+        # Put the status of the boards below on the link; show the one that has passed it.
+        self._merge(read.statuses)
+        self._up.append((tick + self._delay, bytes(self._merged.raw)))
+        take_arrived(self._up, write.status, tick)
 
     def _take(self, command: Reading, tick: int) -> None:
         """Put what is new on the link; take what has passed it."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.value.raw)))
         take_arrived(self._down, self._newest, tick)
-
-    def _give(self, command: Message, tick: int) -> None:
-        newest = self._newest
-        due = newest.due + self.latency if newest.due else 0
-        if not due or due > max(self._due, tick):
-            command.raw[:] = newest.raw
-            self._due = command.due = due
-            self._frozen = False
-        elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
-            self._extrapolate(command)
 
     def _extrapolate(self, command: Message) -> None:
         """Make up the reference after the last one given, or give up."""
@@ -102,12 +102,6 @@ class JointGateway(Executor):
         command.position[:] = newest.position + ahead_s * newest.velocity
         command.velocity[:] = newest.velocity
         command.acceleration[:] = 0.0
-
-    def _report(self, statuses: Mapping[str, Reading], status: Message, tick: int) -> None:
-        """Put the status of the boards below on the link; show the one that has passed it."""
-        self._merge(statuses)
-        self._up.append((tick + self._delay, bytes(self._merged.raw)))
-        take_arrived(self._up, status, tick)
 
     def _merge(self, statuses: Mapping[str, Reading]) -> None:
         merged = self._merged

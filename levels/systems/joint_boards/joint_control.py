@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload
 
@@ -86,7 +86,7 @@ class JointLoads:
         self._computed_at[:] = position
 
 
-@compiled
+@compiled_for("f8[:,::1], f8[:,::1], f8, f8, f8, f8[::1], f8[:,::1], f8[::1], f8[::1]")
 def servo_joints(
     constants: Array,  # (5, joints): rows as below
     loads: Array,  # (4, joints): inertia, load, at the beginning of an interval and at its end
@@ -130,12 +130,3 @@ def servo_joints(
         status[joints + j] = target
         status[2 * joints + j] = target_velocity
         status[3 * joints + j] = needed
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    numbers = np.zeros(4)
-    table = np.zeros((5, 1))
-    servo_joints.load()(
-        table, table[:4], 0.0, 0.0, 0.0, numbers[:2], table[:3], numbers[:3], numbers
-    )

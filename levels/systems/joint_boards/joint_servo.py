@@ -16,7 +16,7 @@ from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
-from rack.levels.servo import reference
+from rack.levels.servo import curves, reference
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import numbers
@@ -69,7 +69,7 @@ class JointServo(Executor):
         Operation.SET: (),
     }
     params = JointServoParams
-    preloads = (dynamics, reference, joint_control)
+    preloads = (curves, dynamics, reference, joint_control)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -151,7 +151,14 @@ class JointServo(Executor):
             wanted = reference.rest(tick)
         else:
             wanted = operator.wanted(reference, tick) if operator.stands else reference.at(tick)
-        self._take_loads(arm, tick, stopped or operator.stands)
+        # Take over inertia and load of the reference that is followed; compute them while
+        # none is.
+        if stopped or operator.stands or self.reference.holding:
+            self.loads.hold(arm.position)
+        elif self._offered is not None:
+            self.loads.take(self._offered, tick)
+            self._due = self._offered.due
+            self._offered = None
         tick_s = self.context.tick_s
         age_s = min(tick + every - sampled, self._oldest + every) * tick_s
         times = self.loads.part(tick), every * tick_s, age_s
@@ -234,16 +241,6 @@ class JointServo(Executor):
                 self._grip.take(command)
                 write.command.payload_mass = command.payload_mass
                 write.command.payload_offset = command.payload_offset
-
-    def _take_loads(self, arm: Message, tick: int, stopped: bool) -> None:
-        """Take over inertia and load of the reference that is followed; compute them while none
-        is."""
-        if stopped or self.reference.holding:
-            self.loads.hold(arm.position)
-        elif self._offered is not None:
-            self.loads.take(self._offered, tick)
-            self._due = self._offered.due
-            self._offered = None
 
     def _report(self, status: Message, arm: Message, away: bool, stopped: bool) -> None:
         """Fill the steady fields of the status when they change."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm.above import CommandsAbove
-from rack.levels.compiled import compiled
+from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext, Reading
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
@@ -58,7 +58,13 @@ class JointTorques(CommandsAbove):
             for board in self.oldest:
                 value = commands[board].value
                 if self._messages.get(board) is not value:
-                    self._see(board, value)
+                    # Find the numbers of a message: those of the next ones of its board are
+                    # in the same place.
+                    self._messages[board] = value
+                    views = [
+                        numbers(m, "torque", "payload_offset") for m in self._messages.values()
+                    ]
+                    self._memory, self._begins = one_view(*views)
         return why
 
     def add_up(self) -> None:
@@ -66,15 +72,8 @@ class JointTorques(CommandsAbove):
         self.rests_on = max(message.operator for message in self._messages.values())
         self.moves = self._add_up(self._sum, self.wanted.table, self._memory, self._begins)
 
-    def _see(self, board: str, message: Message) -> None:
-        """Find the numbers of a message: those of the next ones of its board are in the same
-        place."""
-        self._messages[board] = message
-        views = [numbers(m, "torque", "payload_offset") for m in self._messages.values()]
-        self._memory, self._begins = one_view(*views)
 
-
-@compiled
+@compiled_for("f8[::1], f8[:,::1], f8[::1], i8[::1]")
 def add_up(
     total: Array,  # (3 joints + 5,): set
     motion: Array,  # (3, joints), rad, rad/s: set, but for the accelerations
@@ -93,9 +92,3 @@ def add_up(
         motion[1, j] = total[2 * joints + j]
         moves = moves or motion[1, j] != 0.0
     return moves
-
-
-def preload() -> None:
-    """Load this module's compiled function."""
-    numbers = np.zeros(8)
-    add_up.load()(numbers, np.zeros((3, 1)), numbers, np.zeros(0, dtype=np.int64))

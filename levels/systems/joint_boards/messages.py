@@ -19,9 +19,9 @@ begins again where they hold the arm.
 from __future__ import annotations
 
 from rack.backplane.message import command, status
+from rack.levels.fields import by_joint, flag, real, tick
 from rack.levels.messages import DRIVEN_ARM, JOINT_SET_POINT, SERVO_STATUS
 from rack.levels.operator import ANSWER, RESTS_ON
-from rack.levels.systems.fields import by_joint, flag, real, tick
 
 JOINT_REFERENCE = command(
     "joint_reference",

@@ -122,19 +122,20 @@ class ModifiedFromAfar(JointServo):
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Modify the law as asked, and go on."""
         if read.asked.is_new:
-            self._obey_from_afar(read.asked.value, write.modified)
+            own = f"{self.context.board}."
+            wanted = {
+                name.removeprefix(own)
+                for name in read.asked.value.wanted.split()
+                if name.startswith(own)
+            }
+            refused = {
+                name: why
+                for name in sorted(wanted ^ self._asked)
+                if (why := self._modified.switch(name, name in wanted))
+            }
+            # Those refused are asked for in every message, and each answer says so.
+            self._asked = wanted.difference(refused)
+            write.modified.echo = read.asked.value.id
+            write.modified.error = len(refused)
+            write.modified.reason = "; ".join(refused.values())
         super().process(read, write, tick)
-
-    def _obey_from_afar(self, asked: Message, answer: Message) -> None:
-        own = f"{self.context.board}."
-        wanted = {name.removeprefix(own) for name in asked.wanted.split() if name.startswith(own)}
-        refused = {
-            name: why
-            for name in sorted(wanted ^ self._asked)
-            if (why := self._modified.switch(name, name in wanted))
-        }
-        # Those refused are asked for in every message, and each answer says so.
-        self._asked = wanted.difference(refused)
-        answer.echo = asked.id
-        answer.error = len(refused)
-        answer.reason = "; ".join(refused.values())

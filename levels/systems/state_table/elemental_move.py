@@ -12,8 +12,9 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Field, Message, status
+from rack.backplane.message import Message, status
 from rack.levels.algebra import Array, norm
+from rack.levels.fields import flag, number, row
 from rack.levels.level import Input, LevelContext, Ports
 from rack.levels.messages import WORLD_MODEL
 from rack.levels.operator import OPERATOR_COMMAND
@@ -43,10 +44,10 @@ MOVE_TABLE_STATUS = status(
     "move_table_status",
     1,
     *STATUS_HEAD,
-    Field("sent", "u4", "1", "serial of the newest command sent down; 0: none"),
-    Field("reached", "u1", "1", "1: the newest pose has joint positions"),
-    Field("put", "i2", "1", "row of the object put down last; -1: none"),
-    Field("resting", "u1", "1", "1: the arm rests"),
+    number("sent", "serial of the newest command sent down; 0: none"),
+    flag("reached", "1: the newest pose has joint positions"),
+    row("put", "row of the object put down last; -1: none"),
+    flag("resting", "1: the arm rests"),
 )
 
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 from pydantic import Field as Key
 
 from rack.backplane.message import Field, Message, State, command, status
+from rack.levels.fields import flag, number, short_count
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
@@ -29,7 +30,6 @@ from rack.levels.operator import (
     Orders,
     answered,
 )
-from rack.levels.systems.fields import flag, number
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.table import (
     LATE,
@@ -68,7 +68,7 @@ STATUS_HEAD = (
     Field("table", f"S{NAME_BYTES}", "ASCII", "state table in force"),
     number("checksum", "CRC-32 of its file"),
     Field("in_state", f"S{NAME_BYTES}", "ASCII", "state after this cycle"),
-    Field("row", "u2", "1", "row that fired in this cycle, from 1; 0: none"),
+    short_count("row", "row that fired in this cycle, from 1; 0: none"),
     Field("fired", f"S{ROW_NAME_BYTES}", "ASCII", "its name"),
     Field("words", f"S{PHRASE_BYTES}", "ASCII", "command in force; empty: none"),
     number(

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Field, Message, command, status
+from rack.backplane.message import Message, command, status
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
+from rack.levels.fields import by_joint, flag, real, row
 from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.operator import OPERATOR_COMMAND
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo import curves
 from rack.levels.servo.curves import Curve, Passage, Ramp
-from rack.levels.systems.fields import by_joint, flag, real
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.state_table.level import (
     COMMAND_HEAD,
@@ -51,7 +51,7 @@ JOINT_MOVE = command(
     *COMMAND_HEAD,
     by_joint("joints", "rad", "where a motion ends"),
     real("speed", "1", "part of the joints' limits"),
-    Field("object", "i2", "1", "row of the object concerned in the world model; -1: none"),
+    row("object", "row of the object concerned in the world model; -1: none"),
     real("aim", "m", "where the object, or the place, was for this command", 3),
     real("yaw", "rad", "how it was turned about the vertical"),
 )
@@ -64,7 +64,7 @@ JOINT_MOVE_STATUS = status(
     flag("moving", "1: they still change"),
     flag("closed", "1: the gripper is commanded to close"),
     flag("held", "1: it holds something"),
-    Field("object", "i2", "1", "row of the object that it holds; -1: none"),
+    row("object", "row of the object that it holds; -1: none"),
 )
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Field, Message, status
+from rack.backplane.message import Message, status
+from rack.levels.fields import number, short_count
 from rack.levels.level import Input, LevelContext, Misfits, Ports
 from rack.levels.operator import OPERATOR_COMMAND, Operation
 from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS, MoveTable
@@ -32,11 +33,11 @@ TASK_TABLE_STATUS = status(
     "task_table_status",
     1,
     *STATUS_HEAD,
-    Field("action", "u2", "1", "steps done"),
-    Field("actions", "u2", "1", "steps of the plan"),
-    Field("moves_done", "u2", "1", "commands done by the level below"),
-    Field("moves", "u2", "1", "commands of the plan"),
-    Field("sent", "u4", "1", "serial of the newest command sent down; 0: none"),
+    short_count("action", "steps done"),
+    short_count("actions", "steps of the plan"),
+    short_count("moves_done", "commands done by the level below"),
+    short_count("moves", "commands of the plan"),
+    number("sent", "serial of the newest command sent down; 0: none"),
 )
 
 

@@ -116,7 +116,13 @@ class TrajectoryExecutor(Executor):
                 self._work.step(due * self.context.tick_s, hold)
         self._write_reference(write.command, tick)
         self._write_status(write.status)
-        self._save(write.state)
+        agenda = self._agenda
+        write.state.passed = self._work.passed_s
+        goal = 0 if agenda.goal is None else agenda.goal.id
+        newest = (agenda.taken, agenda.done, agenda.begun, goal)
+        if newest != self._saved:
+            self._saved = newest
+            agenda.save(write.state)
 
     def _recall(self, read: Ports) -> None:
         """Continue after a restart, from the level's own last messages."""
@@ -204,15 +210,6 @@ class TrajectoryExecutor(Executor):
         if not self._sight.knows and self._agenda.current is None:
             return "waiting for the world model"
         return ""
-
-    def _save(self, state: Message) -> None:
-        agenda = self._agenda
-        state.passed = self._work.passed_s
-        goal = 0 if agenda.goal is None else agenda.goal.id
-        newest = (agenda.taken, agenda.done, agenda.begun, goal)
-        if newest != self._saved:
-            self._saved = newest
-            agenda.save(state)
 
 
 LASTS_S = 0.04

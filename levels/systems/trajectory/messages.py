@@ -6,8 +6,8 @@ from __future__ import annotations
 from enum import IntEnum
 
 from rack.backplane.message import Field, MessageType, command, status
+from rack.levels.fields import by_joint, flag, number, real, row, short_count
 from rack.levels.operator import ANSWER, RESTS_ON
-from rack.levels.systems.fields import by_joint, flag, number, real
 
 HELD = 16
 """Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than
@@ -51,12 +51,7 @@ MOTION_REQUEST = command(
     by_joint("joints", "rad", "goal of JOINTS"),
     real("position", "m", "goal of POSE: tool position, in the frame of `body`", 3),
     real("quaternion", "1", "goal of POSE: tool orientation, in the frame of `body`", 4),
-    Field(
-        "body",
-        "i2",
-        "1",
-        "row of the body in the world model in whose frame the goal is; -1: the world",
-    ),
+    row("body", "row of the body in the world model in whose frame the goal is; -1: the world"),
     flag("live", "1: the goal follows the body; 0: its frame is copied when the request begins"),
     real(
         "acceleration", "s", "half the time of the blend into this request; 0: the level's default"
@@ -89,7 +84,7 @@ def state_of(name: str, request: MessageType) -> MessageType:
                 "",
                 "the request at whose goal the arm is, or to which it goes; id 0: none",
             ),
-            Field("count", "u2", "1", "requests that follow"),
+            short_count("count", "requests that follow"),
             Field("requests", request, "", "taken and not ended, oldest first", (HELD,)),
         ),
     )

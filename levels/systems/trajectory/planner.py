@@ -165,7 +165,18 @@ class RequestPlanner(Planner):
         if isinstance(step, MotionStep):
             request.segment = step.segment
             request.acceleration = step.acceleration
-            self._fill_motion(request, step, k, world)
+            joints = self._goals[k]
+            tool = self._tool(step)
+            is_solved = joints is not self._goal_before(k, world)
+            if tool is None or (isinstance(step, MoveStep) and is_solved):
+                request.kind = MotionKind.JOINTS
+                request.joints = joints
+            else:
+                request.kind = MotionKind.POSE
+                request.position, request.quaternion = tool
+            if isinstance(step, LineStep) and step.body is not None:
+                request.body = self._bodies.index(step.body)
+                request.live = step.live
         elif isinstance(step, StayStep):
             request.kind = MotionKind.STAY
             request.segment = step.seconds
@@ -178,20 +189,6 @@ class RequestPlanner(Planner):
             request.force = default if step.force is None else step.force
         else:
             request.kind = MotionKind.CANCEL
-
-    def _fill_motion(self, request: Message, step: Step, k: int, world: Message) -> None:
-        joints = self._goals[k]
-        tool = self._tool(step)
-        is_solved = joints is not self._goal_before(k, world)
-        if tool is None or (isinstance(step, MoveStep) and is_solved):
-            request.kind = MotionKind.JOINTS
-            request.joints = joints
-        else:
-            request.kind = MotionKind.POSE
-            request.position, request.quaternion = tool
-        if isinstance(step, LineStep) and step.body is not None:
-            request.body = self._bodies.index(step.body)
-            request.live = step.live
 
     def _goal_before(self, k: int, world: Message) -> Array:
         """Return joint positions at the end of the step before step k, planning it if need be, as

@@ -14,9 +14,7 @@ from rack.backplane import semaphores
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import RackInUseError, SegmentError
 from rack.backplane.layout import Layout
-from rack.backplane.process import start_time
 from rack.backplane.segment import (
-    LOCKED_SINCE,
     SHM_FOLDER,
     VERSION,
     Segment,
@@ -85,18 +83,6 @@ def test_a_live_rack_of_another_version_is_refused_too(spec: Layout) -> None:
         remove_dead(spec.rack)
     segment.release()
     assert remove_dead(spec.rack)
-    segment.close()
-
-
-@pytest.mark.parametrize(("later", "is_removed"), [(0, False), (1, True)])
-def test_a_rack_of_a_version_without_a_lock_is_judged_by_its_process(
-    spec: Layout, later: int, is_removed: bool
-) -> None:
-    segment = Segment.create(spec, "")
-    segment.release()
-    segment.words[Head.VERSION] = LOCKED_SINCE - 1
-    segment.words[Head.LAUNCHER_NAMESPACE] = start_time(os.getpid()) + later
-    assert (spec.rack in clean()[0]) == is_removed
     segment.close()
 
 

@@ -14,7 +14,7 @@ import pytest
 from rack.backplane.process import Reservation, name_process, take_core
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.neighbours import Holder, holders, occupied
+from rack.boards.crate.neighbours import holders
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
 from tests.machine import needs_deadlines, needs_fifo, needs_two_cores
@@ -66,28 +66,6 @@ def test_a_rack_that_shares_says_so(config: MakeConfig, first: Rack) -> None:
         event = rack.events[0]
     assert event.kind == "waiting"
     assert event.text.startswith(f"core 0, requested by wave: rack '{first.config.name}'")
-
-
-def test_a_rack_in_lockstep_says_so_if_every_core_is_occupied() -> None:
-    held = {core: Holder("other", "process 7", ("wave",)) for core in os.sched_getaffinity(0)}
-    assert occupied(held) == [
-        f"core {core}: rack 'other' (process 7) runs wave on it at real-time priority"
-        for core in sorted(held)
-    ]
-    held.popitem()
-    assert occupied(held) == []
-
-
-@pytest.mark.slow
-def test_what_a_launch_waits_for_is_its_first_event(
-    config: MakeConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    held = {core: Holder("other", "process 7", ("wave",)) for core in os.sched_getaffinity(0)}
-    monkeypatch.setattr("rack.boards.crate.rack.holders", lambda own: held)
-    with Rack(config("clock.mode=lockstep", text=PLAIN)) as rack:
-        found = [(event.kind, event.text) for event in rack.events[: len(held) + 1]]
-    assert found[:-1] == [("waiting", line) for line in occupied(held)]
-    assert found[-1][0] == "launch"
 
 
 @needs_fifo

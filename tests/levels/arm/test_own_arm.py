@@ -126,7 +126,7 @@ def test_a_torque_that_is_nan_is_refused_by_every_arm(rig: ServoRig) -> None:
             "tests.levels.arm.test_own_arm:Missing",
             "module 'tests.levels.arm.test_own_arm' has no class 'Missing'",
         ),
-        ("rack.levels.arm:Sensed", "'Sensed' is not a subclass of rack.levels.arm.arm.Arm"),
+        ("rack.levels.arm:Sensed", "module 'rack.levels.arm' has no Arm named 'Sensed'; it has: "),
         ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, step"),
     ],
 )

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from rack.levels.compiled import preload
 from rack.levels.planning import collision
 from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, first_blocked
 from rack.levels.planning.ik import InverseKinematics
@@ -179,7 +180,7 @@ def test_arm_may_be_near_what_carries_it(tmp_path: Path, carrier: str) -> None:
 def test_compiled_checks_decide_as_python_does_and_are_loaded_before(
     puma: Cell, held: int | None
 ) -> None:
-    collision.preload()
+    preload(collision)
     loaded = list(first_blocked.load().signatures)  # type: ignore[attr-defined]
     checker, under_python = (CollisionChecker(puma, config("puma560")[1]) for _ in range(2))
     under_python._first_blocked = partial(first_blocked, *under_python._first_blocked.args)

@@ -124,7 +124,8 @@ def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
 def test_a_list_of_another_length_is_refused_with_both_numbers(tmp_path: Path) -> None:
     robot = pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1)))
     with pytest.raises(
-        RobotError, match=r"robot.sensors.noise: 3 values; one for all joints, or one per joint: 2"
+        RobotError,
+        match=r"robot.sensors.noise: 3 values; permitted: one for all joints, or 2, one per joint",
     ):
         build_cell(robot, config("puma560")[1], CLOCK_NS)
 

@@ -352,7 +352,7 @@ MISTAKES = {
     "no class": ({"class": COMMON + "Notsch"}, "has no class 'Notsch'"),
     "another class": (
         {"class": "rack.levels.servo:ServoExecutor"},
-        "'ServoExecutor' is not a subclass of",
+        "has no Modification named 'ServoExecutor'",
     ),
     "half a class": ({"class": HERE + "Unfinished"}, "class 'Unfinished' lacks: modify"),
     "no hook": (

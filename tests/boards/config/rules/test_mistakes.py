@@ -166,7 +166,7 @@ MISTAKES = {
     ),
     "no method": (
         "board.upper.executor='two_levels:Unfinished'",
-        "class 'Unfinished' lacks the method 'process'",
+        "class 'Unfinished' lacks: process",
     ),
     "no class": (
         "board.upper.executor='two_levels:Uper'",

@@ -1,4 +1,4 @@
-"""Fields that the messages of many systems have: numbers, flags, ticks, and values by joint."""
+"""Fields that many messages have: numbers, flags, ticks, and values by joint."""
 
 from __future__ import annotations
 
@@ -8,6 +8,16 @@ from rack.backplane.message import Field
 def number(name: str, meaning: str) -> Field:
     """Return a field for a count or a serial."""
     return Field(name, "u4", "1", meaning)
+
+
+def short_count(name: str, meaning: str) -> Field:
+    """Return a field for a small count."""
+    return Field(name, "u2", "1", meaning)
+
+
+def row(name: str, meaning: str) -> Field:
+    """Return a field for a row of a table; -1: none."""
+    return Field(name, "i2", "1", meaning)
 
 
 def flag(name: str, meaning: str, *shape: int | str) -> Field:
