@@ -61,7 +61,6 @@ class CyclesFile:
             self._schema,
             compression="zstd",
             use_dictionary=["task"],
-            write_page_checksum=True,
         )
 
     def add(self, task: str, rows: np.ndarray) -> None:
@@ -153,7 +152,6 @@ class _SignalTable:
             compression="zstd",
             use_dictionary=[column.label for column in self._columns if column.kind[1] == "S"],
             write_statistics=["tick"],
-            write_page_checksum=True,
         )
 
     def add(self, rows: np.ndarray) -> None:

@@ -24,6 +24,8 @@ from rack.tools.recording.spool import (
     STRETCHES,
     Frame,
     Packed,
+    Part,
+    StretchEnd,
     StretchHead,
     locked,
     read,
@@ -74,12 +76,15 @@ class Tally:
         self.number = 0
         self._newest = -1
 
-    def take(self, found: StretchHead | Packed) -> None:
+    def take(self, part: Part) -> None:
         """Take what is in a spool."""
-        if isinstance(found, StretchHead):
-            self.begin(found)
-        else:
-            self.add(found.unpacked())
+        match part:
+            case StretchHead():
+                self.begin(part)
+            case StretchEnd():
+                self.end(part.tick)
+            case Packed():
+                self.add(part.unpacked())
 
     def begin(self, stretch: StretchHead) -> None:
         """Go on with a stretch; others before it may have been removed."""
@@ -91,10 +96,10 @@ class Tally:
         self.taken.update(stretch.taken)
         self.rows.update(stretch.rows)
         if follows and self.kept:
-            self.kept[-1] = self.kept[-1][0], stretch.end
+            self.kept[-1] = self.kept[-1][0], OPEN
         else:
             self.end()
-            self.kept.append((stretch.begin, stretch.end))
+            self.kept.append((stretch.begin, OPEN))
         self.number = stretch.number
 
     def add(self, frame: Frame) -> None:
@@ -113,11 +118,11 @@ class Tally:
         self.rows[name] += rows
         self.taken[name] += lost + rows
 
-    def end(self) -> None:
-        """End the last stretch where its recorder was killed."""
+    def end(self, tick: int = OPEN) -> None:
+        """End the last stretch at a tick, or else where its recorder was killed."""
         if self.kept and self.kept[-1][1] == OPEN:
             first = self.kept[-1][0]
-            self.kept[-1] = first, max(first, self._newest + 1)
+            self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN else tick
 
     def missing(self, segment: Segment) -> dict[str, Missing]:
         """Return what was written into the rings of a rack that has ended, and was lost or never
@@ -193,16 +198,17 @@ def mend(folder: Path) -> bool:
             return False
         layout, launch = read_head(file, path)
         files = RunFiles(folder, layout, launch, MENDED)
-        for found in read(file, folder, layout):
-            files.take(found)
-    files.close()
-    rmtree(folder / SIGNALS, ignore_errors=True)
-    for name in (CYCLES, SIGNALS):
-        (folder / f"{name}{MENDED}").replace(folder / name)
-    Checksums(folder).store(*TABLES)
-    # First: without it what is left of the stretches is not taken for a run.
-    path.unlink()
-    rmtree(folder / STRETCHES, ignore_errors=True)
+        for part in read(file, folder, layout):
+            files.take(part)
+        # Still locked: another process that opens this run waits until the files are in place.
+        files.close()
+        rmtree(folder / SIGNALS, ignore_errors=True)
+        for name in (CYCLES, SIGNALS):
+            (folder / f"{name}{MENDED}").replace(folder / name)
+        Checksums(folder).store(*TABLES)
+        # First: without it what is left of the stretches is not taken for a run.
+        path.unlink()
+        rmtree(folder / STRETCHES, ignore_errors=True)
     return True
 
 
@@ -215,11 +221,11 @@ def tally(folder: Path) -> Tally | None:
     with path.open("rb") as file:
         layout, _ = read_head(file, path)
         found = Tally(layout)
-        for one in read(file, folder, layout):
-            if isinstance(one, StretchHead):
-                found.begin(one)
+        for part in read(file, folder, layout):
+            if isinstance(part, Packed):
+                found.count(part.ring, part.rows, part.lost)
             else:
-                found.count(one.ring, one.rows, one.lost)
+                found.take(part)
     found.end()
     return found
 

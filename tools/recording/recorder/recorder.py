@@ -203,8 +203,8 @@ class Recorder:
         if retention is None:
             self._files = RunFiles(folder, layout, segment.launch, before=before)
         self._tally = self._files or Tally(layout, before)
-        for found in self._spool.resume():
-            self._tally.take(found)
+        for part in self._spool.resume():
+            self._tally.take(part)
         self._flight = (
             None
             if retention is None

@@ -86,7 +86,7 @@ def summary(report: Report) -> Iterator[str]:
 def _blocks(report: Report) -> Blocks:
     yield from summary(report)
     if found := report["continues"]:
-        yield f"- continues {found['folder'] or 'another run'} from {found['time_s']:g} s"
+        yield f"- continues {found['folder']} from {found['time_s']:g} s"
     yield from (f"- {note}" for note in report["notes"])
     yield from _machine(report)
     if report["recording"] != "complete":
