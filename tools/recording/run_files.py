@@ -10,6 +10,8 @@ from pathlib import Path
 from shutil import copyfile, rmtree
 from typing import IO, NamedTuple, Self
 
+import numpy as np
+
 from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
 from rack.backplane.ring import Ring
@@ -23,7 +25,6 @@ from rack.tools.recording.spool import (
     OPEN,
     STRETCHES,
     Frame,
-    Packed,
     Part,
     StretchEnd,
     StretchHead,
@@ -83,8 +84,8 @@ class Tally:
                 self.begin(part)
             case StretchEnd():
                 self.end(part.tick)
-            case Packed():
-                self.add(part.unpacked())
+            case Frame():
+                self.add(part.ring, part.unpack(), part.lost)
 
     def begin(self, stretch: StretchHead) -> None:
         """Go on with a stretch; others before it may have been removed."""
@@ -102,9 +103,8 @@ class Tally:
             self.kept.append((stretch.begin, OPEN))
         self.number = stretch.number
 
-    def add(self, frame: Frame) -> None:
-        """Add rows of a ring."""
-        name, rows, lost = frame
+    def add(self, name: str, rows: np.ndarray, lost: int) -> None:
+        """Add rows of a ring, and count those lost before them."""
         self.count(name, len(rows), lost)
         if len(rows):
             self._newest = int(rows["tick"][-1])
@@ -161,10 +161,9 @@ class RunFiles(Tally):
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
         super().begin(stretch)
 
-    def add(self, frame: Frame) -> None:
-        """Add rows of a ring."""
-        super().add(frame)
-        name, rows, _ = frame
+    def add(self, name: str, rows: np.ndarray, lost: int) -> None:
+        """Add rows of a ring, and count those lost before them."""
+        super().add(name, rows, lost)
         if len(rows):
             tick, before = self._reached[name]
             if self.lost[name] > before:
@@ -222,8 +221,8 @@ def tally(folder: Path) -> Tally | None:
         layout, _ = read_head(file, path)
         found = Tally(layout)
         for part in read(file, folder, layout):
-            if isinstance(part, Packed):
-                found.count(part.ring, part.rows, part.lost)
+            if isinstance(part, Frame):
+                found.count(part.ring, part.length, part.lost)
             else:
                 found.take(part)
     found.end()

@@ -53,27 +53,18 @@ OPEN = -1
 
 
 class Frame(NamedTuple):
-    """Rows of one ring, and how many rows were lost before them."""
-
-    ring: str
-    rows: np.ndarray
-    lost: int
-
-
-class Packed(NamedTuple):
-    """A frame as it is in a file: `data` are the rows, compressed."""
+    """How many rows of a ring were taken, and lost before them; `data` are the rows, compressed."""
 
     ring: str
     dtype: np.dtype
-    rows: int
+    length: int
     lost: int
     data: bytes
 
-    def unpacked(self) -> Frame:
-        """Return it with its rows."""
-        size = self.rows * self.dtype.itemsize
-        data = pa.decompress(self.data, size, "zstd", asbytes=True)
-        return Frame(self.ring, np.frombuffer(data, self.dtype), self.lost)
+    def unpack(self) -> np.ndarray:
+        """Return the rows."""
+        size = self.length * self.dtype.itemsize
+        return np.frombuffer(pa.decompress(self.data, size, "zstd", asbytes=True), self.dtype)
 
 
 class StretchHead(NamedTuple):
@@ -96,7 +87,7 @@ class StretchEnd(NamedTuple):
     tick: int
 
 
-Part = StretchHead | Packed | StretchEnd
+Part = StretchHead | Frame | StretchEnd
 
 
 class Spool:
@@ -134,8 +125,8 @@ class Spool:
     def resume(self) -> Iterator[Part]:
         """Yield what another recorder left, and continue after it."""
         whole = self._file.tell()
-        for packed in _read_frames(self._file, self._layout, self.path):
-            yield packed
+        for frame in _read_frames(self._file, self._layout, self.path):
+            yield frame
             whole = self._file.tell()
         self._file.truncate(whole)
         # What was taken before a stretch is in its head. That of the newest one may be cut off.
@@ -276,15 +267,15 @@ def stretch_files(folder: Path) -> list[Path]:
     return sorted((folder / STRETCHES).glob("*.spool"))
 
 
-def _read_frames(file: IO[bytes], layout: Layout, path: Path) -> Iterator[Packed | StretchEnd]:
+def _read_frames(file: IO[bytes], layout: Layout, path: Path) -> Iterator[Frame | StretchEnd]:
     dtypes = _dtypes(layout)
     while (part := _unpack(file, path)) is not None:
         document, data = part
         if len(document) == len(StretchEnd._fields):
             yield StretchEnd(*document)
         else:
-            ring, rows, lost = document
-            yield Packed(ring, dtypes[ring], rows, lost, data)
+            ring, length, lost = document
+            yield Frame(ring, dtypes[ring], length, lost, data)
 
 
 def rings(segment: Segment) -> dict[str, Ring]:
