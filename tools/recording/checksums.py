@@ -54,9 +54,10 @@ class Checksums:
             self.stored = {match[2]: match[1] for match in found if match}
 
     def store(self, *patterns: str) -> None:
-        """Store the checksums of the files that match a pattern. Raises `OSError`."""
+        """Store the checksums of the regular files that match a pattern. Raises `OSError`."""
         for path in (path for pattern in patterns for path in self._folder.glob(pattern)):
-            self.stored[str(path.relative_to(self._folder))] = _digest(path)
+            if path.is_file():
+                self.stored[str(path.relative_to(self._folder))] = _digest(path)
         text = "".join(f"{value}  {name}\n" for name, value in self.stored.items())
         write_file(self._folder / CHECKSUMS, text)
 
