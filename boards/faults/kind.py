@@ -222,6 +222,9 @@ class Kinds:
     def __iter__(self) -> Iterator[Kind]:
         return iter(self._by_name.values())
 
+    def __len__(self) -> int:
+        return len(self._by_name)
+
     def __contains__(self, name: object) -> bool:
         return name in self._by_name
 

@@ -14,9 +14,11 @@ from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
 from rack.boards.config import RackConfig, load, wire
 from rack.levels.peer import DRIFT_PPM, Presence, peer_port
+from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED
 from rack.tools.recording.parquet import CyclesFile, SignalTables
 from rack.tools.recording.recording import Recording
+from rack.tools.recording.run_files import TABLES
 from tests.boards.lan.racks import rack_text
 
 S, MS, US = 1_000_000_000, 1_000_000, 1_000
@@ -105,6 +107,7 @@ def recorded(
             rows["message"]["count"] = counts_from + rows["basis"]
             signals.add(name, rows)
     signals.close()
+    Checksums(folder).store("config.toml", *TABLES)
     return Recording(folder)
 
 

@@ -103,7 +103,7 @@ def _own(run: Path) -> list[Path]:
     checksums = Checksums(run.parent if is_file else run)
     found = [run] if is_file and run.is_file() else parts_of(run / FILE)
     # A recorder that was killed has left one without a checksum.
-    checksums.verify(*{part.name for part in found} & {*(checksums.stored or ())})
+    checksums.verify(*{part.name for part in found} & {*checksums.stored})
     return found
 
 

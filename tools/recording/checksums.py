@@ -39,11 +39,11 @@ class Checksums:
     """The checksums of a run's files.
 
     Attributes:
-        stored: Checksum by path in the folder. None for a recording of an earlier version.
+        stored: Checksum by path in the folder.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.stored: dict[str, str] | None = None
+        self.stored: dict[str, str] = {}
         self._folder = folder
         path = folder / CHECKSUMS
         if path.is_symlink() or path.exists():
@@ -54,20 +54,18 @@ class Checksums:
             self.stored = {match[2]: match[1] for match in found if match}
 
     def store(self, *patterns: str) -> None:
-        """Store the checksums of the files that match a pattern. Raises `OSError`."""
-        stored = dict(self.stored or {})
+        """Store the checksums of the regular files that match a pattern. Raises `OSError`."""
         for path in (path for pattern in patterns for path in self._folder.glob(pattern)):
-            stored[str(path.relative_to(self._folder))] = _digest(path)
-        text = "".join(f"{value}  {name}\n" for name, value in stored.items())
+            if path.is_file():
+                self.stored[str(path.relative_to(self._folder))] = _digest(path)
+        text = "".join(f"{value}  {name}\n" for name, value in self.stored.items())
         write_file(self._folder / CHECKSUMS, text)
-        self.stored = stored
 
     def verify(self, *names: str) -> None:
         """Raise `Failure` for the first of these files that has been damaged or changed."""
         for name in names:
             path = self._folder / name
-            digest = _digest(path)
-            if self.stored is not None and self.stored.get(name) != digest:
+            if _digest(path) != self.stored.get(name):
                 why = f"damaged, or changed later: its checksum is not the one in {CHECKSUMS}"
                 raise Failure(f"{path}: {why}", 2)
 
@@ -92,22 +90,17 @@ def checked_line(entry: Document) -> str:
     return f'{text[:-1]}{_KEY}{xxh3_64_hexdigest(text.encode())}"}}\n'
 
 
-def read_line(line: str, is_checked: bool = False) -> Document:
+def read_line(line: str) -> Document:
     """Return the entry in a line of events.jsonl.
-
-    Args:
-        line: The line. Lines of earlier versions have no checksum.
-        is_checked: Whether a line without a checksum is damaged.
 
     Raises:
         ValueError: The line is damaged, or not JSON.
     """
-    text, key, check = line.removesuffix("\n").rpartition(_KEY)
-    if key or is_checked:
-        text += "}"
-        if check != f'{xxh3_64_hexdigest(text.encode())}"}}':
-            raise ValueError("its checksum is wrong")
-    entry: Document = json.loads(text or line)
+    text, _, check = line.removesuffix("\n").rpartition(_KEY)
+    text += "}"
+    if check != f'{xxh3_64_hexdigest(text.encode())}"}}':
+        raise ValueError("its checksum is wrong")
+    entry: Document = json.loads(text)
     if "value" in entry and entry["value"] is None:
         # JSON has no NaN.
         entry["value"] = nan

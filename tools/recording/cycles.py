@@ -79,11 +79,7 @@ class Cycles:
 
 
 def cycles_of(recording: Recording) -> dict[str, Cycles]:
-    """Return the cycles of a run by task; tasks without any are left out.
-
-    Raises `Failure` for a recording that lacks columns of the trace.
-    """
-    recording.need_all_columns()
+    """Return the cycles of a run by task; tasks without any are left out."""
     tasks = [task for task in recording.layout.tasks if len(recording.cycles.get(task.name, ()))]
     places = {task.name: recording.place(task) for task in tasks}
     _, away = stalls_of(recording)
@@ -137,7 +133,7 @@ def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[st
     Each part is the longest of all cycles (eq. 3.6), whether or not they fell into the same one;
     with a `percentile` below 100, the longest of that many in a hundred. The start-up of processes
     (`START_UP_S`) is excluded, and so are cycles with a stall in them: a virtual machine stalled by
-    its host counts that as processor time. Raises `Failure` as `cycles_of`.
+    its host counts that as processor time.
     """
     return budgets_of(cycles_of(recording), percentile)
 

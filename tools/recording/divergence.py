@@ -51,7 +51,7 @@ def other_run(run: Path, named: Path) -> Path:
         return named
     asked = f"--against origin: {run}"
     origin = Origin.of(Recording(run))
-    if origin is None or origin.folder is None:
+    if origin is None:
         raise Failure(f"{asked} records no run that it goes on from; permitted: --against RUN", 2)
     there = Path(origin.folder)
     for folder in (there, run.resolve().parent / there.name):

@@ -6,7 +6,6 @@ Launching a run needs this, so it imports nothing that reads recordings.
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -26,18 +25,17 @@ class Origin:
     """The run that another one goes on from before `tick`.
 
     `folder`: as its user named it. `launched_ns`: when it was launched, on the wall clock; no other
-    run has that. Both are None where an earlier version recorded no more than the tick, and the
-    latter for a run of an earlier version.
+    run has that.
     """
 
-    folder: str | None
+    folder: str
     tick: int
-    launched_ns: int | None
+    launched_ns: int
 
     @classmethod
     def at(cls, run: Recording, tick: int) -> Self:
         """Return it for what goes on from a run."""
-        return cls(str(run.folder), tick, _launched_ns(run))
+        return cls(str(run.folder), tick, run.launch.created_ns)
 
     @classmethod
     def of(cls, recording: Recording) -> Self | None:
@@ -45,18 +43,17 @@ class Origin:
         for a file that is not one of these."""
         path = recording.folder / ORIGIN
         if not path.exists():
-            tick = continued_at(recording)
-            return None if tick is None else cls(None, tick, None)
+            return None
         recording.checksums.verify(ORIGIN)
         try:
             found = json.loads(read_file(path))
-            return cls(str(found["folder"]), int(found["tick"]), found["launched_ns"])
+            return cls(str(found["folder"]), int(found["tick"]), int(found["launched_ns"]))
         except (ValueError, TypeError, KeyError) as error:
             raise Failure(f"{path}: not the origin of a run: {error!r}", 2) from None
 
     def is_of(self, run: Recording) -> bool:
-        """Say whether it is this run, and no other one of that name."""
-        return _launched_ns(run) == self.launched_ns
+        """Return whether it is this run, and no other one of that name."""
+        return run.launch.created_ns == self.launched_ns
 
     def write(self, folder: Path) -> None:
         """Write it into the folder of the later run. Raises `OSError`."""
@@ -71,9 +68,3 @@ def continued_at(recording: Recording) -> int | None:
     """Return the tick before which a run that goes on from another begins; None for any other."""
     found = (event["tick"] for event in recording.events if event.get("code") == CONTINUES)
     return next(found, None)
-
-
-def _launched_ns(run: Recording) -> int | None:
-    with suppress(Failure):
-        return run.launch.created_ns
-    return None

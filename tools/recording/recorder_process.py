@@ -190,12 +190,16 @@ class RecorderProcess:
                 self._kill_hung()
             while self._read(0.0):
                 continue
+            was_reported = self._is_gone
             self._is_gone = True
             self._close_pipes()
             try:
                 self._result = self._ended()
             finally:
                 os.close(self._complaints)
+            if self._process.returncode and not was_reported:
+                # The tables may be complete all the same.
+                self._lines.append(f"{self._result}; run.rrd may lack its end")
         return self._result
 
     def _close_pipes(self) -> None:

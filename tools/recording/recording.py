@@ -26,8 +26,14 @@ from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event, order_key
 from rack.tools.console.answer import Document, Failure
-from rack.tools.recording.checksums import Checksums, is_cut_off, read_file, read_line
-from rack.tools.recording.cores import UNMEASURED, CoreRecord
+from rack.tools.recording.checksums import (
+    CHECKSUMS,
+    Checksums,
+    is_cut_off,
+    read_file,
+    read_line,
+)
+from rack.tools.recording.cores import CoreRecord
 from rack.tools.recording.parquet import (
     CONFIG,
     HEAD,
@@ -82,21 +88,28 @@ class Recording:
                     f"{folder}: its recorder was killed; what it had taken is in cycles.parquet and"
                     " signals"
                 )
+        self._there(CHECKSUMS)
         self.checksums = Checksums(folder)
-        if self.checksums.stored is None:
-            _note(f"{folder}: recorded by an earlier version: it cannot be checked for damage")
         self.checksums.verify(CONFIG)
         self.config = self._text(CONFIG)
         """The resolved config, as TOML text."""
         path = self._there(CYCLES)
-        self._cycles = self._opened(path, ("task", "tick"))
-        if (folder / "signals.parquet").exists():
-            why = "recorded by an earlier version, its signals in one table"
-            raise Failure(f"{folder}: {why}, signals.parquet; run the rack again", 2)
+        self._cycles = self._opened(path, ("task", *FIELDS))
         with _naming(path):
-            self._metadata = self._cycles.metadata.metadata
-            self.layout = layout_of(json.loads(self._metadata[b"layout"]))
+            metadata = self._cycles.metadata.metadata
+            self.layout = layout_of(json.loads(metadata[b"layout"]))
             """The rack's layout."""
+            self.launch = Launch(*json.loads(metadata[b"launch"]))
+            """When the rack was launched."""
+            self.cores = CoreRecord.of(metadata[b"cores"])
+            """What the machine did to its cores; empty if the recorder did not measure it, or was
+            killed."""
+            kept = [tuple(ends) for ends in json.loads(metadata[b"kept"])]
+            self.kept: list[tuple[int, int]] = [] if len(kept) == 1 and kept[0][0] == 0 else kept
+            """The ticks of the stretches that a flight recorder kept, [first, end); none if it
+            removed nothing."""
+            self._gaps = json.loads(metadata[b"gaps"])
+            self._lost_before_the_end = dict[str, int](json.loads(metadata[b"lost"]))
         self._columns = {box.name: columns_of(box) for box in self.layout.mailboxes}
         self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
         self.events = self._read_events()
@@ -165,11 +178,7 @@ class Recording:
             _note(f"{path}: line {len(lines) + 1} is cut off, and left out")
         elif last:
             lines.append(last)
-        is_checked = self.checksums.stored is not None
-        found = (
-            _event(line, is_checked, f"{path}: line {number}")
-            for number, line in enumerate(lines, 1)
-        )
+        found = (_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1))
         return sorted(found, key=order_key)
 
     @cached_property
@@ -179,37 +188,9 @@ class Recording:
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
     @property
-    def launch(self) -> Launch:
-        """When the rack was launched. Raises `Failure` for recordings of earlier versions, which do
-        not hold it."""
-        text = self._metadata.get(b"launch")
-        if text is None:
-            why = (
-                "does not say when the rack was launched: it was recorded by an earlier version;"
-                " run the rack again"
-            )
-            raise Failure(f"{self.folder}: {why}", 2)
-        return Launch(*json.loads(text))
-
-    @cached_property
     def lost(self) -> dict[str, int]:
         """Rows that were written and are not in the files, by task and by mailbox."""
-        if "rows_lost" in self.ended:
-            return dict(self.ended["rows_lost"])
-        return self._lost_before_the_end
-
-    @cached_property
-    def _lost_before_the_end(self) -> dict[str, int]:
-        with _naming(self.folder / CYCLES):
-            return dict(json.loads(self._metadata[b"lost"]))
-
-    @cached_property
-    def kept(self) -> list[tuple[int, int]]:
-        """The ticks of the stretches that a flight recorder kept, [first, end); none if it removed
-        nothing."""
-        with _naming(self.folder / CYCLES):
-            found = [tuple(ends) for ends in json.loads(self._metadata.get(b"kept", b"[]"))]
-        return [] if len(found) == 1 and found[0][0] == 0 else found
+        return dict(self.ended.get("rows_lost", self._lost_before_the_end))
 
     def stretch_of(self, ticks: np.ndarray) -> np.ndarray:
         """Return the number of the stretch of each tick, shape (n,): what lies between two of them
@@ -238,8 +219,7 @@ class Recording:
         """
         lost = self.lost if lost is None else lost
         ticks = self.ended.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
-        with _naming(self.folder / CYCLES):
-            found = json.loads(self._metadata.get(b"gaps", b"[]"))
+        found = list(self._gaps)
         for name, count in lost.items():
             if count > self._lost_before_the_end.get(name, 0):
                 found.append((name, self._last_tick(name) + 1, ticks - 1))
@@ -290,32 +270,14 @@ class Recording:
         return {name: missing for name, missing in found.items() if missing.rows}
 
     @cached_property
-    def cores(self) -> CoreRecord:
-        """What the machine did to its cores; empty if the recorder did not measure it, or was
-        killed."""
-        with _naming(self.folder / CYCLES):
-            text = self._metadata.get(b"cores")
-            return UNMEASURED if text is None else CoreRecord.of(text)
-
-    def need_all_columns(self) -> None:
-        """Raise `Failure` for a trace that lacks columns."""
-        if lacking := [name for name in FIELDS if name not in self._cycles.schema_arrow.names]:
-            why = (
-                f"cycles.parquet has no column {', '.join(lacking)}: it was recorded by an earlier"
-                " version"
-            )
-            raise Failure(f"{self.folder}: {why}; run the rack again", 2)
-
-    @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
         """The trace by task: structured rows, oldest first, with the fields of
         `rack.backplane.trace.RECORD`."""
         with _naming(self.folder / CYCLES):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
-            # 0 in columns that an earlier version did not record.
-            rows = np.zeros(len(tasks), dtype=RECORD)
-            for name in table.column_names[1:]:
+            rows = np.empty(len(tasks), dtype=RECORD)
+            for name in FIELDS:
                 rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
 
@@ -400,11 +362,11 @@ def _naming(path: Path) -> Iterator[None]:
         ) from None
 
 
-def _event(line: str, is_checked: bool, place: str) -> Document:
+def _event(line: str, place: str) -> Document:
     """Return an event from its line, as `read_line` does. Raises `Failure`, which names the
     place."""
     try:
-        event = read_line(line, is_checked)
+        event = read_line(line)
         if event["kind"] == "outcome":
             {**event["outcome"], **event["tasks"]}
         else:

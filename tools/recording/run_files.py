@@ -10,6 +10,8 @@ from pathlib import Path
 from shutil import copyfile, rmtree
 from typing import IO, NamedTuple, Self
 
+import numpy as np
+
 from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
 from rack.backplane.ring import Ring
@@ -23,7 +25,8 @@ from rack.tools.recording.spool import (
     OPEN,
     STRETCHES,
     Frame,
-    Packed,
+    Part,
+    StretchEnd,
     StretchHead,
     locked,
     read,
@@ -74,12 +77,15 @@ class Tally:
         self.number = 0
         self._newest = -1
 
-    def take(self, found: StretchHead | Packed) -> None:
+    def take(self, part: Part) -> None:
         """Take what is in a spool."""
-        if isinstance(found, StretchHead):
-            self.begin(found)
-        else:
-            self.add(found.unpacked())
+        match part:
+            case StretchHead():
+                self.begin(part)
+            case StretchEnd():
+                self.end(part.tick)
+            case Frame():
+                self.add(part.ring, part.unpack(), part.lost)
 
     def begin(self, stretch: StretchHead) -> None:
         """Go on with a stretch; others before it may have been removed."""
@@ -91,15 +97,14 @@ class Tally:
         self.taken.update(stretch.taken)
         self.rows.update(stretch.rows)
         if follows and self.kept:
-            self.kept[-1] = self.kept[-1][0], stretch.end
+            self.kept[-1] = self.kept[-1][0], OPEN
         else:
             self.end()
-            self.kept.append((stretch.begin, stretch.end))
+            self.kept.append((stretch.begin, OPEN))
         self.number = stretch.number
 
-    def add(self, frame: Frame) -> None:
-        """Add rows of a ring."""
-        name, rows, lost = frame
+    def add(self, name: str, rows: np.ndarray, lost: int) -> None:
+        """Add rows of a ring, and count those lost before them."""
         self.count(name, len(rows), lost)
         if len(rows):
             self._newest = int(rows["tick"][-1])
@@ -113,11 +118,11 @@ class Tally:
         self.rows[name] += rows
         self.taken[name] += lost + rows
 
-    def end(self) -> None:
-        """End the last stretch where its recorder was killed."""
+    def end(self, tick: int = OPEN) -> None:
+        """End the last stretch at a tick, or else where its recorder was killed."""
         if self.kept and self.kept[-1][1] == OPEN:
             first = self.kept[-1][0]
-            self.kept[-1] = first, max(first, self._newest + 1)
+            self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN else tick
 
     def missing(self, segment: Segment) -> dict[str, Missing]:
         """Return what was written into the rings of a rack that has ended, and was lost or never
@@ -156,10 +161,9 @@ class RunFiles(Tally):
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
         super().begin(stretch)
 
-    def add(self, frame: Frame) -> None:
-        """Add rows of a ring."""
-        super().add(frame)
-        name, rows, _ = frame
+    def add(self, name: str, rows: np.ndarray, lost: int) -> None:
+        """Add rows of a ring, and count those lost before them."""
+        super().add(name, rows, lost)
         if len(rows):
             tick, before = self._reached[name]
             if self.lost[name] > before:
@@ -193,16 +197,17 @@ def mend(folder: Path) -> bool:
             return False
         layout, launch = read_head(file, path)
         files = RunFiles(folder, layout, launch, MENDED)
-        for found in read(file, folder, layout):
-            files.take(found)
-    files.close()
-    rmtree(folder / SIGNALS, ignore_errors=True)
-    for name in (CYCLES, SIGNALS):
-        (folder / f"{name}{MENDED}").replace(folder / name)
-    Checksums(folder).store(*TABLES)
-    # First: without it what is left of the stretches is not taken for a run.
-    path.unlink()
-    rmtree(folder / STRETCHES, ignore_errors=True)
+        for part in read(file, folder, layout):
+            files.take(part)
+        # Still locked: another process that opens this run waits until the files are in place.
+        files.close()
+        rmtree(folder / SIGNALS, ignore_errors=True)
+        for name in (CYCLES, SIGNALS):
+            (folder / f"{name}{MENDED}").replace(folder / name)
+        Checksums(folder).store(*TABLES)
+        # First: without it what is left of the stretches is not taken for a run.
+        path.unlink()
+        rmtree(folder / STRETCHES, ignore_errors=True)
     return True
 
 
@@ -215,11 +220,11 @@ def tally(folder: Path) -> Tally | None:
     with path.open("rb") as file:
         layout, _ = read_head(file, path)
         found = Tally(layout)
-        for one in read(file, folder, layout):
-            if isinstance(one, StretchHead):
-                found.begin(one)
+        for part in read(file, folder, layout):
+            if isinstance(part, Frame):
+                found.count(part.ring, part.length, part.lost)
             else:
-                found.count(one.ring, one.rows, one.lost)
+                found.take(part)
     found.end()
     return found
 

@@ -17,14 +17,13 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import struct
 import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Self
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -40,80 +39,55 @@ from rack.tools.recording.checksums import Checksums, check_file
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder_process import ORIGIN, SPOOL
 
-MAGIC = b"RACKSPL3"
-"""First bytes of a spool and of a stretch. A CRC follows every other part of them."""
+MAGIC = b"RACKSPL4"
+"""First bytes of a spool."""
 FLUSH_S = 0.1
 """SIGKILL of all processes loses what boards wrote in this time, between two drains, and in one or
 two passes of the recorder, which last longer on a busy machine."""
-_SIZE_BYTES = 4
-"""Bytes of the size of the JSON that follows it: layout and launch in a spool, the head of a
-stretch."""
-_FRAME = struct.Struct("<IIII")
-"""Ring, rows, rows lost before them, size of the data that follow."""
-STRETCHES = "stretches"
-_ENDED = struct.Struct("<q")
-"""Tick at which a stretch ended. It follows the magic."""
+_SIZES = struct.Struct("<II")
+"""Head of a part of a spool or stretch: sizes of the JSON document and of the data that follow."""
 _CRC_BYTES = 4
+STRETCHES = "stretches"
 OPEN = -1
 """End of a stretch that is being written, or whose recorder was killed."""
 
 
 class Frame(NamedTuple):
-    """Rows of one ring, and how many rows were lost before them."""
-
-    ring: str
-    rows: np.ndarray
-    lost: int
-
-
-class Packed(NamedTuple):
-    """A frame as it is in a file: `data` are the rows, compressed."""
+    """How many rows of a ring were taken, and lost before them; `data` are the rows, compressed."""
 
     ring: str
     dtype: np.dtype
-    rows: int
+    length: int
     lost: int
     data: bytes
 
-    def unpacked(self) -> Frame:
-        """Return it with its rows."""
-        size = self.rows * self.dtype.itemsize
-        data = pa.decompress(self.data, size, "zstd", asbytes=True)
-        return Frame(self.ring, np.frombuffer(data, self.dtype), self.lost)
+    def unpack(self) -> np.ndarray:
+        """Return the rows."""
+        size = self.length * self.dtype.itemsize
+        return np.frombuffer(pa.decompress(self.data, size, "zstd", asbytes=True), self.dtype)
 
 
 class StretchHead(NamedTuple):
     """The head of a stretch: its number from 1, and what its recorder had taken before it.
 
-    It holds what ended from tick `begin` to before `end`. By ring, `taken` is the number of the
-    last record before it, and `rows` counts the rows.
+    It holds what ended from tick `begin` on. By ring, `taken` is the number of the last record
+    before it, and `rows` counts the rows.
     """
 
     number: int
     begin: int
     taken: dict[str, int]
     rows: dict[str, int]
-    end: int = OPEN
 
-    def create(self, folder: Path) -> IO[bytes]:
-        """Create its file, to be written; the kernel has at once whatever is written."""
-        folder.mkdir(exist_ok=True)
-        file = self.path(folder).open("wb", buffering=0)
-        _write(file, MAGIC + _seal(_ENDED.pack(self.end)) + _pack(self[:-1]))
-        return file
 
-    def path(self, folder: Path) -> Path:
-        """Return its file in the folder of stretches."""
-        return folder / f"{self.number:08}.spool"
+class StretchEnd(NamedTuple):
+    """The last part of a stretch, which holds what ended before this tick; a recorder that was
+    killed leaves none."""
 
-    @classmethod
-    def read(cls, file: IO[bytes], path: Path) -> Self | None:
-        """Read it; None if its recorder was killed as it began. Raises `Failure` if it is
-        damaged."""
-        _read_magic(file, path)
-        ended = _unseal(file, _ENDED.size, path)
-        head = _unpack(file, path)
-        return None if ended is None or head is None else cls(*head, *_ENDED.unpack(ended))
+    tick: int
+
+
+Part = StretchHead | Frame | StretchEnd
 
 
 class Spool:
@@ -130,9 +104,8 @@ class Spool:
         self._out: IO[bytes] = self._file
         self._folder = folder
         self._layout = layout
-        self._rings = {name: place for place, name in enumerate(_dtypes(layout))}
-        self._waiting: dict[str, list[np.ndarray]] = {name: [] for name in self._rings}
-        self._lost = dict.fromkeys(self._rings, 0)
+        self._lost = dict.fromkeys(_dtypes(layout), 0)
+        self._waiting: dict[str, list[np.ndarray]] = {name: [] for name in self._lost}
         self._flush_at = 0.0
         try:
             if not locked(self._file):
@@ -149,11 +122,11 @@ class Spool:
             self.close()
             raise
 
-    def resume(self) -> Iterator[StretchHead | Packed]:
+    def resume(self) -> Iterator[Part]:
         """Yield what another recorder left, and continue after it."""
         whole = self._file.tell()
-        for packed in _read_frames(self._file, self._layout, self.path):
-            yield packed
+        for frame in _read_frames(self._file, self._layout, self.path):
+            yield frame
             whole = self._file.tell()
         self._file.truncate(whole)
         # What was taken before a stretch is in its head. That of the newest one may be cut off.
@@ -163,13 +136,17 @@ class Spool:
         """Finish the stretch that is being written, which ends at a tick, and write what is added
         from now on into another; return its file."""
         self.flush(now=True)
-        self._seal(end)
-        self._out = stretch.create(self._folder / STRETCHES)
-        return stretch.path(self._folder / STRETCHES)
+        self._finish_stretch(end)
+        path = self._folder / STRETCHES / f"{stretch.number:08}.spool"
+        path.parent.mkdir(exist_ok=True)
+        self._out = path.open("wb", buffering=0)
+        _write(self._out, _pack(stretch))
+        return path
 
-    def _seal(self, end: int) -> None:
+    def _finish_stretch(self, end: int) -> None:
         if self._out is not self._file:
-            os.pwrite(self._out.fileno(), _seal(_ENDED.pack(end)), len(MAGIC))
+            if end != OPEN:
+                _write(self._out, _pack(StretchEnd(end)))
             self._out.close()
 
     def add(self, ring: str, rows: np.ndarray, lost: int) -> None:
@@ -191,15 +168,11 @@ class Spool:
         return True
 
     def _packed(self) -> Iterator[bytes]:
-        for ring, place in self._rings.items():
-            blocks = self._waiting[ring]
-            lost = self._lost[ring]
-            if blocks or lost:
-                rows = sum(map(len, blocks))
-                packed = pa.compress(
-                    b"".join(block.tobytes() for block in blocks), codec="zstd", asbytes=True
-                )
-                yield _seal(_FRAME.pack(place, rows, lost, len(packed))) + _seal(packed)
+        for ring, blocks in self._waiting.items():
+            if blocks or self._lost[ring]:
+                data = b"".join(block.tobytes() for block in blocks)
+                frame = (ring, sum(map(len, blocks)), self._lost[ring])
+                yield _pack(frame, pa.compress(data, codec="zstd", asbytes=True))
                 self._waiting[ring] = []
                 self._lost[ring] = 0
 
@@ -210,7 +183,7 @@ class Spool:
 
     def close(self, end: int = OPEN) -> None:
         """Close the spool and leave it to another recorder; its stretch, if any, ends at a tick."""
-        self._seal(end)
+        self._finish_stretch(end)
         self._file.close()
 
 
@@ -249,36 +222,33 @@ def _unseal(file: IO[bytes], size: int, path: Path) -> bytes | None:
     return data
 
 
-def _pack(document: Any) -> bytes:
+def _pack(document: Any, data: bytes = b"") -> bytes:
     text = encode_json(document).encode()
-    return _seal(len(text).to_bytes(_SIZE_BYTES)) + _seal(text)
+    return _seal(_SIZES.pack(len(text), len(data))) + _seal(text + data)
 
 
-def _unpack(file: IO[bytes], path: Path) -> Any:
-    """Return a document that `_pack` packed; None if the file ends before it."""
-    size = _unseal(file, _SIZE_BYTES, path)
-    text = size and _unseal(file, int.from_bytes(size), path)
-    return text and json.loads(text)
-
-
-def _read_magic(file: IO[bytes], path: Path) -> None:
-    if not MAGIC.startswith(file.read(len(MAGIC))):
-        raise Failure(f"{path}: not a recorder's spool, or one of an earlier version", 2)
+def _unpack(file: IO[bytes], path: Path) -> tuple[Any, bytes] | None:
+    """Return a document and data that `_pack` packed; None if the file ends before them."""
+    if (sizes := _unseal(file, _SIZES.size, path)) is None:
+        return None
+    text_size, data_size = _SIZES.unpack(sizes)
+    body = _unseal(file, text_size + data_size, path)
+    return None if body is None else (json.loads(body[:text_size]), body[text_size:])
 
 
 def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
     """Return what the head of a spool says of the rack; its frames follow. Raises `Failure`."""
     file.seek(0)
-    _read_magic(file, path)
-    head = _unpack(file, path)
-    if head is None:
+    if not MAGIC.startswith(file.read(len(MAGIC))):
+        raise Failure(f"{path}: not a recorder's spool, or one of an earlier version", 2)
+    if (head := _unpack(file, path)) is None:
         raise Failure(f"{path}: truncated before its first row", 2)
-    return layout_of(head["layout"]), Launch(*head["launch"])
+    return layout_of(head[0]["layout"]), Launch(*head[0]["launch"])
 
 
 def read(
     file: IO[bytes], folder: Path, layout: Layout, newest: int | None = None
-) -> Iterator[StretchHead | Packed]:
+) -> Iterator[Part]:
     """Yield the frames of a spool, which is open after its head, then its stretches with theirs, or
     the `newest` ones."""
     yield from _read_frames(file, layout, folder / SPOOL)
@@ -286,8 +256,9 @@ def read(
     for path in paths if newest is None else paths[-newest:]:
         check_file(path)
         with path.open("rb") as part:
-            if (stretch := StretchHead.read(part, path)) is not None:
-                yield stretch
+            # Its recorder may have been killed as it began.
+            if (head := _unpack(part, path)) is not None:
+                yield StretchHead(*head[0])
                 yield from _read_frames(part, layout, path)
 
 
@@ -296,14 +267,15 @@ def stretch_files(folder: Path) -> list[Path]:
     return sorted((folder / STRETCHES).glob("*.spool"))
 
 
-def _read_frames(file: IO[bytes], layout: Layout, path: Path) -> Iterator[Packed]:
-    rings = list(_dtypes(layout).items())
-    while head := _unseal(file, _FRAME.size, path):
-        place, count, lost, size = _FRAME.unpack(head)
-        if (data := _unseal(file, size, path)) is None:
-            return
-        name, dtype = rings[place]
-        yield Packed(name, dtype, count, lost, data)
+def _read_frames(file: IO[bytes], layout: Layout, path: Path) -> Iterator[Frame | StretchEnd]:
+    dtypes = _dtypes(layout)
+    while (part := _unpack(file, path)) is not None:
+        document, data = part
+        if len(document) == len(StretchEnd._fields):
+            yield StretchEnd(*document)
+        else:
+            ring, length, lost = document
+            yield Frame(ring, dtypes[ring], length, lost, data)
 
 
 def rings(segment: Segment) -> dict[str, Ring]:

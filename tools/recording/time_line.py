@@ -13,7 +13,7 @@ one wrote.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -167,10 +167,11 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
         ways = ((a, b, way) for a, b in near if (way := _way(grids[b], grids[a])) is not None)
         if (found := next(ways, None)) is None:
             lone = next(grid for at, grid in enumerate(grids) if at not in placed)
+            met = ", ".join(f"'{grids[at].rack}'" for at in placed)
             raise Failure(
-                f"{lone.recording.folder}: rack '{lone.rack}' and"
-                f" {_named(grids[at] for at in placed)} never met: no recording holds a comparison"
-                " of their clocks; each rack needs one that has it among its peers",
+                f"{lone.recording.folder}: rack '{lone.rack}' and {met} never met: no recording"
+                " holds a comparison of their clocks; each rack needs one that has it among its"
+                " peers",
                 2,
             )
         a, b, shifts = found
@@ -207,10 +208,6 @@ def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
         RackPlace(line, line, by_ticks=True),
         RackPlace(grids[1], line, by_ticks=True, marked=tuple(marks)),
     ]
-
-
-def _named(grids: Iterable[RackGrid]) -> str:
-    return ", ".join(f"'{grid.rack}'" for grid in grids)
 
 
 def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:

@@ -98,20 +98,6 @@ def test_the_run_that_a_branch_continues_is_found_if_it_is_the_very_run(
 
 
 @pytest.mark.slow
-def test_a_branch_of_an_earlier_version_still_reads(run: Path, tmp_path: Path) -> None:
-    two = tmp_path / "two"
-    rack("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--out", two)
-    (two / ORIGIN).unlink()
-    report, text = write_report(two)
-    found = report["continues"]
-    assert found == {"folder": None, "tick": 480, "time_s": 1.2, "launched_ns": None}
-    assert "\n- continues another run from 1.2 s\n" in text
-    refused = rack("report", two, "--against", "origin")
-    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
-    assert "records no run that it goes on from; permitted: --against RUN" in refused.stderr
-
-
-@pytest.mark.slow
 def test_an_origin_that_is_none_is_refused(run: Path) -> None:
     (run / ORIGIN).write_text("{}")
     with pytest.raises(Failure, match=r"origin\.json: damaged, or changed later"):

@@ -6,8 +6,11 @@ import os
 import resource
 import signal
 import time
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
+
+import numpy as np
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -116,3 +119,21 @@ def counts(recording: Recording) -> dict[str, int]:
 
 def realtime(config: RackConfig) -> RackConfig:
     return config.model_copy(update={"clock": config.clock.model_copy(update={"mode": "realtime"})})
+
+
+class EndingView:
+    """A view whose library ends the recorder's process as it is closed, as one without memory
+    may."""
+
+    def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
+        pass
+
+    def add(self, ring: str, rows: np.ndarray) -> None:
+        """Take nothing."""
+
+    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
+        """Take nothing."""
+
+    def close(self, tick: int, lost: Mapping[str, int]) -> None:
+        """End the process."""
+        os._exit(70)

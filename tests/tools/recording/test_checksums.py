@@ -13,7 +13,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from rack.backplane.words import System
@@ -24,7 +23,7 @@ from rack.boards.errors import CheckpointError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, checked_line, read_line
-from rack.tools.recording.parquet import CONFIG, HEAD, TIME
+from rack.tools.recording.parquet import CONFIG, HEAD
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
@@ -127,25 +126,6 @@ def test_a_flipped_bit_is_named_or_changes_no_value(damaged: Path, pattern: str)
             assert pattern in (CHECKSUMS, "report.*")
             assert rack("report", damaged, "--json").stdout == report
         path.write_bytes(before)
-
-
-def test_the_pages_of_a_table_have_checksums_that_are_verified(damaged: Path) -> None:
-    """Without the checksums of whole files: a flipped bit at the end of any column's page."""
-    (damaged / CHECKSUMS).unlink()
-    table = damaged / "signals" / "lower.status.parquet" / "0001.parquet"
-    whole = table.read_bytes()
-    rows = pq.ParquetFile(table).metadata.row_group(0)
-    for column in map(rows.column, range(rows.num_columns)):
-        first = column.data_page_offset
-        if column.has_dictionary_page:
-            first = column.dictionary_page_offset
-        content = bytearray(whole)
-        content[first + column.total_compressed_size - 1] ^= 1
-        table.write_bytes(content)
-        # The time is the tick in another unit, and is never read.
-        if column.path_in_schema != TIME:
-            with pytest.raises(Failure, match=r"lower\.status\.parquet: .*CRC"):
-                values(damaged)
 
 
 @pytest.mark.slow

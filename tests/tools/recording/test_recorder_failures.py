@@ -22,12 +22,13 @@ from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
 from rack.tools.live.launch import NO_RECORDER, run_rack
 from rack.tools.recording import recorder_process
+from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import mend
-from rack.tools.recording.spool import Spool
+from rack.tools.recording.spool import Spool, locked
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.analysis.tables import text as analysis_text
@@ -240,6 +241,21 @@ def test_what_a_killed_recorder_took_is_readable(
 
 
 @pytest.mark.slow
+def test_a_recorder_that_dies_over_the_viewers_file_is_reported(
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        recorder_process, "VIEW", "tests.tools.recording.struck_recorders:EndingView"
+    )
+    result = run_rack(config, 1.0, tmp_path / "run", Display())
+    # Its tables were complete before.
+    assert (result.worked, result.recording) == (True, "complete")
+    assert notes_of(Recording(tmp_path / "run")) == [
+        "the recorder ended with status 70; run.rrd may lack its end"
+    ]
+
+
+@pytest.mark.slow
 def test_a_recorder_that_is_stopped_is_replaced_in_real_time_too(
     config: RackConfig, tmp_path: Path
 ) -> None:
@@ -302,6 +318,23 @@ def test_a_spool_that_is_cut_anywhere_gives_what_is_whole(
         found.append(sum(pq.read_table(table).num_rows for table in tables))
     assert found == sorted(found, reverse=True)
     assert found[0] > 200 > found[-1]
+
+
+def test_a_spool_is_locked_until_the_files_made_of_it_are_in_place(
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise two programs that open the run of a killed recorder at once damage it."""
+    with Rack(config) as rack:
+        Recorder(rack.segment, tmp_path)._spool.close()
+    refused = []
+
+    def store(checksums: Checksums, *patterns: str) -> None:
+        with (tmp_path / SPOOL).open("rb") as spool:
+            refused.append(not locked(spool))
+
+    monkeypatch.setattr(Checksums, "store", store)
+    assert mend(tmp_path)
+    assert refused == [True]
 
 
 def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +11,7 @@ import rerun.blueprint as rrb
 from rack.backplane.segment import Launch
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.events import Event
+from rack.tools.recording.checksums import checked_line
 from rack.tools.viewer.events import Events
 from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.reading import read
@@ -25,7 +25,7 @@ def test_what_a_launch_waits_for_is_not_in_the_log(tmp_path: Path) -> None:
     stream = Stream(new_recording("events", "run", tmp_path / "run.rrd", rrb.Blueprint()), times)
     texts = {"preloading 'a:B'": -1, "preloading 'a:C'": -1, "rack 'x' is awaited": 4}
     events = [Event(time.time_ns(), at, "waiting", "", text) for text, at in texts.items()]
-    (tmp_path / "events.jsonl").write_text("".join(json.dumps(asdict(e)) + "\n" for e in events))
+    (tmp_path / "events.jsonl").write_text("".join(checked_line(asdict(e)) for e in events))
     hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
     Events(stream, tmp_path / "events.jsonl", hierarchy, None).advance()
     stream.flush()

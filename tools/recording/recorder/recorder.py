@@ -27,7 +27,7 @@ from rack.tools.recording.parquet import PUBLISHED
 from rack.tools.recording.recorder.flight import FlightRecorder
 from rack.tools.recording.recorder_process import LOOK_S
 from rack.tools.recording.run_files import TABLES, RunFiles, Tally
-from rack.tools.recording.spool import Frame, Spool, rings
+from rack.tools.recording.spool import Spool, rings
 
 REALTIME_S = 0.05
 LOCKSTEP_S = 0.005
@@ -195,8 +195,8 @@ class Recorder:
         if retention is None:
             self._files = RunFiles(folder, layout, segment.launch, before=before)
         self._tally = self._files or Tally(layout, before)
-        for found in self._spool.resume():
-            self._tally.take(found)
+        for part in self._spool.resume():
+            self._tally.take(part)
         self._flight = (
             None
             if retention is None
@@ -235,7 +235,7 @@ class Recorder:
         for name, ring in self._rings.items():
             rows, lost = ring.drain()
             self._spool.add(name, rows, lost)
-            self._tally.add(Frame(name, rows, lost))
+            self._tally.add(name, rows, lost)
             if self._flight is not None:
                 self._flight.look(name, rows, lost)
             if self._view is not None:

@@ -103,7 +103,7 @@ def _blocks(document: Document) -> Blocks:
 def _notes(report: RunReport) -> Iterator[str]:
     """Yield what the run began from and ran on, and what the recording lacks."""
     if found := report.continues:
-        yield f"- continues {found['folder'] or 'another run'} from {found['time_s']:g} s"
+        yield f"- continues {found['folder']} from {found['time_s']:g} s"
     yield from (f"- {note}" for note in report.notes)
     yield from _machine(report)
     if report.recording != "complete":

@@ -24,7 +24,7 @@ def stored_report(folder: Path) -> tuple[Document, str] | None:
     try:
         checksums = Checksums(folder)
         kept = (*FILES, *RECORDED)
-        checksums.verify(*(name for name in checksums.stored or () if name.startswith(kept)))
+        checksums.verify(*(name for name in checksums.stored if name.startswith(kept)))
         made_ns = min((folder / name).stat().st_mtime_ns for name in FILES)
         newest_ns = max((folder / name).stat().st_mtime_ns for name in RECORDED)
         if (folder / SPOOL).exists() or made_ns <= max(newest_ns, *_changed_ns()):

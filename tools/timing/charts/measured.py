@@ -25,13 +25,11 @@ BLOCK_NS = 1_000_000_000
 class TracedRun:
     """A recorded run in the terms of the timing model. Times are ns of the wall clock since tick 0.
 
-    Raises `ConfigError` when a file named by its config is missing, `Failure` for a trace that
-    lacks columns.
+    Raises `ConfigError` when a file named by its config is missing.
     """
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
-        recording.need_all_columns()
         self.config: RackConfig = recording.rack_config
         layout = recording.layout
         known = rack_timing(self.config, layout, dict.fromkeys(self.config.board, Budget())).tasks

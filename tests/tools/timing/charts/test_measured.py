@@ -6,14 +6,10 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 
 from rack.boards.config import load
 from rack.levels.timing.schedule import Chart
-from rack.tools.console.answer import Failure
-from rack.tools.recording.checksums import CHECKSUMS
-from rack.tools.recording.recording import Recording
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import union, without
 from tests.tools.recordings import EPOCH_NS, cycle, recorded
@@ -151,18 +147,6 @@ def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
     assert parts[-1] == 1.0
     assert (in_blocks.patterns, in_blocks.counts) == (at_once.patterns, at_once.counts)
     assert dict(at_once.patterns["level"].plans) == {"R X W P | R X W P U -": 30}
-
-
-def test_a_trace_without_the_newer_columns_is_refused(folder: Path) -> None:
-    fig2(folder, [executor(0, 0, 0, 0, 0, 100)], [])
-    table = pq.read_table(folder / "cycles.parquet").drop_columns(["plan_ns"])
-    pq.write_table(table, folder / "cycles.parquet")
-    (folder / CHECKSUMS).unlink()
-    with pytest.raises(
-        Failure,
-        match="no column plan_ns: it was recorded by an earlier version; run the rack again",
-    ):
-        TracedRun(Recording(folder))
 
 
 def test_times_count_from_tick_0_whatever_the_machines_clock_says(folder: Path) -> None:
