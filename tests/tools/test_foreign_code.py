@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,9 +65,11 @@ RUNS_THEM = {
 
 
 class Spied(NamedTuple):
-    """A rack that runs, and a recorded run, both with levels that note who imports them."""
+    """A rack that runs in real time, one in lockstep, and a recorded run, all with levels that note
+    who imports them."""
 
     rack: str
+    lockstep: str
     run: Path
     marker: Path
 
@@ -95,7 +98,7 @@ ARGUMENTS: dict[str, Callable[[Spied], Sequence[Sequence[object]]]] = {
     ],
     "pause": lambda spied: [(spied.rack,)],
     "resume": lambda spied: [(spied.rack,)],
-    "step": lambda spied: [(spied.rack,), (spied.rack, "--run")],
+    "step": lambda spied: [(spied.lockstep,), (spied.lockstep, "--run")],
     "estop": lambda spied: [(spied.rack,), (spied.rack, "--reset")],
     "clean": lambda spied: [()],
     "replay": lambda spied: [(spied.run, "--out", spied.run / "again.rrd")],
@@ -127,11 +130,12 @@ def spied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spied]:
     marker = own / f"{MODULE}.imported"
     run = folder / "run"
     name = f"test-spied-{os.getpid()}"
-    command = [*RACK, "run", str(path), "--lockstep", "--set", f"name={name}"]
+    command = [*RACK, "run", str(path), "--share"]
     fault = 'fault=[{ kind = "spy-drop", board = "lower", tick = 200, cycles = 2 }]'
     command = [*command, *(f"--set=board.{board}.budget.process_ms=0.1" for board in BOARDS)]
     recorded = [
         *command,
+        "--lockstep",
         "--set",
         fault,
         f"--set={HOLD}",
@@ -144,15 +148,28 @@ def spied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spied]:
     done = subprocess.run(recorded, capture_output=True, text=True, timeout=BOUND_S)
     assert done.returncode == 0, done.stderr
     assert "rack.tools.cli run" in marker.read_text()
+    # In lockstep a rack writes faster than `rack watch` may read.
+    modes = {name: "--set=clock.mode=realtime", f"{name}-steps": "--lockstep"}
+    with ExitStack() as stack:
+        for one, mode in modes.items():
+            stack.enter_context(_launched(one, [*command, f"--set=name={one}", mode]))
+        marker.unlink()
+        yield Spied(*modes, run, marker)
+
+
+@contextmanager
+def _launched(name: str, command: Sequence[str]) -> Iterator[None]:
+    """Run a rack that has begun to tick, and end it."""
     process = subprocess.Popen([*command, "--no-record"], stdout=subprocess.PIPE)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.startswith(name.encode()) and b"tick 0 " not in line:
-            break
-    marker.unlink()
-    yield Spied(name, run, marker)
-    process.kill()
-    process.communicate()
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith(name.encode()) and b"tick 0 " not in line:
+                break
+        yield
+    finally:
+        process.terminate()
+        process.communicate(timeout=BOUND_S)
 
 
 @pytest.fixture
