@@ -7,13 +7,13 @@ in lockstep and tasks at ordinary priority occupy no core: they can wait.
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.errors import SegmentError
 from rack.backplane.process import SCHED_DEADLINE
 from rack.backplane.segment import Segment, racks
@@ -84,7 +84,7 @@ def _held(segment: Segment) -> dict[int, list[str]]:
             held.setdefault(task.core, []).append(task.name)
     # Another version of this program may have created the segment, so its config is not validated
     # here.
-    clock = tomllib.loads(segment.config).get("clock", {})
+    clock = load_toml(segment.config).get("clock", {})
     # If the boards were refused their priority, so was the clock.
     if held and clock.get("priority"):
         held.setdefault(obtained_core(clock["core"]), []).append(CLOCK)

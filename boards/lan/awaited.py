@@ -3,10 +3,10 @@ watches the rack."""
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from enum import IntEnum
 
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.checked import as_named, pick
 from rack.backplane.errors import DamageError
 from rack.backplane.segment import Segment
@@ -47,7 +47,7 @@ def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
             from rack.boards.lan.config import LanTable
 
             why, place = divmod(word - 1, 1 << _PLACES)
-            table = tomllib.loads(segment.config).get("adapter", {}).get(task.board)
+            table = load_toml(segment.config).get("adapter", {}).get(task.board)
             if table is None:
                 raise DamageError(f"'{task.board}' waits for another rack and is no adapter")
             keys = {field.alias or name for name, field in LanTable.model_fields.items()}

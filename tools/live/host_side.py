@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.checked import as_named
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
@@ -94,7 +94,7 @@ def entries_of(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
     """Yield status mailbox, name and source of every entry of a rack's bus adapters; `config` is
     TOML text."""
     boxes = [box.name for box in layout.mailboxes if box.message == ADAPTER_STATUS]
-    boards = tomllib.loads(config)["board"] if boxes else {}
+    boards = load_toml(config)["board"] if boxes else {}
     for box in boxes:
         for entry, table in boards[box.partition(".")[0]].get("params", {}).get("pass", {}).items():
             yield box, entry, table["from"]

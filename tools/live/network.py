@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.segment import Segment
 from rack.levels.peer import Presence, peer_port
 from rack.tools.live.newest import Newest
@@ -81,7 +81,7 @@ class Entries(NamedTuple):
 @cache
 def exchanged(config: str) -> Entries | None:
     """Return what a rack exchanges by its config, TOML text; None: it has no network adapter."""
-    table: dict[str, Any] | None = tomllib.loads(config).get("adapter", {}).get(BOARD)
+    table: dict[str, Any] | None = load_toml(config).get("adapter", {}).get(BOARD)
     if table is None:
         return None
     exports, imports = (

@@ -3,12 +3,12 @@ progress of its task."""
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.checked import as_named
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
@@ -126,7 +126,7 @@ class RackMonitor:
         self._newest = Newest(segment)
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
-        robot = tomllib.loads(segment.config).get("robot", {})
+        robot = load_toml(segment.config).get("robot", {})
         self._joints = tuple(robot.get("joints", ()))
         self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
         self.cycles: dict[str, np.ndarray] = {}

@@ -10,7 +10,6 @@ are in no recording: see `rack.tools.timing.analysis.cycle_again`.
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.fault_table import NEVER
 from rack.backplane.layout import MailboxSpec, TaskSpec
 from rack.boards.config.schema import LAN
@@ -197,7 +197,7 @@ class Divergence:
 
     def _config(self, task: str) -> Iterator[Clue]:
         """Yield the keys of the writer's board that differ; if none does, those of the rack."""
-        tables = (tomllib.loads(run.config) for run in self.runs)
+        tables = (load_toml(run.config) for run in self.runs)
         differ = [both for both in unlike_values(*tables) if not both.name.startswith(OWN)]
         board = f"board.{task.partition('.')[0]}."
         own = [both for both in differ if both.name.startswith(board)]

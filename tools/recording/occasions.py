@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, alarm_ring
@@ -36,7 +36,7 @@ class Retention(NamedTuple):
     @classmethod
     def of(cls, segment: Segment) -> Self | None:
         """Return it for a rack; None: everything is kept."""
-        config = RecordConfig.model_validate(tomllib.loads(segment.config).get("record", {}))
+        config = RecordConfig.model_validate(load_toml(segment.config).get("record", {}))
         if config.keep is None:
             return None
         spans_s = (config.keep, config.before, config.after)
