@@ -88,4 +88,6 @@ def test_a_rack_whose_launcher_was_killed_is_listed_as_dead_and_cleaned(
     os.kill(held.pid, signal.SIGKILL)
     held.wait(BOUND_S)
     assert seen(rack_name)["state"] == "dead"
-    assert rack_name in json.loads(inside("clean", "--json").stdout)["removed"]
+    inside("clean")
+    # Or another test has cleaned meanwhile, so what this one says that it removed does not count.
+    assert rack_name not in racks()
