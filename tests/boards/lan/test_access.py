@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rack.boards.lan.access import IN, OUT, SEND, TOKENS, access_control
+from rack.boards.lan.access import IN, OUT, PUT, SUBSCRIBE, TOKEN, WATCH_TOKENS, access_control
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.keys import alive_key, launch_and_cycle
 
@@ -44,13 +44,12 @@ def test_without_others_nothing_is_allowed() -> None:
     assert list(rules(TLS)) == []
 
 
-def test_without_tls_anyone_may_see_what_it_sends_and_compare_clocks() -> None:
+def test_without_tls_anyone_may_see_that_it_is_there_and_compare_clocks() -> None:
     found = list(rules(TCP))
+    assert {message for _, message, *_ in found} == {*WATCH_TOKENS, *TOKEN, *SUBSCRIBE, *PUT}
+    keys = {key for _, message, key, _ in found if message in (*SUBSCRIBE, *PUT)}
+    assert keys == {"rack/*/ping/home", "rack/*/pong/*", "rack/home/pong/*"}
     assert {name for *_, name in found} == {"*"}
-    assert {key for flow, message, key, _ in found if (flow, message) == ("ingress", "put")} == {
-        "rack/*/ping/home"
-    }
-    assert not [rule for rule in found if rule[1] in (*QUERIES, "liveliness_token") and IN in rule]
 
 
 def test_over_tls_every_rule_is_for_one_certificate() -> None:
@@ -59,25 +58,38 @@ def test_over_tls_every_rule_is_for_one_certificate() -> None:
     assert names == {"friend", "anyone"}
 
 
-def test_everyone_sends_under_a_name_of_their_own() -> None:
+def test_puts_come_from_a_rack_itself_and_only_what_is_imported() -> None:
     imports = {"own": {"from": "friend/pulse.status", **ENTRY}}
-    found = list(rules(TLS, **{"import": imports}, peers=("other",), estop_from=["viewer"]))
-    come = {
+    found = {
         (key, name)
-        for flow, message, key, name in found
-        if flow == IN and message in (*SEND, *QUERIES)
+        for flow, message, key, name in rules(
+            TLS, **{"import": imports}, peers=("other",), estop_from=["viewer"]
+        )
+        if (flow, message) == (IN, "put")
     }
-    senders = {(f"rack/{name}/**", name) for name in ("friend", "other")}
-    assert come == {*senders, ("rack/viewer/estop/home", "viewer")}
-    out = {key for flow, message, key, _ in found if flow == OUT and message in SEND}
-    assert out == {"rack/home/**"}
+    keys = ("step", "ping/home", "pong/home")
+    expected = {(f"rack/{name}/{key}", name) for name in ("friend", "other") for key in keys}
+    assert found == {*expected, ("rack/friend/out/pulse/status", "friend")}
+
+
+def test_what_goes_out_is_this_racks_own() -> None:
+    exports = {"pulse": {"from": "pulse.status"}}
+    out = [
+        key
+        for flow, message, key, _ in rules(TLS, export=exports, peers=("friend",))
+        if flow == OUT and message in (*PUT, *TOKEN, *QUERIES)
+    ]
+    assert out
+    assert all(key.startswith("rack/home/") for key in out)
+    assert "rack/home/out/pulse/status" in out
 
 
 def test_whoever_may_stop_it_may_do_nothing_else() -> None:
     stop = "rack/viewer/estop/home"
+    seen = ("rack/*/alive/*", "rack/home/alive/*")
     assert {rule[:3] for rule in rules(TLS, estop_from=["viewer"])} == {
-        *((IN, token, "rack/**") for token in TOKENS),
-        (OUT, "liveliness_token", "rack/home/**"),
+        *((IN, watch, key) for watch in WATCH_TOKENS for key in seen),
+        (OUT, "liveliness_token", "rack/home/alive/*"),
         (OUT, "declare_queryable", "rack/*/estop/home"),
         (IN, "query", stop),
         (OUT, "reply", stop),
