@@ -124,7 +124,13 @@ MUTANTS = (
     Mutant(
         "violation counter",
         "violation counter",
-        (("levels/arm/monitors.py", "self.count += int(steps.sum())", "self.count += 0"),),
+        (
+            (
+                "levels/arm/simulation.py",
+                "self.violations += int(steps.sum())",
+                "self.violations += 0",
+            ),
+        ),
     ),
 )
 KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation counter"))

@@ -253,29 +253,6 @@ class Arm(Plant, ABC):
         self._show(scene)
 
 
-class CalibratedLink:
-    """Implements `Link` around an arm whose samples are off by `robot.calibration.offset`."""
-
-    def __init__(self, arm: Arm, offset: Array) -> None:
-        """Add `offset`, (joints,), rad, to positions."""
-        self._arm = arm
-        self._offset = offset
-
-    def sense(self) -> Sensed:
-        """Return the newest sample, calibrated."""
-        sample = self._arm.sense()
-        return sample._replace(position=sample.position + self._offset)
-
-    def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Pass on the torque; see `Link.drive`."""
-        return self._arm.drive(torque, grip_force)
-
-    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Pass on the set points, as the drives count positions; see `Link.follow`."""
-        target = target._replace(position=target.position - self._offset)
-        return self._arm.follow(target, grip_force)
-
-
 def find_arm(reference: str) -> type[Arm]:
     """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing
     or no whole `Arm`."""

@@ -64,9 +64,9 @@ class FaultyLink:
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the active faults; one of a joint that the arm lacks has no effect."""
         active = [
-            ActiveFault(place, fault, self._joints(fault), self._every, self._kept)
+            ActiveFault(place, fault, joints, self._every, self._kept)
             for place, fault in enumerate(faults)
-            if self._joints(fault).any()
+            if (joints := self._joints(fault)).any()
         ]
         for gone in self._kept.keys() - {a.key for a in active}:
             del self._kept[gone]
@@ -74,21 +74,14 @@ class FaultyLink:
         self._sensors = [(step, a) for step, a in steps if isinstance(step, SensorStep)]
         self._motors = [(step.part(a), a) for step, a in steps if isinstance(step, MotorStep)]
         self._commands = [(step, a) for step, a in steps if isinstance(step, CommandStep)]
-        most = self._most() if self._motors else None
-        self._arm.weaken(most)
-
-    def _joints(self, fault: Fault) -> Mask:
-        return (
-            np.full(len(self._limits), True)
-            if fault.joint < 0
-            else np.arange(len(self._limits)) == fault.joint
-        )
-
-    def _most(self) -> Array:
         most = np.full(len(self._limits), np.inf)
         for part, active in self._motors:
             np.minimum(most, part * self._limits, out=most, where=active.joints)
-        return most
+        self._arm.weaken(most if self._motors else None)
+
+    def _joints(self, fault: Fault) -> Mask:
+        joints = np.arange(len(self._limits))
+        return np.asarray((joints == fault.joint) | (fault.joint < 0))
 
     def sense(self) -> Sensed:
         """Return the newest sample with the faults applied."""

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
+import mujoco
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.arm.poses import poses, show
 from rack.levels.level import Executor, Finding
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell
 
 EPISODE_TICKS = 20
 """Ticks without a finding of a kind after which the next one is reported again."""
+SAVED = ("tick", "waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
+"""Attributes of a plant that its `ARM_STATE` keeps."""
 
 
 class Plant:
@@ -52,16 +53,19 @@ class Plant:
         )
         # the first violation, readable: which limit, by how much, and when
         self.first_violation = ""
-        self._saved: tuple[Message, tuple[int, ...]] | None = (
-            None  # last message filled, with what seldom changes
-        )
+        self._model = cell.model
         self._data = cell.start()
-        self._poses = poses(cell, self._data)
-        self._fill = show.load()
 
     def _show(self, scene: Message) -> None:
         """Fill a `SCENE` from `_data`."""
-        self._fill(*self._poses, np.frombuffer(scene.raw))
+        data = self._data
+        bodies = self.cell.bodies
+        tool = self.cell.tool
+        mujoco.mj_kinematics(self._model, data)  # after a step, poses are those before it
+        scene.position[: len(bodies)] = data.xpos[bodies]
+        scene.quaternion[: len(bodies)] = data.xquat[bodies]
+        scene.tool_position = data.site_xpos[tool]
+        mujoco.mju_mat2Quat(scene.tool_quaternion, data.site_xmat[tool])
 
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
@@ -69,20 +73,8 @@ class Plant:
         A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.state`.
         """
         self.report_cycle()
-        state.tick = self.tick
-        seldom = (
-            self.waited,
-            self.braked,
-            self.clipped,
-            self.touches,
-            self.violations,
-            self.pushed,
-            self.struck,
-        )
-        if (state, seldom) != self._saved:
-            state.waited, state.braked, state.clipped, state.touches = seldom[:4]
-            state.violations, state.pushed, state.struck = seldom[4:]
-            self._saved = state, seldom
+        for name in SAVED:
+            setattr(state, name, getattr(self, name))
 
     def find(self, finding: Finding) -> None:
         """Add a finding, unless it continues an episode."""
@@ -112,11 +104,6 @@ class Plant:
     def restore(self, state: Message) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
         board."""
-        self.tick = state.tick
-        self.waited = state.waited
+        for name in SAVED:
+            setattr(self, name, getattr(state, name))
         self.braked = bool(state.braked)
-        self.clipped = state.clipped
-        self.touches = state.touches
-        self.violations = state.violations
-        self.pushed = state.pushed
-        self.struck = state.struck

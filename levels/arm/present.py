@@ -1,5 +1,5 @@
-"""Samples of an arm behind a bus are some ticks old: its equation of motion brings them to the
-present."""
+"""Samples of an arm behind a bus are some ticks old, and count from elsewhere: its equation of
+motion brings them to the present, `robot.calibration.offset` to the model's positions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.levels.algebra import Array, solve
-from rack.levels.arm.arm import Arm, JointTarget, Link, Sensed, copied
+from rack.levels.arm.arm import Arm, JointTarget, Sensed, copied
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
@@ -33,17 +33,17 @@ class Present(NamedTuple):
 
 
 class PresentLink:
-    """Implements `Link` around an arm whose samples are up to `robot.latency_ticks` old.
+    """Implements `Link` around an arm whose samples are up to `robot.latency_ticks` old, and off by
+    `robot.calibration.offset`.
 
     Such a sample is led to the tick at which it is read: by the torques given since, or as brakes
     stop a joint. How far off the model may be by then is in the cell's `encoders`. An older sample
     is passed on as it is.
     """
 
-    def __init__(self, arm: Arm, cell: Cell, tick_s: float, below: Link | None = None) -> None:
-        """Sense the `arm` by the link `below`, if it has one of its own."""
+    def __init__(self, arm: Arm, cell: Cell, tick_s: float) -> None:
         self._arm = arm
-        self._below: Link = below or arm
+        self._offset = cell.encoders.offset
         self._braking = cell.limits.acceleration
         self._dynamics = Dynamics(cell)
         self._latency = cell.encoders.latency_ticks
@@ -59,7 +59,9 @@ class PresentLink:
         """Return the newest sample, and the present state."""
         arm = self._arm
         last = self._last
-        sample = copied(self._below.sense())
+        sample = copied(arm.sense())
+        if self._offset is not None:
+            sample.position[:] += self._offset
         torque = None if arm.braked else arm.torque.copy()
         self._driven.append(Driven(arm.tick, torque))
         if not 0 < arm.tick - sample.tick <= self._latency:
@@ -81,8 +83,10 @@ class PresentLink:
         return self._arm.drive(torque, grip_force)
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Pass on the set points; see `Link.follow`."""
-        return self._below.follow(target, grip_force)
+        """Pass on the set points, as the drives count positions; see `Link.follow`."""
+        if self._offset is not None:
+            target = target._replace(position=target.position - self._offset)
+        return self._arm.follow(target, grip_force)
 
     def _led(self, sample: Sensed) -> Sensed:
         """Return a sample led to the present."""

@@ -1,5 +1,4 @@
-"""Drives that follow set points of position or velocity: what such set points must pass, and the
-simulated ones."""
+"""Drives that follow set points of position or velocity: what such set points must pass."""
 
 from __future__ import annotations
 
@@ -10,16 +9,9 @@ from rack.levels.algebra import Array, mat_vec, solve
 from rack.levels.arm.arm import Arm, JointTarget
 from rack.levels.arm.drives import LimitGate, speed_towards
 from rack.levels.level import Finding
-from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import Bounds, Limits
 
-POSITION_GAIN = 25.0
-VELOCITY_GAIN = 100.0
-INTEGRAL_GAIN = 10.0
-"""Gains of a simulated drive, 1/s: speed per position error, acceleration per velocity error, and
-that of the integral. Each loop is at least twice as fast as the one around it, and all are slow
-against ticks of 2.5 ms."""
 MOST_ACCELERATION = 3.0
 """Multiple of the acceleration limits with which set points may change their velocity: curves
 between those of the level above need two, joining them another. The less, the less drives swing
@@ -128,44 +120,3 @@ def half_planned(bounds: Bounds, limits: Limits) -> Bounds:
     position = np.stack((np.maximum(low, least), np.minimum(high, most)), axis=1)
     fastest = np.minimum(bounds.velocity, 0.5 * (bounds.velocity + limits.velocity))
     return Bounds(position, fastest, bounds.torque)
-
-
-class CascadedDrives:
-    """The drives of an arm, as position servos have them: P on position, around PI on velocity,
-    with limited torque.
-
-    They know the arm's inertia, as the controllers of such arms do, or as gears make it the same
-    everywhere; with that of each joint at home the K-1607, which has no gears, swings. Gravity,
-    friction and load are left to the integral, which begins with the torque predicted as brakes are
-    released.
-    """
-
-    def __init__(
-        self, cell: Cell, dynamics: Dynamics, tick_s: float, every: int, rows: Array
-    ) -> None:
-        """Use `rows`, (3, joints): position, rad, and velocity, rad/s, for the end of a cycle, and
-        the torque of the integral, N m."""
-        self._rows = rows
-        self._dynamics = dynamics
-        self._tick_s = tick_s
-        self._every = every
-        self._limit = cell.bounds.torque
-        self._position_gain = POSITION_GAIN if cell.interface == "position" else 0.0
-
-    def start(self, torque: Array, q: Array, qd: Array) -> None:
-        """Begin at `q`, `qd` with what `torque`, (joints,), N m, contains beside acceleration."""
-        change = (self._rows[1] - qd) / (self._every * self._tick_s)
-        self._rows[2] = torque - mat_vec(self._dynamics.terms(q, qd).inertia, change)
-
-    def torque(self, q: Array, qd: Array, waited: int) -> Array:
-        """Return the torques, (joints,), N m, of the tick that begins at `q`, `qd`, `waited` ticks
-        after the set point came."""
-        position, velocity, integral = self._rows
-        now = position + (waited - self._every) * self._tick_s * velocity
-        slip = velocity + self._position_gain * (now - q) - qd
-        pull = VELOCITY_GAIN * mat_vec(self._dynamics.terms(q, qd).inertia, slip)
-        wanted = pull + integral
-        torque = np.asarray(np.clip(wanted, -self._limit, self._limit))
-        # A limit that is reached stops the integral.
-        integral += np.where(torque == wanted, INTEGRAL_GAIN * self._tick_s * pull, 0.0)
-        return torque

@@ -9,18 +9,26 @@ import mujoco
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, mat_vec
 from rack.levels.arm.arm import Arm, JointTarget, Sensed, copied
-from rack.levels.arm.drives import Brake, CoarseSensors, LimitGate, give
-from rack.levels.arm.set_points import CascadedDrives, SetPointGate
+from rack.levels.arm.drives import LimitGate
+from rack.levels.arm.sensors import CoarseSensors, WristSensor
+from rack.levels.arm.set_points import SetPointGate
 from rack.levels.arm.simulation import Simulation
-from rack.levels.arm.wrist import WristSensor
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.robot.engine import one_view
 from rack.levels.robot.model import SET_POINT_ROWS
 from rack.levels.tables import SceneConfig, SensorConfig
+
+STANDSTILL = 0.01
+"""Joint speed, rad/s, below which a joint holds its position."""
+POSITION_GAIN = 25.0
+VELOCITY_GAIN = 100.0
+INTEGRAL_GAIN = 10.0
+"""Gains of a simulated drive, 1/s: speed per position error, acceleration per velocity error, and
+that of the integral. Each loop is at least twice as fast as the one around it, and all are slow
+against ticks of 2.5 ms."""
 
 
 class SimulatedArm(Simulation, Arm):
@@ -43,12 +51,8 @@ class SimulatedArm(Simulation, Arm):
         d = self._data
         joints = len(cell.qpos)
         self.begin(scene, clock_ns)
-        # Memory views: single numbers in a third of the time that arrays take.
-        self._qpos: memoryview[float] = memoryview(d.qpos)
-        self._qvel: memoryview[float] = memoryview(d.qvel)
-        self._ctrl: memoryview[float] = memoryview(d.ctrl)
         self._gripper = cell.gripper
-        dynamics = Dynamics(cell)
+        dynamics = self.dynamics
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
         self._brake = Brake(cell.limits.acceleration, dynamics, cell.begin)
         self._most: Array | None = None  # (joints,), N m: torques of weakened motors
@@ -57,13 +61,9 @@ class SimulatedArm(Simulation, Arm):
         # The newest, oldest first: all that are on their way.
         self._samples: deque[Sensed] = deque(maxlen=self._latency + 1)
         self._wrist = None if cell.wrist is None else WristSensor(cell.wrist, d, seed)
-        # N m: the newest command, the one in force, and its torque as given.
-        self._asked, self._command, self.torque = torques = np.zeros((3, joints))
+        # N m: the command in force, and its torque as given.
+        self._command, self.torque = np.zeros((2, joints))
         self._given = False  # the command for the coming tick has passed the gate
-        memory, (qpos, qvel, ctrl, brakes) = one_view(d.qpos, d.qvel, d.ctrl, d.qfrc_applied)
-        places = np.stack(
-            (qpos + cell.qpos, qvel + cell.dof, ctrl + cell.actuators, brakes + cell.dof)
-        )
         self._drives: CascadedDrives | None = None  # None: they take torques
         if cell.interface != "torque":
             tick_s = clock_ns * 1e-9
@@ -72,8 +72,6 @@ class SimulatedArm(Simulation, Arm):
             span_s = self.patience * tick_s
             self._set_points = SetPointGate(self, cell.bounds, tick_s, span_s, rows[:2])
             self.reports_torque = every == 1
-        self._clear = torques, self.dynamics.newest, *self._gate.clearance, places, memory
-        self._give_clear = give.load()
         if (
             self._wrist is not None
         ):  # until the first step it senses an arm that is braked, not one that falls
@@ -83,7 +81,7 @@ class SimulatedArm(Simulation, Arm):
     @property
     def holds(self) -> bool:
         """Whether the gripper touches a part."""
-        return self._contacts.holds(self._data)
+        return bool(self._contacts.held(self._data).any())
 
     @property
     def leans(self) -> bool:
@@ -103,34 +101,25 @@ class SimulatedArm(Simulation, Arm):
         gripper = self._gripper
         if gripper is None:
             return Sensed(position, velocity, 0.0, 0.0, self.tick)
-        opening = self._qpos[gripper.linkage.driven]
-        return Sensed(position, velocity, opening, self._qvel[gripper.dof], self.tick)
+        opening = float(self._data.qpos[gripper.linkage.driven])
+        speed = float(self._data.qvel[gripper.dof])
+        return Sensed(position, velocity, opening, speed, self.tick)
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and give torques and gripper force for the coming torque cycle; see
         `Link.drive`."""
-        self._asked[:] = torque
-        if self._gripper is not None and math.isfinite(grip_force):
-            self._ctrl[self._gripper.actuator] = self.grip_force = grip_force
-        if self._most is None and self._give_clear(*self._clear):
-            self.waited = 0
-            self.braked = False
-            self._given = True
-            return None
+        self._grip(grip_force)
         finding = self.refused(torque)
         if finding is not None:
             self.brake()
             return finding
-        self.waited = 0
-        self.braked = False
         self._command[:] = torque
-        self._give()
+        self._release()
         return None
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and follow, for the coming cycle; see `Link.follow`."""
-        if self._gripper is not None and math.isfinite(grip_force):
-            self._ctrl[self._gripper.actuator] = self.grip_force = grip_force
+        self._grip(grip_force)
         if (offset := self.cell.encoders.offset) is not None:  # its encoders count from elsewhere
             target = target._replace(position=target.position + offset)
         passed = self._set_points.admit(target, *self._state)
@@ -138,10 +127,18 @@ class SimulatedArm(Simulation, Arm):
             return passed
         if self.braked and self._drives is not None:
             self._drives.start(target.torque, *self._state)
+        self._release()
+        return None
+
+    def _release(self) -> None:
+        """Release the brakes."""
         self.waited = 0
         self.braked = False
         self._give()
-        return None
+
+    def _grip(self, force: float) -> None:
+        if self._gripper is not None and math.isfinite(force):
+            self._data.ctrl[self._gripper.actuator] = self.grip_force = force
 
     def brake(self) -> None:
         """Engage the brakes; the motors give nothing, the gripper keeps its force."""
@@ -185,10 +182,8 @@ class SimulatedArm(Simulation, Arm):
 
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE`."""
-        before = self._saved
         super().save(state)
-        if self.braked or self._saved is not before:
-            state.rest = self._brake.rest
+        state.rest = self._brake.rest
 
     def restore(self, state: Message) -> None:
         """Continue, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
@@ -198,7 +193,8 @@ class SimulatedArm(Simulation, Arm):
         np.copyto(self._brake.rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
-        self.grip_force = 0.0 if self._gripper is None else self._ctrl[self._gripper.actuator]
+        if self._gripper is not None:
+            self.grip_force = float(d.ctrl[self._gripper.actuator])
         # Torques stay; of a set point that came before the last tick, drives make a new one.
         self._given = self._drives is None or self.braked or self.waited == 0
 
@@ -221,3 +217,69 @@ class SimulatedArm(Simulation, Arm):
         given = self.torque if self._most is None else np.clip(self.torque, -self._most, self._most)
         self._data.ctrl[cell.actuators] = given
         self._given = True
+
+
+class Brake:
+    """Stops the joints and holds them where they came to rest, even with the motors off."""
+
+    def __init__(
+        self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0
+    ) -> None:
+        """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of
+        the hold."""
+        self._braking = braking
+        self._dynamics = dynamics
+        self._stiffness = stiffness
+        self.rest: Array = rest.copy()  # (joints,), rad: where the joints came to rest
+
+    def hold_at(self, q: Array) -> None:
+        """Engage at positions `q`, (joints,), rad."""
+        np.copyto(self.rest, q)
+
+    def torque(self, q: Array, qd: Array) -> Array:
+        """Return the torques (joints,), N m, that stop or hold the arm at state `q`, `qd`."""
+        np.copyto(self.rest, q, where=np.abs(qd) > STANDSTILL)
+        wanted = self._stiffness**2 * (self.rest - q) - 2.0 * self._stiffness * qd
+        inertia, bias = self._dynamics.terms(q, qd)
+        return np.asarray(mat_vec(inertia, np.clip(wanted, -self._braking, self._braking)) + bias)
+
+
+class CascadedDrives:
+    """The drives of an arm, as position servos have them: P on position, around PI on velocity,
+    with limited torque.
+
+    They know the arm's inertia, as the controllers of such arms do, or as gears make it the same
+    everywhere; with that of each joint at home the K-1607, which has no gears, swings. Gravity,
+    friction and load are left to the integral, which begins with the torque predicted as brakes are
+    released.
+    """
+
+    def __init__(
+        self, cell: Cell, dynamics: Dynamics, tick_s: float, every: int, rows: Array
+    ) -> None:
+        """Use `rows`, (3, joints): position, rad, and velocity, rad/s, for the end of a cycle, and
+        the torque of the integral, N m."""
+        self._rows = rows
+        self._dynamics = dynamics
+        self._tick_s = tick_s
+        self._every = every
+        self._limit = cell.bounds.torque
+        self._position_gain = POSITION_GAIN if cell.interface == "position" else 0.0
+
+    def start(self, torque: Array, q: Array, qd: Array) -> None:
+        """Begin at `q`, `qd` with what `torque`, (joints,), N m, contains beside acceleration."""
+        change = (self._rows[1] - qd) / (self._every * self._tick_s)
+        self._rows[2] = torque - mat_vec(self._dynamics.terms(q, qd).inertia, change)
+
+    def torque(self, q: Array, qd: Array, waited: int) -> Array:
+        """Return the torques, (joints,), N m, of the tick that begins at `q`, `qd`, `waited` ticks
+        after the set point came."""
+        position, velocity, integral = self._rows
+        now = position + (waited - self._every) * self._tick_s * velocity
+        slip = velocity + self._position_gain * (now - q) - qd
+        pull = VELOCITY_GAIN * mat_vec(self._dynamics.terms(q, qd).inertia, slip)
+        wanted = pull + integral
+        torque = np.asarray(np.clip(wanted, -self._limit, self._limit))
+        # A limit that is reached stops the integral.
+        integral += np.where(torque == wanted, INTEGRAL_GAIN * self._tick_s * pull, 0.0)
+        return torque

@@ -8,20 +8,24 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array, norm
-from rack.levels.arm.monitors import ContactMonitor, LimitMonitor
+from rack.levels.algebra import Array, Mask, norm
 from rack.levels.arm.plant import Plant
 from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
+from rack.levels.robot.cell import Cell, unintended_contacts
+from rack.levels.robot.lookup import geom_name
 from rack.levels.robot.state import restore_state, sleeping
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
 """Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the
 blow."""
+QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
+"""What is judged of a joint, by row of a step."""
 
 
 class Simulation(Plant):
@@ -37,20 +41,17 @@ class Simulation(Plant):
     def begin(self, scene: SceneConfig, clock_ns: int) -> None:
         """Prepare the steps of a tick of `clock_ns`, and what judges them."""
         cell = self.cell
-        d = self._data
-        self._model = sleeping(cell.model, scene) if self.sleeps else cell.model
+        if self.sleeps:
+            self._model = sleeping(cell.model, scene)
         self._clock_ns = clock_ns
-        self._poses = self._poses._replace(model=self._model._address)  # else all would wake
         steps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
-        self._steps = substeps(cell, self._model, d, steps)
+        self._steps = substeps(cell, self._model, self._data, steps)
         self._state = (
             self._steps.seen[-1, 0],
             self._steps.seen[-1, 1],
         )  # (joints,): true positions and velocities
         self._refresh()
-        self._saving = self._steps.model, self._steps.data, self._steps.asleep  # for `copy_state`
-        self._contacts = ContactMonitor(cell)
-        self._limits = LimitMonitor(cell, self._steps)
+        self._contacts = Contacts(cell)
         obstacles = zip(
             cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True
         )
@@ -78,9 +79,10 @@ class Simulation(Plant):
         position[:] = self._data.qpos[self.cell.qpos]
         velocity[:] = self._data.qvel[self.cell.dof]
 
-    def named(self, contact: tuple[int, int]) -> str:
+    def named(self, contact: tuple[int, int] | NDArray[np.int32]) -> str:
         """Return a `contact` in words: the names of the geoms."""
-        return self._contacts.named(contact)
+        first, second = (geom_name(self.cell.model, geom) for geom in contact)
+        return f"'{first}' touches '{second}'"
 
     def look(self, scene: Message) -> None:
         """Fill a `SCENE` with the poses as simulated."""
@@ -89,15 +91,13 @@ class Simulation(Plant):
     def save(self, state: Message) -> None:
         """Fill an `ARM_STATE`."""
         super().save(state)
-        self._copy_state(*self._saving, state.state)
+        steps = self._steps
+        self._copy_state(steps.model, steps.data, steps.asleep, state.state)
 
     def restore(self, state: Message) -> None:
         """Continue, bit for bit, from an `ARM_STATE`."""
         super().restore(state)
         restore_state(self._model, self._data, state.state)
-        self._contacts.count = state.touches
-        self._limits.count = state.violations
-        self._limits.pushed = state.pushed
         self._refresh()
 
     @property
@@ -114,7 +114,7 @@ class Simulation(Plant):
             self._data.mocap_pos[mocap] = motion.position(self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = push_force(pushes, self._now_s)
-        made = self._advance(0, (self.tick + 1) * self._clock_ns * 1e-9, *self._steps)
+        made = self._advance(0, self._after_s, *self._steps)
         if made < 0:
             self._look_closer(-made)
         elif self.struck:
@@ -123,36 +123,71 @@ class Simulation(Plant):
     def _look_closer(self, made: int) -> None:
         """Finish a tick in which step `made` failed a check; on a fault, restore the state before
         the tick."""
-        touches = self._contacts.count
-        self._contacts.struck = self.contact
-        self._contacts.look(self._data)
+        touches = self.touches
+        self._count_contacts()
         while made < len(self._steps.seen):
             made = self._advance(made, self._after_s, *self._steps)
             if made < 0:
                 made = -made
-                self._contacts.look(self._data)
-        if self._contacts.count > touches and self._contacts.struck is not None:
-            self.find(Finding(Alarm.COLLISION, *self._contacts.struck))
+                self._count_contacts()
+        if self.touches > touches and self.contact is not None:
+            self.find(Finding(Alarm.COLLISION, *self.contact))
             self.struck = STRUCK_TICKS
-        violations = self._limits.count
-        broken = self._limits.judge(self._now_s, self.struck > 0)
-        if self._limits.count > violations:
-            self.find(self._limits.finding)
+        is_broken = self._judge_limits()
         if self.struck:
-            self.struck = STRUCK_TICKS if broken else self.struck - 1
+            self.struck = STRUCK_TICKS if is_broken else self.struck - 1
         self.fault = self._broken()
         if self.fault:
             restore_state(self._model, self._data, self._steps.states[0])
             self._refresh()
         self._data.time = self._after_s
-        contacts = self._contacts
-        limits = self._limits
-        self.contact = contacts.struck
-        self.touches = contacts.count
-        self.first_touch = contacts.first
-        self.violations = limits.count
-        self.pushed = limits.pushed
-        self.first_violation = limits.first
+
+    def _count_contacts(self) -> None:
+        """Count the unintended contacts of the last step; keep one of the plant, or of its load."""
+        pairs = unintended_contacts(self._data, self.cell.touch)
+        if not len(pairs):
+            return
+        if not self.first_touch:
+            named = self.named(pairs[0])
+            self.first_touch = f"unintended contact: {named} at {self._data.time:.3f} s"
+        self.touches += len(pairs)
+        ours = pairs[self._contacts.ours(self._data)[pairs].any(axis=1)]
+        if len(ours):
+            self.contact = int(ours[0, 0]), int(ours[0, 1])
+
+    def _judge_limits(self) -> bool:
+        """Judge position, velocity and torque, of motor and brake together, in every step of a
+        tick; return whether one broke a limit.
+
+        It shares no code with the limit gate, which enforces the limits. A blow that still moves
+        the arm breaks those of position and velocity: no drive can prevent it.
+        """
+        seen = self._steps.seen
+        low, high = self._steps.judged[:2]
+        wrong = ~((seen >= low) & (seen <= high))  # NaN is not within limits either
+        is_wrong = steps = wrong.any(axis=(1, 2))
+        if self.struck:
+            pushed = steps & ~wrong[:, 2].any(axis=1) & np.isfinite(seen).all(axis=(1, 2))
+            self.pushed += int(pushed.sum())
+            steps = steps & ~pushed
+        if steps.any():
+            self.violations += int(steps.sum())
+            self._report_violation(wrong, int(steps.argmax()))
+        return bool(is_wrong.any())
+
+    def _report_violation(self, wrong: Mask, step: int) -> None:
+        """Report the first limit that a step broke."""
+        part, joint = (int(at[0]) for at in np.nonzero(wrong[step]))
+        value = float(self._steps.seen[step, part, joint])
+        if not self.first_violation:
+            model = self.cell.model
+            name = model.joint(int(model.dof_jntid[self.cell.dof[joint]])).name
+            what, unit = QUANTITIES[part]
+            where = f"joint '{name}' at {self._now_s:.4f} s, step {step}"
+            low, high = self._steps.judged[:2, part, joint]
+            permitted = f"{low:g} to {high:g} is permitted"
+            self.first_violation = f"{what} {value:.6g} {unit} of {where}; {permitted}"
+        self.find(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
 
     def _broken(self) -> str:
         """Return the fault of the simulation; empty: none."""
@@ -163,6 +198,31 @@ class Simulation(Plant):
         if not (np.isfinite(d.qpos).all() and np.isfinite(d.qvel).all()):
             return f"the simulated state is not finite at {self._now_s:.4f} s"
         return ""
+
+
+class Contacts:
+    """Tells which contacts of a cell are those of the arm, or of its load."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._arm, self._gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
+        self._arm[cell.arm_geoms] = self._gripper[cell.gripper_geoms] = True
+        self._root = cell.model.body_rootid[cell.model.geom_bodyid]
+
+    def ours(self, data: mujoco.MjData) -> Mask:
+        """Mark (ngeom,) the geoms of the arm and of its load."""
+        return np.asarray(self._arm | self.held(data))
+
+    def leans(self, data: mujoco.MjData) -> bool:
+        """Return whether the arm, or its load, touches anything else."""
+        one_sided = self.ours(data)[data.contact.geom].sum(axis=1) == 1
+        return bool((one_sided & (data.contact.dist < 0.0)).any())
+
+    def held(self, data: mujoco.MjData) -> Mask:
+        """Mark (ngeom,) the geoms of free bodies that the gripper touches."""
+        pairs = data.contact.geom
+        others = pairs[self._gripper[pairs].any(axis=1)].ravel()
+        roots = self._root[others[~self._arm[others]]]
+        return np.asarray(np.isin(self._root, roots[roots != 0]))
 
 
 class ObstacleMotion:

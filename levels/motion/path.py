@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rack.levels.algebra import Array, norm
+from rack.levels.algebra import Array, Ints, norm
 from rack.levels.compiled import compiled_for
 
 COINCIDENT_RAD = 1e-7
@@ -78,12 +76,30 @@ class BlendedPath:
         self.waypoints = points  # (k, joints), rad, without coincident ones
         self.blend = radii  # (k,), rad
         self.joints = points.shape[1]
-        self._directions = steps / lengths[:, None]
+        # From each waypoint to the next one, and what a corner changes of it.
+        directions = np.vstack((steps / lengths[:, None], np.zeros_like(points[:1])))
+        self._changes = np.zeros_like(points)
+        self._changes[1:-1] = np.diff(directions[:-1], axis=0)
         self._corners = np.concatenate(([0.0], np.cumsum(lengths)))
         self.length = float(self._corners[-1])  # rad
-        self._lay_pieces()
-        self._marks, self._table = self._tabulate()
+        self.stops: list[float] = []  # s of the corners where motion must come to rest, rad
+        pieces, breaks = self._lay_pieces()
+        self.breaks = np.array(breaks)  # (pieces + 1,), rad: s where each piece begins, and the end
+        at = np.array([at for at, _ in pieces])
+        before = np.array([at - (b > 0.0) for at, b in pieces])
+        blends = np.array([[b] for _, b in pieces])
+        changes = np.where(blends > 0.0, self._changes[at], 0.0)
+        # The rows of `set_point`.
+        self._marks = np.hstack((self.breaks[:-1, None], self._corners[at, None], blends))
+        self._table = np.stack((points[at], directions[before], changes), axis=1)
         self._point = np.zeros((3, self.joints))
+        changes = np.abs(changes)
+        widths = [b or math.inf for _, b in pieces]
+        self.bounds = PathBounds(
+            np.maximum(np.abs(directions[before]), np.abs(directions[at])),
+            0.75 * changes / np.array([[b] for b in widths]),
+            1.5 * changes / np.array([[b**2] for b in widths]),
+        )
 
     def evaluate(self, s: float) -> PathPoint:
         """Return the point at `s`, clamped to the path. The next call overwrites its arrays."""
@@ -91,10 +107,11 @@ class BlendedPath:
         # Not kept: in a path that comes from a checkpoint they would be copies.
         return PathPoint(*self._point)
 
-    def piece_at(self, s: float) -> int:
-        """Return the index of the piece that contains `s`; at a break, of the piece that begins
+    def pieces_at(self, s: ArrayLike) -> Ints:
+        """Return the indices of the pieces that contain `s`; at a break, of the piece that begins
         there."""
-        return min(max(bisect_right(self._breaks, s) - 1, 0), len(self._pieces) - 1)
+        found = np.searchsorted(self.breaks, s, side="right") - 1
+        return np.clip(found, 0, len(self.breaks) - 2)
 
     def sample(self, step_rad: float) -> Array:
         """Return points along the path, both ends included, at most `step_rad` of s apart; (n,
@@ -102,65 +119,23 @@ class BlendedPath:
         count = max(int(np.ceil(self.length / step_rad)), 1) + 1 if self.length > 0.0 else 1
         return points_at.load()(self._marks, self._table, np.linspace(0.0, self.length, count))
 
-    def _lay_pieces(self) -> None:
-        """Cut the path into lines (line, -1) and corners (line before, corner)."""
+    def _lay_pieces(self) -> tuple[list[tuple[int, float]], list[float]]:
+        """Cut the path into lines and corners: return the waypoint of each, with its blend, rad,
+        or 0 for the line that begins there; and their breaks."""
         last = len(self.waypoints) - 1
-        self._starts: list[float] = self._corners.tolist()
-        self._radii: list[float] = self.blend.tolist()
-        self._changes = np.zeros_like(self.waypoints)
-        self._changes[1:last] = np.diff(self._directions, axis=0)
-        self.stops: list[float] = []  # s of the corners where motion must come to rest, rad
-        self._pieces: list[tuple[int, int]] = []
-        self._breaks: list[float] = [0.0]
-        for line in range(last):
-            corner = line + 1
-            b = self._radii[line + 1]
-            self._add_piece((line, -1), self._starts[corner] - b)
-            if b > 0.0:
-                self._add_piece((line, corner), self._starts[corner] + b)
-            elif corner < last and norm(self._changes[corner]) > MAX_STRAIGHT_BEND:
-                self.stops.append(self._starts[corner])
-        if not self._pieces:
-            self._pieces = [(-1, -1)]
-            self._breaks = [0.0, self.length]
-        self.breaks = np.array(
-            self._breaks
-        )  # (pieces + 1,), rad: s where each piece begins, and the end
-
-    def _add_piece(self, piece: tuple[int, int], end: float) -> None:
-        """Append a piece up to `end`, unless adjacent blends leave no line between them."""
-        if end - self._breaks[-1] > COINCIDENT_RAD:
-            self._pieces.append(piece)
-            self._breaks.append(end)
-
-    def _tabulate(self) -> tuple[Array, Array]:
-        """Return the pieces in the rows of `set_point`."""
-        marks = np.zeros((len(self._pieces), 3))
-        table = np.zeros((len(self._pieces), 3, self.joints))
-        for k, (line, corner) in enumerate(self._pieces):
-            at = max(line if corner < 0 else corner, 0)
-            marks[k] = self._breaks[k], self._starts[at], self._radii[at] if corner >= 0 else 0.0
-            table[k, 0] = self.waypoints[at]
-            if line >= 0:
-                table[k, 1] = self._directions[line]
-            if corner >= 0:
-                table[k, 2] = self._changes[corner]
-        return marks, table
-
-    @cached_property
-    def bounds(self) -> PathBounds:
-        """Bounds of every piece; many a path is only sampled."""
-        first, second, third = (np.zeros((len(self._pieces), self.joints)) for _ in range(3))
-        for k, (line, corner) in enumerate(self._pieces):
-            if corner >= 0:
-                b = self._radii[corner]
-                change = np.abs(self._changes[corner])
-                first[k] = np.abs(self._directions[corner - 1 : corner + 1]).max(axis=0)
-                second[k] = 0.75 * change / b
-                third[k] = 1.5 * change / b**2
-            elif line >= 0:
-                first[k] = np.abs(self._directions[line])
-        return PathBounds(first, second, third)
+        starts: list[float] = self._corners.tolist()
+        pieces: list[tuple[int, float]] = []
+        breaks = [0.0]
+        for corner, b in enumerate(self.blend.tolist()[1:], start=1):
+            start = starts[corner]
+            # Adjacent blends leave no line between them.
+            for piece, end in (((corner - 1, 0.0), start - b), ((corner, b), start + b)):
+                if end - breaks[-1] > COINCIDENT_RAD:
+                    pieces.append(piece)
+                    breaks.append(end)
+            if b == 0.0 and corner < last and norm(self._changes[corner]) > MAX_STRAIGHT_BEND:
+                self.stops.append(start)
+        return (pieces, breaks) if pieces else ([(0, 0.0)], [0.0, self.length])
 
 
 @compiled_for("f8[:,::1], f8[:,:,::1], f8, f8[:,::1]")

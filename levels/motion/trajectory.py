@@ -4,7 +4,6 @@ ramps to rest."""
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -61,16 +60,15 @@ class Trajectory:
             sections  # (n, 5), n >= 1: start in s; s, ds, dds and jerk of the path parameter there
         )
         self.duration = duration  # s
-        self._starts: list[float] = sections[:, 0].tolist()
-        self._rows: list[list[float]] = sections[:, 1:].tolist()
-        self.begin = self._rows[0][0]  # path parameter at the start, rad
+        self.begin = float(sections[0, 1])  # path parameter at the start, rad
         self.end = self.at(duration).s  # path parameter at the end, rad
 
     def at(self, time_s: float) -> PathState:
         """Return the state `time_s` after the start."""
         time_s = min(max(time_s, 0.0), self.duration)
-        k = max(bisect_right(self._starts, time_s) - 1, 0)
-        return PathState(*_moved(time_s - self._starts[k], *self._rows[k]))
+        k = int(np.searchsorted(self.sections[:, 0], time_s, side="right")) - 1
+        start, *state = self.sections[max(k, 0)].tolist()
+        return PathState(*_moved(time_s - start, *state))
 
     def states(self, times_s: Array) -> tuple[Array, Array, Array]:
         """Return s, ds and dds at `times_s` (n,), within the duration; (n,) each."""
@@ -104,7 +102,7 @@ def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Tr
     rows: list[Section] = []
     for start, end in pairwise(marks):
         if end - start > COINCIDENT_RAD:
-            rows += _fastest(_Run(path, start, end), limits)
+            rows += _fastest(path, start, end, limits)
     return _joined(rows, marks[0])
 
 
@@ -117,7 +115,7 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
     """
     if state.ds < MAX_REST_RAD_S:
         return _joined([], state.s)
-    most, jerk = acceleration_room(path.bounds.first[path.piece_at(state.s)], limits)
+    most, jerk = acceleration_room(path.bounds.first[path.pieces_at(state.s)], limits)
     # After a stop the path continues in another direction: the motion must rest there.
     end = (
         next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
@@ -129,44 +127,30 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
     return None
 
 
-class _Run:
-    """A stretch of a path between two points of rest, and the bounds of its pieces."""
-
-    def __init__(self, path: BlendedPath, start: float, end: float) -> None:
-        first = path.piece_at(start)
-        last = path.piece_at(end - COINCIDENT_RAD)
-        inner = path.breaks[first + 1 : last + 1]
-        self.marks = [start, *inner.tolist(), end]
-        self.bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
-        corners = int(self.bounds.second.any(axis=1).sum())
-        self.shares = SHARES if corners else SHARES[:1]
-        self.most_sections = SECTIONS_A_LINE * (1 + corners)
-
-    def ways(self) -> list[tuple[list[float], PathBounds]]:
-        """Return marks and bounds: limits for each piece, and one set for all, which suits many
-        small corners."""
-        alone = (self.marks, self.bounds)
-        together = PathBounds(*(bound.max(axis=0, keepdims=True) for bound in self.bounds))
-        return (
-            [alone, ([self.marks[0], self.marks[-1]], together)] if len(self.marks) > 2 else [alone]
+def _fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> list[Section]:
+    """Return the fastest of a few candidates, between two points of rest of a path, that fit into a
+    message."""
+    first, last = path.pieces_at((start, end - COINCIDENT_RAD))
+    bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
+    corners = int(bounds.second.any(axis=1).sum())
+    ways = [([start, *path.breaks[first + 1 : last + 1].tolist(), end], bounds)]
+    if last > first:  # one set of limits for all pieces suits many small corners
+        ways.append(
+            ([start, end], PathBounds(*(bound.max(axis=0, keepdims=True) for bound in bounds)))
         )
-
-
-def _fastest(run: _Run, limits: Limits) -> list[Section]:
-    """Return the fastest of a few candidates that fit into a message."""
     best: list[Section] = []
     least = np.inf
-    for share in run.shares:
-        for marks, bounds in run.ways():
+    for share in SHARES if corners else SHARES[:1]:
+        for marks, pieces in ways:
             stretches = [
                 speed_limits(PathBounds(*piece), limits, share)
-                for piece in zip(*bounds, strict=True)
+                for piece in zip(*pieces, strict=True)
             ]
             rows = list(_sections(marks, stretches))
             time_s = math.fsum(
                 row[0] for row in rows
             )  # exact: `sum` rounds otherwise from Python 3.12 on
-            if time_s < least and len(rows) <= run.most_sections:
+            if time_s < least and len(rows) <= SECTIONS_A_LINE * (1 + corners):
                 best = rows
                 least = time_s
     return best
@@ -269,8 +253,7 @@ def _checked_times(stop: Trajectory) -> Array:
 
 def _bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
     """Return the bounds of the path's derivatives between consecutive `s`; (n - 1, joints) each."""
-    last = len(path.breaks) - 2
-    piece = np.clip(np.searchsorted(path.breaks, s, side="right") - 1, 0, last)
+    piece = path.pieces_at(s)
     low = piece[:-1]
     high = piece[1:]
     bounds = [bound[low] for bound in path.bounds]

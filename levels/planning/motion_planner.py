@@ -82,7 +82,14 @@ class MotionPlanner:
             path = self._line(move, start, goal)
         else:
             goal = self.goal(move, start) if goal is None else goal
-            path = self._path_to(move, start, goal, attempt=attempt, searches=searches)
+            clearance = self._clearance_at(start)
+            first_blocked = self._with(clearance)
+            found = self.paths.plan(start, goal, first_blocked, attempt=attempt, searches=searches)
+            if found is None:
+                place = in_metres(self.ik.tool_at(goal))
+                why = self._why_no_path(start, goal, clearance)
+                raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {place}: {why}")
+            path = found
         if situation.held is not None and situation.grip is not None:
             along = BlendedPath(*path).sample(LOAD_STEP_RAD)
             self.payloads.check_motors(situation.held, situation.grip, along)
@@ -122,21 +129,6 @@ class MotionPlanner:
 
     def _with(self, clearance: float) -> FirstBlocked:
         return partial(self.checker.first_blocked, clearance=clearance)
-
-    def _path_to(
-        self, move: Move, start: Array, goal: Array, *, attempt: int, searches: int
-    ) -> Path:
-        clearance = self._clearance_at(start)
-        path = self.paths.plan(
-            start, goal, self._with(clearance), attempt=attempt, searches=searches
-        )
-        if path is None:
-            why = self._why_no_path(start, goal, clearance)
-            raise Refused(
-                Error.NO_PATH,
-                f"{VERB_NAMES[move.verb]} to {in_metres(self.ik.tool_at(goal))}: {why}",
-            )
-        return path
 
     def _why_no_path(self, start: Array, goal: Array, clearance: float) -> str:
         """Return why a free motion has no path: start or goal is blocked, or the obstacle on the
@@ -193,26 +185,17 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
     """
     begin = ik.tool_at(start)
     for lines in LINES:
-        points = _points_on(ik, [start], (begin, target), lines)
-        if points is not None:
-            path = _smooth(points)
+        points = [start]
+        for k in range(1, lines + 1):
+            q = ik.nearby(begin.towards(target, k / lines), points[-1])
+            if q is None:
+                break
+            points.append(q)
+        else:
+            path = _smooth(np.array(points))
             if _stray(ik, path, begin, target) < MAX_STRAY_M:
                 return path
     return None
-
-
-def _points_on(
-    ik: InverseKinematics, points: list[Array], way: tuple[Pose, Pose], lines: int
-) -> Array | None:
-    """Return `points` continued along `way` on one branch, (lines + 1, joints), rad; None: it
-    leaves the branch."""
-    begin, target = way
-    for k in range(1, lines + 1):
-        q = ik.nearby(begin.towards(target, k / lines), points[-1])
-        if q is None:
-            return None
-        points.append(q)
-    return np.array(points)
 
 
 def _smooth(points: Array) -> Path:

@@ -62,13 +62,12 @@ class PathPlanner:
     def __init__(self, cell: Cell, clearance: float, seed: int) -> None:
         self._limits = cell.limits
         self._seed = seed
-        levers = np.maximum(lever_arms(cell, seed), MIN_LEVER_M)
+        self._levers = np.maximum(lever_arms(cell, seed), MIN_LEVER_M)
         # sum |lever_j dq_j| <= |lever| |dq|: a step of this length moves no point farther than
         # intended.
-        self.step_rad = STEP_PART * clearance / norm(levers)
-        low, high = cell.limits.position.T
-        resolution = STEP_PART * clearance / float(np.sqrt(len(levers)))
-        self._search = SampledSearch(low, high, levers, resolution)
+        self.step_rad = STEP_PART * clearance / norm(self._levers)
+        # Of scaled length between two checks.
+        self._resolution = STEP_PART * clearance / float(np.sqrt(len(self._levers)))
 
     def plan(
         self,
@@ -121,7 +120,7 @@ class PathPlanner:
         left = MAX_CHECKS
         for k in range(MAX_SEARCHES):
             seed = 1 + (self._seed + attempt * MAX_SEARCHES + k) % MAX_SEED
-            polyline, checks = self._search.search(ends, first_blocked, seed, left)
+            polyline, checks = self._search(ends, first_blocked, seed, left)
             left -= checks
             if polyline is not None and len(polyline) <= WAYPOINTS:
                 paths.append(self.rounded(polyline, first_blocked))
@@ -141,22 +140,11 @@ class PathPlanner:
                 return b
         return 0.0
 
-
-class SampledSearch:
-    """Searches joint space scaled by `weights` (joints,) for polylines checked every `resolution`
-    of scaled length."""
-
-    def __init__(self, low: Array, high: Array, weights: Array, resolution: float) -> None:
-        self._low = low
-        self._high = high
-        self._weights = weights
-        self._resolution = resolution
-
-    def search(
+    def _search(
         self, ends: Array, first_blocked: FirstBlocked, seed: int, budget: int
     ) -> tuple[Array | None, int]:
-        """Return a free polyline (k, joints), rad, between `ends` (2, joints), or None, and the
-        number of configurations checked.
+        """Search joint space, scaled by the levers, between `ends` (2, joints), rad; return a free
+        polyline (k, joints), or None, and the number of configurations checked.
 
         `budget` bounds the checks of the search; the short cuts add a few.
         """
@@ -165,7 +153,7 @@ class SampledSearch:
 
         def free(scaled: Array) -> bool:
             nonlocal count
-            found = first_blocked(scaled / self._weights)
+            found = first_blocked(scaled / self._levers)
             count += min(found + 1, len(scaled))
             return found == len(scaled)
 
@@ -180,7 +168,7 @@ class SampledSearch:
         if not problem.hasExactSolution():
             return None, count
         path = _simplified(information, problem.getSolutionPath())
-        polyline = self._values(*path.getStates()) / self._weights
+        polyline = self._values(*path.getStates()) / self._levers
         # Scaling there and back rounds: restore the exact ends.
         polyline[[0, -1]] = ends
         return polyline, count
@@ -188,14 +176,15 @@ class SampledSearch:
     def _space(self, ends: Array, free: Free) -> base.SpaceInformation:
         least = ends.min(axis=0)
         most = ends.max(axis=0)
-        low = np.where(np.isfinite(self._low), self._low, least - ENDLESS_RAD)
-        high = np.where(np.isfinite(self._high), self._high, most + ENDLESS_RAD)
+        low, high = self._limits.position.T
+        low = np.where(np.isfinite(low), low, least - ENDLESS_RAD)
+        high = np.where(np.isfinite(high), high, most + ENDLESS_RAD)
         space = base.RealVectorStateSpace(len(least))
         bounds = base.RealVectorBounds(len(least))
         # The arm may rest slightly beyond a limit: the start counts as inside.
-        for j, value in enumerate(np.minimum(low, least) * self._weights - BOUND_ROUNDING):
+        for j, value in enumerate(np.minimum(low, least) * self._levers - BOUND_ROUNDING):
             bounds.setLow(j, value)
-        for j, value in enumerate(np.maximum(high, most) * self._weights + BOUND_ROUNDING):
+        for j, value in enumerate(np.maximum(high, most) * self._levers + BOUND_ROUNDING):
             bounds.setHigh(j, value)
         space.setBounds(bounds)
         information = base.SpaceInformation(space)
@@ -207,13 +196,13 @@ class SampledSearch:
 
     def _state(self, information: base.SpaceInformation, q: Array) -> base.State:
         state = information.allocState()
-        for j, value in enumerate(q * self._weights):
+        for j, value in enumerate(q * self._levers):
             state[j] = value
         return state
 
     def _values(self, *states: base.State) -> Array:
         """Return the scaled values of states, (states, joints)."""
-        joints = range(len(self._weights))
+        joints = range(len(self._levers))
         return np.array([[state[j] for j in joints] for state in states])
 
 

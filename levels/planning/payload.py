@@ -9,6 +9,7 @@ unknown and only the motors are checked.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -58,7 +59,8 @@ class Payloads:
     def check_grip(self, row: int, grip: Pose) -> None:
         """Raise `Refused` with both forces if friction does not hold object `row` at `grip` in the
         tool's frame."""
-        needed = MIN_GRIP_FACTOR * self._mass(row) * self._gravity
+        gravity = float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
+        needed = MIN_GRIP_FACTOR * self._mass(row) * gravity
         holds = self._holding_force(row, grip)
         if holds is not None and holds < needed:
             why = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
@@ -81,10 +83,6 @@ class Payloads:
                 )
                 raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {why}")
 
-    @property
-    def _gravity(self) -> float:
-        return float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
-
     def _mass(self, row: int) -> float:
         return float(self._cell.model.body_subtreemass[self._cell.bodies[row]])
 
@@ -93,11 +91,11 @@ class Payloads:
 
     def _holding_force(self, row: int, grip: Pose) -> float | None:
         """Return the friction, N, that can carry object `row`; None: unknown."""
-        surfaces = self._surfaces(row, grip)
-        wide, narrow = (
-            self._around(surfaces[0] + surfaces[1]) if surfaces is not None else (None, None)
-        )
-        if surfaces is None or wide is None or narrow is None or wide.gap <= narrow.gap:
+        width = self._width(row, grip)
+        # The last jaws that are wider, and the first that are not.
+        around = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
+        wide, narrow = next(around, (None, None))
+        if wide is None or narrow is None:
             return None
         model = self._cell.model
         gripper = self._cell.gripper
@@ -110,16 +108,8 @@ class Payloads:
             max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms
         )
 
-    def _around(self, width: float) -> tuple[Jaws | None, Jaws | None]:
-        """Return the last jaws wider than `width`, m, and the first that are not; None: there are
-        no such jaws."""
-        for wide, narrow in zip(self.jaws, self.jaws[1:], strict=False):
-            if wide.gap > width >= narrow.gap:
-                return wide, narrow
-        return None, None
-
-    def _surfaces(self, row: int, grip: Pose) -> tuple[float, float] | None:
-        """Return how far the object reaches from the tool to either side, m; None: the line misses
+    def _width(self, row: int, grip: Pose) -> float:
+        """Return the width of the object on the line through the tool, m; -inf: the line misses
         it."""
         cell = self._cell
         data = self._data
@@ -127,11 +117,10 @@ class Payloads:
         tool = pose(*site_pose(data, cell.tool))
         data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
-        found = []
-        for side in SIDES:
-            distance, _ = self._nearest(self._objects[row], RAY_RANGE_M * side, -side)
-            found.append(RAY_RANGE_M - distance)
-        return (found[0], found[1]) if all(np.isfinite(found)) else None
+        parts = self._objects[row]
+        return sum(
+            RAY_RANGE_M - self._nearest(parts, RAY_RANGE_M * side, -side)[0] for side in SIDES
+        )
 
     def _closing(self) -> list[Jaws]:
         """Return the jaws from open to closed, while there is a gap and a finger on either side."""

@@ -178,6 +178,10 @@ def index(
     supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     bounds = joint_bounds(model, joints, robot, hand.torque if hand is not None else torque)
     wrist = find_wrist(model, robot.wrist, moved)
+    touch = unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports)
+    if wrist is not None:  # contacts of a support and what hangs on the sensor are measured
+        pressed = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
+        touch[np.ix_(pressed, supports)] = touch[np.ix_(supports, pressed)] = False
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = robot.home
     data.qvel[model.jnt_dofadr[joints]] = robot.velocity
@@ -199,8 +203,7 @@ def index(
         object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
         mocap=lookup.mocap_ids(model, obstacles),
         supports=supports,
-        touch=unintended_pairs(model, arm_geoms, gripper_geoms, object_geoms, supports)
-        & ~pressed_pairs(model, wrist, supports),
+        touch=touch,
         bounds=bounds,
         limits=planned_limits(bounds, robot),
         encoders=Encoders.of(robot, robot.substeps * model.opt.timestep),
@@ -221,8 +224,8 @@ def unintended_pairs(
     """Return (ngeom, ngeom), True where a contact of two geoms is unintended.
 
     Intended are an object on a support, an object in the gripper, the parts of one object and the
-    fingers on each other; and, see `pressed_pairs`, a tool on a support. Every other contact of arm
-    or object is unintended; the rest of the cell is ignored.
+    fingers on each other. Every other contact of arm or object is unintended; the rest of the cell
+    is ignored.
     """
     touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     ours = np.union1d(arm, objects)
@@ -232,16 +235,6 @@ def unintended_pairs(
     root = model.body_rootid[model.geom_bodyid]
     touch[np.ix_(objects, objects)] &= root[objects][:, None] != root[objects][None, :]
     return touch
-
-
-def pressed_pairs(model: mujoco.MjModel, wrist: Wrist | None, supports: Ints) -> Mask:
-    """Return (ngeom, ngeom), True for a support and what hangs on the wrist sensor: their contact
-    is measured."""
-    pressed = np.zeros((model.ngeom, model.ngeom), dtype=bool)
-    if wrist is not None:
-        tool = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
-        pressed[np.ix_(tool, supports)] = pressed[np.ix_(supports, tool)] = True
-    return pressed
 
 
 def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -> NDArray[np.int32]:

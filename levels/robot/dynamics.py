@@ -115,16 +115,6 @@ class Dynamics:
         """Return dry friction, N m, that opposes motion at `velocity`, rad/s, (joints,)."""
         return np.asarray(self.dry * each(math.tanh, velocity / FRICTION_SPEED))
 
-    def pose(self, q: Array) -> tuple[Array, Array]:
-        """Return position (3,), m, and rotation (3, 3) of the tool at `q`. The arrays are valid
-        until the next call."""
-        m = self._model
-        d = self._data
-        self.newest[:STATE_ROWS] = np.nan
-        d.qpos[self._cell.qpos] = q
-        mujoco.mj_kinematics(m, d)
-        return d.site_xpos[self._cell.tool], d.site_xmat[self._cell.tool].reshape(3, 3)
-
 
 def addresses(
     model: mujoco.MjModel, data: mujoco.MjData, cell: Cell

@@ -160,11 +160,7 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
                 f"robot.hand.finger: joint '{finger.joints[-1]}' does not move the tip"
                 f" '{finger.tip}'"
             )
-    for row, found in zip(ROWS, actuators, strict=True):
-        for actuator in map(int, found):
-            why = _no_tension(model, actuator, hand.least)
-            if why:
-                raise RobotError(f"robot.hand.{row}: '{model.actuator(actuator).name}' {why}")
+    check_tensions(model, actuators, hand.least)
     most = model.actuator_ctrlrange[actuators, 1]
     for joint, (first, second) in zip(robot.joints, most.T, strict=True):
         if first != second:
@@ -195,33 +191,26 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
     )
 
 
-def _no_tension(model: mujoco.MjModel, actuator: int, least: float) -> str:
-    """Return why the control of an actuator is not the tension of a tendon that only pulls; empty:
-    it is."""
-    low, high = model.actuator_ctrlrange[actuator]
-    gain = (
-        model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED,
-        model.actuator_gainprm[actuator, 0],
+def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None:
+    """Raise `RobotError` for an actuator whose control is not the tension, N, of a tendon that only
+    pulls, by more than `least`."""
+    low, high = np.moveaxis(model.actuator_ctrlrange[actuators], -1, 0)
+    pulls = (
+        (model.actuator_trntype[actuators] == mujoco.mjtTrn.mjTRN_TENDON)
+        & (model.actuator_gaintype[actuators] == mujoco.mjtGain.mjGAIN_FIXED)
+        & (model.actuator_gainprm[actuators, 0] == 1.0)
+        & (model.actuator_biastype[actuators] == mujoco.mjtBias.mjBIAS_NONE)
+        & (model.actuator_gear[actuators, 0] == -1.0)
+        & (model.actuator_ctrllimited[actuators] != 0)
+        & (low >= 0.0)
+        & (high > least)
     )
-    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_TENDON:
-        return "drives no tendon"
-    if gain != (True, 1.0) or model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_NONE:
-        return "must have its tension as its control: a fixed gain of 1, and no bias"
-    if model.actuator_gear[actuator, 0] != -1.0:
-        return (
-            f"cannot pull: its gear is {model.actuator_gear[actuator, 0]:g}; -1, which shortens the"
-            " tendon, is valid"
+    for actuator in actuators[~pulls]:
+        raise RobotError(
+            f"robot.hand: actuator '{model.actuator(int(actuator)).name}' must pull a tendon, and"
+            " nothing else, by its control, N: valid are a fixed gain of 1, no bias, a gear of -1,"
+            f" and a range from 0 or more to above robot.hand.least = {least:g} N"
         )
-    if not model.actuator_ctrllimited[actuator]:
-        return "pushes as well: its control has no range; one from 0 or more is valid"
-    if low < 0.0:
-        return f"pushes as well: its control is {low:g} to {high:g} N; from 0 or more is valid"
-    if not high > least:
-        return (
-            f"cannot pull: its largest tension is {high:g} N; above robot.hand.least = {least:g} N"
-            " is valid"
-        )
-    return ""
 
 
 def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
@@ -233,49 +222,26 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
         np.array(robot.home),
         *np.where(limited, model.jnt_range[joints], np.array(robot.home)[:, None]).T,
     )
-    at = [
-        actuator_moments(model, joints, place)[actuators] for place in places
-    ]  # each (2, joints, joints), m
-    arms = np.zeros(len(joints))
+    moments = np.array([actuator_moments(model, joints, place)[actuators] for place in places])
+    # (places, 2, joints), m: of flexors, and of extensors, which turn joints back.
+    own = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])
     for number, joint in enumerate(robot.joints):
-        for row, sign in enumerate((1.0, -1.0)):
-            name = model.actuator(int(actuators[row, number])).name
-            own = [moments[row, number] for moments in at]
-            arm = float(own[0][number])
-            why = _no_arm(robot, joint, own, sign)
-            if why:
-                raise RobotError(f"robot.hand.{ROWS[row]}: '{name}' {why}")
-            if row and abs(sign * arm - arms[number]) > SAME_ARM * arms[number]:
+        least = float(own[:, :, number].min()) + 0.0  # no -0
+        most = float(own[:, :, number].max())
+        if least < SAME_ARM or most - least > SAME_ARM * most:
+            raise RobotError(
+                f"robot.hand: arms of the tendons on joint '{joint}' are {least:g} to {most:g} m;"
+                " valid is one positive arm, which does not vary, of a flexor that turns it in"
+                " positive direction and of an extensor that turns it back"
+            )
+        turned = np.abs(moments[:, :, number]).max(axis=(0, 1)) > SAME_ARM * least
+        for other in np.flatnonzero(turned):
+            if other != number:
                 raise RobotError(
-                    f"robot.hand: arms on joint '{joint}' are {arms[number]:g} and {-arm:g} m;"
-                    " equal ones are valid"
+                    f"robot.hand: a tendon of joint '{joint}' turns joint '{robot.joints[other]}',"
+                    " too"
                 )
-            arms[number] = sign * arm
-    return arms
-
-
-def _no_arm(robot: RobotConfig, joint: str, own: list[Array], sign: float) -> str:
-    """Return why a tendon does not suit its joint, by its moments (joints,) at several positions;
-    empty: it does."""
-    number = robot.joints.index(joint)
-    arm = float(own[0][number])
-    if abs(arm) < SAME_ARM:
-        return f"has no moment arm on joint '{joint}'"
-    for other in np.flatnonzero(np.abs(own).max(axis=0) > SAME_ARM * abs(arm)):
-        if other != number:
-            return f"turns joint '{robot.joints[other]}' in addition to '{joint}'"
-    if arm * sign < 0.0:
-        return (
-            f"turns joint '{joint}' the wrong way: flexors turn it in positive direction, extensors"
-            " back"
-        )
-    spread = [float(moments[number]) for moments in own]
-    if max(spread) - min(spread) > SAME_ARM * abs(arm):
-        return (
-            f"has an arm of {min(spread):g} to {max(spread):g} m on joint '{joint}'; one that does"
-            " not vary is valid"
-        )
-    return ""
+    return np.array(own[0, 1])
 
 
 def actuator_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:

@@ -64,7 +64,6 @@ class Limits:
     velocity: Array  # (joints,), rad/s, both ways
     acceleration: Array  # (joints,), rad/s2, both ways
     jerk: Array  # (joints,), rad/s3, both ways
-    torque: Array  # (joints,), N m, both ways
 
 
 @dataclass(frozen=True)
@@ -177,5 +176,4 @@ def planned_limits(bounds: Bounds, robot: RobotConfig) -> Limits:
         velocity=bounds.velocity * (1.0 - VELOCITY_ROOM),
         acceleration=np.array(robot.acceleration),
         jerk=np.array(robot.jerk),
-        torque=bounds.torque,
     )

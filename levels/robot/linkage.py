@@ -238,11 +238,7 @@ class _Solver:
         """Return the rows of tendons that are springs, (tendons,) and (tendons, joints), their
         stiffness a part of `most`."""
         model = self._model
-        jacobian = np.zeros((len(self._tendons), model.nv))
-        for row, tendon in zip(jacobian, self._tendons, strict=True):
-            begin = model.ten_J_rowadr[tendon]
-            span = slice(begin, begin + model.ten_J_rownnz[tendon])
-            row[model.ten_J_colind[span]] = self._data.ten_J[span]
+        jacobian = tendon_jacobian(model, self._data)[self._tendons]
         parts = np.sqrt(model.tendon_stiffness[self._tendons] / most)
         length = self._data.ten_length[self._tendons]
         slack = np.clip(length, *model.tendon_lengthspring[self._tendons].T)
@@ -326,7 +322,14 @@ def tendon_joints(model: mujoco.MjModel, tendon: int) -> set[int]:
     """Return the joints that change a tendon's length."""
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    first = model.ten_J_rowadr[tendon]
-    span = slice(first, first + model.ten_J_rownnz[tendon])
-    moving = model.ten_J_colind[span][np.abs(data.ten_J[span]) > ROUNDING]
+    moving = np.abs(tendon_jacobian(model, data)[tendon]) > ROUNDING
     return set(model.dof_jntid[moving].tolist())
+
+
+def tendon_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+    """Return the Jacobian of all tendons, (tendons, nv)."""
+    jacobian = np.zeros((model.ntendon, model.nv))
+    mujoco.mju_sparse2dense(
+        jacobian, data.ten_J, model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind
+    )
+    return jacobian

@@ -20,13 +20,8 @@ from rack.levels.robot.model import (
 )
 from rack.levels.tables import RobotConfig, SceneConfig
 
-NOUNS = {
-    mujoco.mjtObj.mjOBJ_SITE: "site",
-    mujoco.mjtObj.mjOBJ_BODY: "body",
-    mujoco.mjtObj.mjOBJ_GEOM: "geom",
-    mujoco.mjtObj.mjOBJ_JOINT: "joint",
-    mujoco.mjtObj.mjOBJ_ACTUATOR: "actuator",
-}
+COUNTS = {"site": "nsite", "body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu"}
+"""Attributes of a model with the numbers of its elements, by kind."""
 
 
 def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> int:
@@ -34,17 +29,12 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
     found = mujoco.mj_name2id(model, kind, name)
     if found >= 0:
         return int(found)
-    counts = {
-        "site": model.nsite,
-        "body": model.nbody,
-        "geom": model.ngeom,
-        "joint": model.njnt,
-        "actuator": model.nu,
-    }
-    have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(counts[NOUNS[kind]])])
+    noun = kind.name.removeprefix("mjOBJ_").lower()
+    count = getattr(model, COUNTS[noun])
+    have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
     if place == "robot.tool":  # a body serves as well
         have += "; bodies: " + listed([model.body(k).name for k in range(model.nbody)])
-    raise RobotError(f"{place}: no {NOUNS[kind]} '{name}' in the model; it has: {have}")
+    raise RobotError(f"{place}: no {noun} '{name}' in the model; it has: {have}")
 
 
 def find_all(

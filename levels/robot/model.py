@@ -153,7 +153,12 @@ def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Arra
             f"joints {listed(sorted(shared))} share one actuator, but those of an arm are driven"
             " independently; give each its own"
         )
-    limits = np.array(robot.torque or [torque_limit(spec, name, drives) for name in robot.joints])
+    limits = robot.torque or tuple(stated_torque(spec, name, drives) for name in robot.joints)
+    if 0.0 in limits:
+        raise RobotError(
+            f"joint '{robot.joints[limits.index(0.0)]}': the model gives no torque limit; give"
+            " robot.torque, N m, one value a joint"
+        )
     remove(spec, drives)
     names = [f"torque of {joint}" for joint in robot.joints]
     for name, joint, limit in zip(names, robot.joints, limits, strict=True):
@@ -163,7 +168,7 @@ def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Arra
         # in the model's bias.
         drive.actgravcomp = False
         add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, joint, limit)
-    return names, limits
+    return names, np.array(limits)
 
 
 def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
@@ -230,17 +235,6 @@ def driven_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
     tendon = spec.tendon(actuator.target) if is_tendon else None
     path = () if tendon is None else tendon.path
     return [wrap.target.name for wrap in path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
-
-
-def torque_limit(spec: mujoco.MjSpec, joint: str, drives: list[mujoco.MjsActuator]) -> float:
-    """Return the torque limit of one joint, N m. Raises `RobotError` when there is none."""
-    limit = stated_torque(spec, joint, drives)
-    if not limit:
-        raise RobotError(
-            f"joint '{joint}': the model gives no torque limit; give robot.torque, N m, one value a"
-            " joint"
-        )
-    return limit
 
 
 def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]) -> float:

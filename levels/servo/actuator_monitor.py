@@ -189,16 +189,11 @@ def left_over(
 ) -> int:
     """Compare the torques that a motion took with those commanded; keep the present state for the
     next cycle."""
-    # At the beginning of the cycle: rad/s, N m, N m.
-    velocity_before = table[0]
-    bias_before = table[1]
-    torque = table[2]
+    # At the beginning of the cycle: rad/s, N m, N m. Dry friction, N m, and time constant of the
+    # simulated one, s. Noise of exact encoders, N m; acceleration that others may simulate, rad/s2;
+    # error of the positions, rad.
+    velocity_before, bias_before, torque, dry, early, noise, uncertain, off = table[:8]
     inertia_before = table[13:]  # kg m2
-    dry = table[3]  # friction, N m
-    early = table[4]  # time constant of the simulated one, s
-    noise = table[5]  # of exact encoders, N m
-    uncertain = table[6]  # acceleration that others may simulate, rad/s2
-    off = table[7]  # rad: error of the positions
     position = state[0]
     velocity = state[1]
     verdict = EXPLAINED

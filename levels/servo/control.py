@@ -126,11 +126,8 @@ def set_torque(
     bias: Array,  # (joints,), N m
 ) -> bool:
     """Set the torques of `ComputedTorque`; return whether a limit cut one."""
-    stiffness = table[0]  # 1/s2
-    damping = table[1]  # 1/s
-    dry = table[2]  # friction, N m
-    limits = table[3]  # N m
-    torque = table[4]  # N m: set
+    # 1/s2, 1/s; friction, limits and, set here, torques, N m.
+    stiffness, damping, dry, limits, torque = table
     cut = False
     for j in range(len(torque)):
         torque[j] = bias[j] + dry[j] * math.tanh(wanted[1, j] / FRICTION_SPEED)

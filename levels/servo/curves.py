@@ -86,54 +86,25 @@ class Bridge(Curve):
         self, before: Curve, begin_s: float, end: tuple[Array, Array], duration_s: float
     ) -> None:
         """Leave `before` at its `begin_s`; reach `end`, rad, rad/s, `duration_s` later."""
+        motion = before.at(begin_s)
         position, velocity = end
-        super().__init__(position, duration_s=duration_s)
-        set_bridge.load()(
-            before.table,
-            before.duration_s,
-            before.ends_s,
-            begin_s,
-            position,
-            velocity,
-            duration_s,
-            self.table,
+        first = motion.velocity * duration_s
+        second = velocity * duration_s
+        way = position - motion.position
+        super().__init__(
+            motion.position,
+            first,
+            3.0 * way - 2.0 * first - second,
+            first + second - 2.0 * way,
+            duration_s=duration_s,
         )
 
     def is_within(self, acceleration: Array) -> bool:
-        """Return whether no joint needs more than its `acceleration`, rad/s2."""
-        return bool(is_within.load()(self.table, self.duration_s, acceleration))
-
-
-@compiled_for("f8[:,::1], f8, f8, f8, f8[::1], f8[::1], f8, f8[:,::1]")
-def set_bridge(
-    before: Array,
-    before_duration_s: float,
-    before_ends_s: float,
-    begin_s: float,
-    position: Array,
-    velocity: Array,
-    duration_s: float,
-    table: Array,
-) -> None:
-    """Set the coefficients of the cubic Hermite curve in `table`, (7, joints)."""
-    motion = np.zeros((3, table.shape[1]))
-    set_motion(before, before_duration_s, before_ends_s, begin_s, 0.0, motion)
-    first = motion[1] * duration_s
-    second = velocity * duration_s
-    way = position - motion[0]
-    table[0] = motion[0]
-    table[1] = first
-    table[2] = 3.0 * way - 2.0 * first - second
-    table[3] = first + second - 2.0 * way
-
-
-@compiled_for("f8[:,::1], f8, f8[::1]")
-def is_within(table: Array, duration_s: float, acceleration: Array) -> bool:
-    """Return whether the acceleration of a cubic is within bounds, rad/s2: it is largest at one of
-    the ends."""
-    begin = 2.0 * table[2] / duration_s**2
-    end = (2.0 * table[2] + 6.0 * table[3]) / duration_s**2
-    return bool(np.all((np.abs(begin) <= acceleration) & (np.abs(end) <= acceleration)))
+        """Return whether no joint needs more than its `acceleration`, rad/s2: the need is greatest
+        at one of the ends."""
+        begin = 2.0 * self.table[2] / self.duration_s**2
+        end = (2.0 * self.table[2] + 6.0 * self.table[3]) / self.duration_s**2
+        return bool(np.all((np.abs(begin) <= acceleration) & (np.abs(end) <= acceleration)))
 
 
 class Ramp(Curve):

@@ -10,27 +10,16 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.backplane.watch.alarms import BY_DEMAND
+from rack.backplane.watch.alarms import BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
-from rack.levels.arm import (
-    Arm,
-    CalibratedLink,
-    DriveState,
-    FaultyLink,
-    GuardedArm,
-    Link,
-    PresentLink,
-    Sensed,
-    find_arm,
-    preload,
-)
-from rack.levels.arm.faulty import STEPS
-from rack.levels.arm.guard import kept_bounds
-from rack.levels.compiled import compiled_for
+from rack.levels.arm import Arm, DriveState, Sensed, find_arm, preload
+from rack.levels.arm.arm import Link
+from rack.levels.arm.faulty import STEPS, FaultyLink
+from rack.levels.arm.guard import GuardedArm, kept_bounds
+from rack.levels.arm.present import PresentLink
 from rack.levels.errors import RobotError
 from rack.levels.level import (
-    Demand,
     Executor,
     Fault,
     Finding,
@@ -50,31 +39,21 @@ from rack.levels.servo.control import ArmParams, SetPointLaw
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.enabling import Enabling
 from rack.levels.servo.sensor_monitor import SensorMonitor
-from rack.levels.servo.stopping import Reaction, Stopping
+from rack.levels.servo.stopping import Cause, Reaction, Stopping
 from rack.levels.tables import read_params
 
 SCENES = Output(SCENE, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
 
 
-class SteadyStatus(NamedTuple):
-    """The fields of a status that seldom change."""
+class Course(NamedTuple):
+    """What a status says of set points."""
 
     command: int
     holding: bool
     stopped: bool
     cut: int  # cycles in which the level itself cut a set point or a torque
     kept: str  # why the arm does not follow its set points
-    braked: bool
-    demand: Demand
-    clipped: int
-    touches: int
-    violations: int
-    pushed: int
-    slowed: bool
-    error: Error  # latched
-    fault: str  # of the arm
-    note: str  # the rest of what the status says
 
 
 class ArmDriver(Executor):
@@ -108,10 +87,8 @@ class ArmDriver(Executor):
         self.part = robot.bring_up or 1.0  # of full speed, until the operator's release
         # The path to the arm; through `_faulty` while faults are injected.
         link: Link = self.arm
-        if cell.encoders.offset is not None:
-            link = CalibratedLink(self.arm, cell.encoders.offset)
-        if robot.latency_ticks:
-            link = PresentLink(self.arm, cell, context.tick_s, link)
+        if cell.encoders.offset is not None or robot.latency_ticks:
+            link = PresentLink(self.arm, cell, context.tick_s)
         self._guard = None
         if not self.arm.keeps_limits:
             link = self._guard = GuardedArm(
@@ -132,11 +109,7 @@ class ArmDriver(Executor):
             (2, len(cell.home))
         )  # the motion wanted in the last cycle begins with: rad, rad/s
         self._wanted[0] = cell.home
-        self._numbers: tuple[Array, Array, Array] | None = (
-            None  # set in every cycle: the first arguments of `show`
-        )
-        self._show_numbers = show.load()
-        self._shown: SteadyStatus | None = None  # in the last status
+        self._shown: tuple[object, ...] = ()  # what seldom changes, in the last status
         self._started = False  # the first cycle has begun
         self._adopted = False  # the arm is enabled, and its pose then was taken over
         self.abandoned = False  # set points were abandoned in the last cycle: the arm was braked
@@ -150,7 +123,6 @@ class ArmDriver(Executor):
         super().preload()
         preload()
         compiled.preload(sensor_monitor, actuator_monitor)
-        show.preload()
 
     @classmethod
     def misfits(
@@ -214,8 +186,8 @@ class ArmDriver(Executor):
         """Whether the gripper holds a part."""
 
     @abstractmethod
-    def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
-        """Return the first five fields of a `SteadyStatus`."""
+    def course(self, reaction: Reaction) -> Course:
+        """Return what the status says of set points."""
 
     @property
     def has_work(self) -> bool:
@@ -259,13 +231,20 @@ class ArmDriver(Executor):
             wanted = None if missed or self.abandoned else self._wanted
             sensors.look(sensed, tick, wanted, contact is not None)
         if contact is not None:
-            self.stopping.struck(contact, self.arm.named(contact), tick)
+            blow = Cause(Error.TOUCHED, f"unintended contact: {self.arm.named(contact)}")
+            self.stopping.stop_for(blow, Finding(Alarm.COLLISION, *contact), tick)
         if self._adopted and self._guard is not None and self._guard.exceeded is not None:
-            self.stopping.exceeds(*self._guard.exceeded, tick)
+            finding, text = self._guard.exceeded
+            cause = Cause(Error.LIMIT, text, finding.subject, finding.value)
+            self.stopping.stop_for(cause, finding, tick)
         self.feel(tick)
         if serial := self.enabling.arrived():
             self.orders.drives_done(serial)
-        reaction = self._decide(tick)
+        if self.enabling.is_enabled:
+            reaction = self.stopping.decide(self.demand, sensors, tick)
+        else:
+            error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED
+            reaction = self.stopping.wait(error, self.enabling.reason, tick)
         if reaction is Reaction.BRAKE:
             self.brake()
         elif sensors.fresh:
@@ -307,13 +286,6 @@ class ArmDriver(Executor):
             self.adopted()
         return is_adopted or is_enabled
 
-    def _decide(self, tick: int) -> Reaction:
-        """Return the reaction of this cycle; an arm that is not enabled is braked, and waits."""
-        if self.enabling.is_enabled:
-            return self.stopping.decide(self.demand, self.sensors, tick)
-        error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED
-        return self.stopping.wait(error, self.enabling.reason, tick)
-
     def _start(self, before: Message | None, tick: int) -> None:
         self.enabling.start(before is not None)
         if before is not None:
@@ -341,8 +313,11 @@ class ArmDriver(Executor):
             return self.brake()
         terms = self.terms()
         failed = self.motors.look(wanted.table, self.sensors.state, terms, self.holds)
-        if failed is not None and self._motor_fails(failed, tick) is Reaction.BRAKE:
-            return self.brake()
+        if failed is not None:
+            if not self.stopping.trying:
+                self.findings.append(failed)
+            if self.stopping.motor_fails(failed.subject, failed.value, tick) is Reaction.BRAKE:
+                return self.brake()
         if reaction is Reaction.STOP and (self.abandoned or not wanted.velocity.any()):
             return self.brake()
         torque, grip_force = self.torques(wanted, sensed, terms)
@@ -352,124 +327,75 @@ class ArmDriver(Executor):
             target = self.ahead.target(wanted, self.sensors.position, torque)
             refused = self._link.follow(target, grip_force)
         if refused is not None:
-            return self._refuse(refused, tick)
+            self.stopping.refuse(refused, tick)  # the arm has engaged its brakes
+            return self.brake()
         self._wanted = wanted.table
         self.abandoned = False
         self.stopping.refused = None
         return self.motors.begin()
-
-    def _motor_fails(self, finding: Finding, tick: int) -> Reaction:
-        if not self.stopping.trying:
-            self.findings.append(finding)
-        return self.stopping.motor_fails(finding.subject, finding.value, tick)
-
-    def _refuse(self, finding: Finding, tick: int) -> None:
-        """React to a torque that the arm refused, engaging its brakes."""
-        self.stopping.refuse(finding, tick)
-        self.brake()
 
     def _report(self, write: Ports, sensed: Sensed, reaction: Reaction) -> None:
         """Fill the status, and the estimate in the state; the steady fields only when they
         change."""
         arm = self.arm
         status = write.status
-        if self._numbers is None:
-            moving = numbers(status, "position", "grip_force")
-            kept = numbers(write.state, "position", "doubt")
-            self._numbers = moving, kept, self.motors.torque
-        _, _, opening, opening_velocity, _ = sensed
-        self._show_numbers(
-            *self._numbers,
-            self.sensors.estimate,
-            self._wanted,
-            arm.torque,
-            opening,
-            opening_velocity,
-            arm.grip_force,
-        )
+        status.position, status.velocity, _ = self.sensors.estimate
+        status.torque = self.motors.torque[:] = arm.torque
+        status.target, status.target_velocity = self._wanted[:2]
+        status.opening = sensed.opening
+        status.opening_velocity = sensed.opening_velocity
+        status.grip_force = arm.grip_force
+        write.state.position, write.state.velocity, write.state.doubt = self.sensors.estimate
+        course = self.course(reaction)
         shown = (
-            *self.course(reaction),
+            course,
             arm.braked,
             self.demand,
             arm.clipped,
             arm.touches,
             arm.violations,
             arm.pushed,
-            self.part < 1.0,
+            self.part,
             self.stopping.error,
             arm.fault,
             self.note,
         )
         if shown != self._shown:
-            self._shown = SteadyStatus(*shown)
-            self._show(status, self._shown)
+            self._shown = shown
+            self._show(status, course)
 
-    def _show(self, status: Message, shown: SteadyStatus) -> None:
+    def _show(self, status: Message, course: Course) -> None:
         """Fill the steady fields."""
-        kept = shown.kept
-        status.echo = shown.command
-        status.holding = shown.holding
-        status.stopped = shown.stopped
-        status.braked = shown.braked
-        status.demand = shown.demand
-        status.clipped = shown.clipped + shown.cut
-        status.touches = shown.touches
-        status.violations = shown.violations
-        status.pushed = shown.pushed
-        status.slowed = shown.slowed
-        if self.stopping.is_disabled:
+        arm = self.arm
+        stopping = self.stopping
+        kept = course.kept
+        slowed = self.part < 1.0
+        status.echo = course.command
+        status.holding = course.holding
+        status.stopped = course.stopped
+        status.braked = arm.braked
+        status.demand = self.demand
+        status.clipped = arm.clipped + course.cut
+        status.touches = arm.touches
+        status.violations = arm.violations
+        status.pushed = arm.pushed
+        status.slowed = slowed
+        status.reason = kept
+        if stopping.is_disabled:
             status.state = State.HOLDING
-            status.error = self.stopping.cause
-            status.reason = kept
-        elif shown.fault:
+            status.error = stopping.cause
+        elif arm.fault:
             status.state = State.ERROR
             status.error = Error.SIMULATION
-            status.reason = shown.fault
-        elif shown.error:
+            status.reason = arm.fault
+        elif stopping.error:
             status.state = State.ERROR
-            status.error = shown.error
-            status.reason = kept
+            status.error = stopping.error
         else:
-            resting = State.IDLE if shown.holding else State.EXECUTING
+            resting = State.IDLE if course.holding else State.EXECUTING
             status.state = State.HOLDING if kept and self.has_work else resting
-            touched = Error.TOUCHED if shown.touches else Error.NONE
-            status.error = Error.LIMIT if shown.violations else touched
-            broken = self.arm.first_violation if shown.violations else self.arm.first_touch
-            slow = self.enabling.slow if shown.slowed else ""
-            status.reason = kept or broken or slow or shown.note
-
-
-def numbers(message: Message, first: str, last: str) -> Array:
-    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one
-    array."""
-    fields = message.record.dtype.fields
-    assert fields is not None
-    begin = fields[first][1]
-    end = fields[last][1] + fields[last][0].itemsize
-    return np.frombuffer(message.raw[begin:end])
-
-
-@compiled_for("f8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8, f8, f8")
-def show(
-    status: Array,  # (5 joints + 3,): set, its fields from `position` to `grip_force`
-    state: Array,  # (3 joints,): set, its fields from `position` to `doubt`
-    begun: Array,  # (joints,), N m: set, see `ActuatorMonitor.torque`
-    estimate: Array,  # (3, joints), rad, rad/s, rad
-    wanted: Array,  # (2, joints) or more, rad, rad/s
-    torque: Array,  # (joints,), N m
-    opening: float,  # m
-    opening_velocity: float,  # m/s
-    grip_force: float,  # N
-) -> None:
-    """Fill the fields of status and state that change in every cycle."""
-    joints = len(torque)
-    for j in range(joints):
-        for row in range(3):
-            state[row * joints + j] = estimate[row, j]
-        for row in range(2):
-            status[row * joints + j] = estimate[row, j]
-            status[(3 + row) * joints + j] = wanted[row, j]
-        status[2 * joints + j] = begun[j] = torque[j]
-    status[-3] = opening
-    status[-2] = opening_velocity
-    status[-1] = grip_force
+            touched = Error.TOUCHED if arm.touches else Error.NONE
+            status.error = Error.LIMIT if arm.violations else touched
+            broken = arm.first_violation if arm.violations else arm.first_touch
+            slow = self.enabling.slow if slowed else ""
+            status.reason = kept or broken or slow or self.note

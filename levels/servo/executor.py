@@ -17,7 +17,7 @@ from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import control, curves, reference
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams, SetPointLaw
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.driver import SCENES, ArmDriver
+from rack.levels.servo.driver import SCENES, ArmDriver, Course
 from rack.levels.servo.modification import misfits_of, names_of
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
@@ -105,7 +105,7 @@ class ServoExecutor(ArmDriver):
     def _obey(self, command: Message) -> str:
         """Do what leaves the command in force as it is; return why not, empty: it does."""
         if command.what == Operation.MODIFY:
-            return self._modified.obey(command)
+            return self._modified.switch(command.name, command.goal == Goal.ON)
         if command.what == Operation.SET:
             return self._tune(command.name)
         why = self.obey(command)
@@ -152,17 +152,17 @@ class ServoExecutor(ArmDriver):
         """Return the torques, N m, and the grip force, N."""
         grip = self._grip
         grip_force = 0.0 if grip is None else grip.force(sensed.opening, sensed.opening_velocity)
-        return self._torque(wanted, terms), grip_force
-
-    def _torque(self, wanted: Motion, terms: Terms) -> Array:
         loop = self._loop
         # What is predicted for set points is the torque of an arm that is there.
         state = self.sensors.state if self.ahead is None else wanted.table
-        modified = self._modified
-        if not modified.exists:
-            return loop.torque(wanted, state, terms)
+        if not self._modified.exists:
+            return loop.torque(wanted, state, terms), grip_force
         given = LawInputs(wanted, state, np.diagonal(terms.inertia), terms.bias, self.arm.tick)
-        return modified.torque(lambda motion, seen: loop.torque(motion, seen, terms), given)
+
+        def law(motion: Motion, seen: Array) -> Array:
+            return loop.torque(motion, seen, terms)
+
+        return self._modified.torque(law, given), grip_force
 
     def brake(self) -> None:
         """Brake, and abandon set points and torques."""
@@ -179,7 +179,7 @@ class ServoExecutor(ArmDriver):
         """How the law is modified."""
         return self._modified.reason
 
-    def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
+    def course(self, reaction: Reaction) -> Course:
         """Return what the status says of set points."""
         operator = self.operator
         cut = self.reference.refused + self._loop.cut
@@ -188,4 +188,4 @@ class ServoExecutor(ArmDriver):
             kept = operator.reason
         holding = self.abandoned or self.reference.holding
         stopped = self.abandoned or reaction > 0 or operator.stands
-        return self.command, holding, stopped, cut, kept
+        return Course(self.command, holding, stopped, cut, kept)

@@ -15,15 +15,14 @@ the same sample: the law goes on without it, and the torque goes over to it in t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.level import Finding, LevelContext
-from rack.levels.operator import Goal
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.modification import (
     Hook,
@@ -47,20 +46,20 @@ class LawInputs(NamedTuple):
     tick: int
 
 
+@dataclass
 class Modified:
     """One modification of a law, put in or not."""
 
-    def __init__(self, number: int, name: str, modification: Modification, is_on: bool) -> None:
-        self.number = number
-        self.name = name
-        self.modification = modification
-        self.is_on = is_on
-        self.begins = True  # the next sample is its first
+    number: int
+    name: str
+    modification: Modification
+    is_on: bool
+    begins: bool = True  # the next sample is its first
 
-    def act(self, sample: LawSample, changed: Array, kept: Array) -> str:
-        """Modify a sample; return why that failed, empty: it did not. `kept` is room for the array
-        that it changes."""
-        kept[:] = changed
+    def act(self, sample: LawSample, changed: Array) -> str:
+        """Modify a sample, of which it changes one array; return why that failed, empty: it did
+        not."""
+        kept = changed.copy()
         why = ""
         try:
             if self.begins:
@@ -104,10 +103,6 @@ class ModifiedLaw:
         self._torque = torque
         self._findings = findings
         self._sample = LawSample(len(joints))
-        self._kept = (
-            np.zeros_like(self._sample.seen),
-            np.zeros(len(joints)),
-        )  # room for `Modified.act`
         self._last = np.zeros(len(joints))  # N m: torque of the last sample
         self._difference = np.zeros(len(joints))  # N m: from the law's torque to it, at the switch
         self._since: int | None = None  # tick of the switch; None: the difference has decayed
@@ -116,13 +111,9 @@ class ModifiedLaw:
         self._failed: dict[str, str] = {}  # why, by name, for those taken out
         self._arrange()
 
-    def obey(self, command: Message) -> str:
+    def switch(self, name: str, is_on: bool) -> str:
         """Put a modification in, or take it out, with the next sample; return why that is refused,
         empty: it is not."""
-        return self.switch(command.name, command.goal == Goal.ON)
-
-    def switch(self, name: str, is_on: bool) -> str:
-        """Do the same for a name."""
         one = self._all.get(name)
         if one is None:
             return f"no modification '{name}'; permitted: {', '.join(self._all) or 'none'}"
@@ -161,17 +152,16 @@ class ModifiedLaw:
         sample.seen[:3] = given.motion.table
         sample.seen[3:] = given.state
         sample.torque[:] = np.nan
-        seen, torque = self._kept
         for one in self._before:
-            self._act(one, sample.seen, seen)
-        if not any(self._act(one, sample.torque, torque) for one in self._instead):
+            self._act(one, sample.seen)
+        if not any(self._act(one, sample.torque) for one in self._instead):
             sample.torque = law(sample.motion, sample.seen[3:])
         for one in self._after:
-            self._act(one, sample.torque, torque)
+            self._act(one, sample.torque)
         return sample.torque
 
-    def _act(self, one: Modified, changed: Array, kept: Array) -> bool:
-        why = one.act(self._sample, changed, kept)
+    def _act(self, one: Modified, changed: Array) -> bool:
+        why = one.act(self._sample, changed)
         if why:
             one.is_on = False
             self._failed[one.name] = why

@@ -88,7 +88,10 @@ class OperatorControl:
 
     def wanted(self, reference: Reference, tick: int) -> Motion:
         """Return the motion wanted at `tick`, while the level follows the operator."""
-        goal = self._aim()
+        returns = self._way and not self.orders.stands
+        goal = self._way[-1] if returns else None
+        if self.orders.standing is Operation.SETPOINT:
+            goal = self._goal
         if goal is None:
             motion = reference.rest(tick)
         else:
@@ -98,15 +101,9 @@ class OperatorControl:
                 self._way.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
             # React to the arm's arrival at its goal.
-            if not self.orders.stands and self._way:
+            if returns:
                 self._way.pop()
             if self.orders.stands or not self._way:
                 self.stands = self.orders.stands
                 self.orders.done()
         return motion
-
-    def _aim(self) -> Array | None:
-        """Return the goal of the joints, (joints,), rad; None: they stay."""
-        if self.orders.standing is Operation.SETPOINT:
-            return self._goal
-        return self._way[-1] if not self.orders.stands and self._way else None

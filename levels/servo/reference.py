@@ -13,7 +13,6 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled_for
 from rack.levels.robot.limits import Bounds, Limits
 from rack.levels.servo.curves import Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
 
@@ -27,10 +26,6 @@ ASTRAY_RAD = 0.005
 MAX_AHEAD_S = 2.0
 """Time ahead at which a set point may be due: beyond that it is a broken command, not a slow
 level."""
-WRONG = 0
-CUT = 1
-WITHIN = 2
-"""Verdicts on a set point: not finite, cut at the bounds, within them."""
 
 
 class SetPoint(NamedTuple):
@@ -58,7 +53,6 @@ class Reference:
         )  # the one wanted, and its difference from the curve
         self._wanted = Motion(self._motions[0])
         self._interpolate = set_motion.load()
-        self._admit = admit.load()
         self._command: Message | None = None  # the newest `JOINT_SET_POINT`
         self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
@@ -146,14 +140,15 @@ class Reference:
         command = self._command
         if command is None:
             return
-        position = np.array(command.position)
-        velocity = np.array(command.velocity)
-        verdict = WRONG
-        if (due - tick) * self._tick_s <= MAX_AHEAD_S:
-            verdict = self._admit(position, velocity, self._low, self._high, self._fastest)
-        self.refused += verdict != WITHIN
-        if verdict != WRONG:
+        position = np.clip(command.position, self._low, self._high)
+        velocity = np.clip(command.velocity, -self._fastest, self._fastest)
+        is_near = (due - tick) * self._tick_s <= MAX_AHEAD_S
+        if is_near and np.isfinite((command.position, command.velocity)).all():
             self._next = SetPoint(due, position, velocity)
+            is_cut = (position != command.position) | (velocity != command.velocity)
+            self.refused += bool(is_cut.any())
+        else:
+            self.refused += 1
         if self._next is not None and (self.holding or tick >= self._due):
             self._advance(self._next, tick)
 
@@ -208,20 +203,3 @@ class Reference:
             self._interpolate(difference.table, lasts_s, ends_s, time_s, half_s, self._motions[1])
             wanted.table += self._motions[1]
         return wanted
-
-
-@compiled_for("f8[::1], f8[::1], f8[::1], f8[::1], f8[::1]")
-def admit(position: Array, velocity: Array, low: Array, high: Array, fastest: Array) -> int:
-    """Cut a set point at its bounds, (joints,) each; return `WRONG`, `CUT` or `WITHIN`."""
-    verdict = WITHIN
-    for j in range(len(position)):
-        if not (np.isfinite(position[j]) and np.isfinite(velocity[j])):
-            return WRONG
-        allowed = (
-            min(max(position[j], low[j]), high[j]),
-            min(max(velocity[j], -fastest[j]), fastest[j]),
-        )
-        if allowed != (position[j], velocity[j]):
-            verdict = CUT
-        position[j], velocity[j] = allowed
-    return verdict

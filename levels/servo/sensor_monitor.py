@@ -82,7 +82,6 @@ class SensorMonitor:
         encoders = cell.encoders
         bounds = cell.bounds
         home = cell.home
-        self._coarse = not encoders.exact
         self._low = bounds.position[:, 0] - BEYOND_RAD
         self._high = bounds.position[:, 1] + BEYOND_RAD
         self._tick_s = tick_s
@@ -118,7 +117,7 @@ class SensorMonitor:
         self._suspect = np.zeros(joints, dtype=bool)
         self._everyone = np.ones(joints, dtype=bool)
         self._sent = self._everyone  # its set point moves, or may have moved
-        self._check = partial(check.load(), self._table, self._coarse)
+        self._check = partial(check.load(), self._table, not encoders.exact)
         self._tick: int | None = None
         self._sampled = -sys.maxsize  # tick of the newest sample
         self._latency = encoders.latency_ticks
@@ -197,12 +196,6 @@ class SensorMonitor:
             self.doubt[self._unchanged == 0.0] = 0.0
         self._table[4:6] = self._table[2:4] = self._table[:2]
 
-    def _claim(self, unchanged: Mask, passed_s: float) -> None:
-        """Integrate the least motion that a joint's sensed velocity implies while its sample does
-        not change."""
-        least = np.maximum(np.abs(self._qd) - self._speed_room, 0.0)
-        self._claimed[:] = np.where(unchanged, self._claimed + passed_s * least, 0.0)
-
     def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
         q = self._q
@@ -213,8 +206,6 @@ class SensorMonitor:
         finite = np.isfinite(q) & np.isfinite(qd)
         inside = (q >= self._low) & (q <= self._high)
         unchanged = (q == last_q) & (qd == last_qd)
-        if not self._coarse:
-            self._claim(unchanged, passed_s)
         frozen = self._claimed > self._room
         still = np.asarray(
             (self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown)
@@ -222,9 +213,10 @@ class SensorMonitor:
         begins = not self.faulty
         room += passed_s * np.abs(qd - last_qd)
         steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room
+        off = q - self.position - way
         self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
         self._name(Alarm.SENSOR_STUCK, frozen | still, self._still)
-        self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, q - self.position - way)
+        self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, off)
         good = fits & steady & inside & ~still & ~frozen
         self.drivable = bool((np.isfinite(qd) & ~frozen & ~still).all())
         self.doubt[still] += STUCK_RAD
@@ -243,20 +235,16 @@ class SensorMonitor:
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
         self._still[still] = 0
-        self._blame(good, q, q - self.position - way)
+        if not good.all():
+            amount = np.where(np.isfinite(off), np.abs(off), np.inf)
+            joint = int(np.where(good, -1.0, amount).argmax())
+            self.blamed = joint, float(q[joint]), float(off[joint])
         self._suspect |= ~good
         if self._settled(bool(good.all())):
             self._take(self._room)
             return
         self._table[2:4] = self._table[:2]
         self._estimate(q, qd, way, np.isfinite(qd) & ~frozen, passed_s)
-
-    def _blame(self, good: Mask, q: Array, off: Array) -> None:
-        """Keep the joint with the largest error."""
-        if not good.all():
-            amount = np.where(np.isfinite(off), np.abs(off), np.inf)
-            joint = int(np.where(good, -1.0, amount).argmax())
-            self.blamed = joint, float(q[joint]), float(off[joint])
 
     def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
         """Estimate suspect joints from their velocity, or as braked where that is unknown; take the
@@ -350,32 +338,15 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
 ) -> int:
     """Check a sample against the estimate, and take it if nothing is in doubt; return the
     verdict."""
-    # This sample and the one before it, rad and rad/s.
-    q = table[0]
-    qd = table[1]
-    last_q = table[2]
-    last_qd = table[3]
-    # The estimate: rad, rad/s, rad.
-    position = table[4]
-    velocity = table[5]
-    doubt = table[6]
-    # For errors, rad and rad/s; motion that must show, rad.
-    room = table[7]
-    speed_room = table[8]
-    unshown = table[9]
-    # Cycles without a change while the set point moves, and its motion in that time, rad;
-    # integrated velocity while the sample does not change, rad.
-    still = table[10]
-    still_way = table[11]
-    claimed = table[12]
-    # Set here: motion since the last sample, and room for its errors, rad.
-    way = table[13]
-    allowed = table[14]
-    braking = table[15]  # rad/s2
-    fastest = table[16]  # rad/s
-    # Set to 0 or 1: agrees with velocities; if taken, is as before.
-    fits = table[17]
-    unchanged = table[18]
+    # This sample and the one before it, rad and rad/s; the estimate: rad, rad/s, rad.
+    q, qd, last_q, last_qd, position, velocity, doubt = table[:7]
+    # For errors, rad and rad/s; motion that must show, rad. Cycles without a change while the set
+    # point moves, and its motion in that time, rad; integrated velocity while the sample does not
+    # change, rad.
+    room, speed_room, unshown, still, still_way, claimed = table[7:13]
+    # Set here: motion since the last sample, and room for its errors, rad. Braking, rad/s2, and
+    # greatest velocity, rad/s. Set to 0 or 1: agrees with velocities; if taken, is as before.
+    way, allowed, braking, fastest, fits, unchanged = table[13:]
     good = not faulty
     in_doubt = False
     at_rest = False
@@ -397,10 +368,10 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
         good = (
             good and fitting and not (still[j] >= STILL_CYCLES and abs(still_way[j]) >= unshown[j])
         )
-        if coarse:  # an exact sensor that is stuck shows it in the next sample
-            least = max(abs(qd[j]) - speed_room[j], 0.0)
-            claimed[j] = claimed[j] + passed_s * least if same and qd[j] == last_qd[j] else 0.0
-            good = good and claimed[j] <= room[j]
+        least = max(abs(qd[j]) - speed_room[j], 0.0)
+        claimed[j] = claimed[j] + passed_s * least if same and qd[j] == last_qd[j] else 0.0
+        # An exact sensor that is stuck shows it in the next sample.
+        good = good and not (coarse and claimed[j] > room[j])
         in_doubt = in_doubt or doubt[j] != 0.0
     if not good or in_doubt:
         return GOOD if good else DOUBTFUL

@@ -121,22 +121,11 @@ class Stopping:
         self.refused = finding
         self._wait_for(self._about_torque(finding), tick)
 
-    def struck(self, contact: tuple[int, int], named: str, tick: int) -> None:
-        """Register an unintended contact of the arm."""
-        blow = Cause(Error.TOUCHED, f"unintended contact: {named}")
-        self._stop_for(blow, Finding(Alarm.COLLISION, *contact), Reaction.BRAKE, tick)
-
-    def pressed(self, finding: Finding, text: str, reaction: Reaction, tick: int) -> None:
-        """Register a contact stronger than the arm's limits, with its text and the reaction to
-        it."""
-        self._stop_for(Cause(Error.FORCE, text, value=finding.value), finding, reaction, tick)
-
-    def exceeds(self, finding: Finding, text: str, tick: int) -> None:
-        """Register a joint beyond its limit, with its text."""
-        cause = Cause(Error.LIMIT, text, finding.subject, finding.value)
-        self._stop_for(cause, finding, Reaction.BRAKE, tick)
-
-    def _stop_for(self, blow: Cause, finding: Finding, reaction: Reaction, tick: int) -> None:
+    def stop_for(
+        self, blow: Cause, finding: Finding, tick: int, reaction: Reaction = Reaction.BRAKE
+    ) -> None:
+        """Register a blow: a contact that is unintended or too strong, or a joint beyond its limit;
+        with the reaction to it."""
         is_new = self._struck_until is None or blow.error is not self._blow.error
         # The arm may have reported it by itself, in this cycle.
         if is_new and all(one.alarm is not finding.alarm for one in self.findings):

@@ -7,12 +7,12 @@ import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, norm
-from rack.levels.arm import wrist
 from rack.levels.errors import LevelError
 from rack.levels.level import Finding, Input, LevelContext, Ports
+from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams, Reacting
-from rack.levels.servo.stopping import Reaction
+from rack.levels.servo.stopping import Cause, Reaction
 from rack.levels.systems.force import contact_wrench
 from rack.levels.systems.force.contact import HALVES
 from rack.levels.systems.force.contact_wrench import ContactWrench
@@ -53,7 +53,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
     outputs = {**ArmExecutor.outputs, "wrench": WRENCH}
     params = ForceArmParams
-    preloads = (*ArmExecutor.preloads, wrist, contact_wrench)
+    preloads = (*ArmExecutor.preloads, contact_wrench)
 
     def __init__(self, context: LevelContext) -> None:
         params = read_params(ForceArmParams, context.params)
@@ -126,7 +126,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def _stop(self, found: Finding, text: str, tick: int) -> None:
         self._exceeded += 1
-        self.stopping.pressed(found, text, self._on_limit, tick)
+        cause = Cause(Error.FORCE, text, value=found.value)
+        self.stopping.stop_for(cause, found, tick, self._on_limit)
 
     def started(self) -> None:
         """Continue from the state that was restored."""

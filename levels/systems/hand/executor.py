@@ -12,7 +12,7 @@ from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.algebra import Array
-from rack.levels.arm import poses, substeps
+from rack.levels.arm import substeps
 from rack.levels.arm.above import CommandsAbove
 from rack.levels.faults import TendonStep
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Misfits, Ports, Reading
@@ -50,7 +50,7 @@ class HandExecutor(Executor):
     commands = HOLDABLE
     params = Table
     faults = (TendonStep,)
-    preloads = (substeps, poses)
+    preloads = (substeps,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

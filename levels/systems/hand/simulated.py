@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from rack.levels.algebra import Array, Mask
-from rack.levels.arm.drives import CoarseSensors
+from rack.levels.arm.sensors import CoarseSensors
 from rack.levels.arm.simulation import Simulation
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig

@@ -18,7 +18,7 @@ from rack.levels.operator import DRIVES, HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.driver import SCENES, ArmDriver
+from rack.levels.servo.driver import SCENES, ArmDriver, Course
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
 from rack.levels.systems.joint_boards import joint_torques
@@ -179,7 +179,7 @@ class ArmExecutor(ArmDriver):
         """Return True: the arm is there to be driven."""
         return True
 
-    def course(self, reaction: Reaction) -> tuple[int, bool, bool, int, str]:
+    def course(self, reaction: Reaction) -> Course:
         """Return what the status says of the torques from above."""
         held = self.orders.holds
         kept = self.stopping.reason or self._waiting
@@ -187,7 +187,7 @@ class ArmExecutor(ArmDriver):
             kept = HELD
         holding = self.abandoned or not self.joints.moves
         stopped = self.abandoned or reaction > 0 or held
-        return 0, holding, stopped, 0, kept
+        return Course(0, holding, stopped, 0, kept)
 
 
 def _by(boards: Sequence[str]) -> str:

@@ -66,16 +66,6 @@ def test_closed_brakes_stop_and_hold_an_arm_all_of_whose_motors_are_off() -> Non
     assert np.abs(arm.sense().position - rest).max() > 0.02  # without brakes it falls
 
 
-def test_a_command_opens_the_brakes() -> None:
-    arm, _, torque = moving()
-    arm.brake()
-    arm.step(5)
-    assert arm.braked
-    assert arm.drive(torque(), 0.0) is None
-    assert not arm.braked
-    assert arm.torque.any()
-
-
 def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
     arm, made, _ = moving()
     arm.brake()
@@ -118,21 +108,6 @@ def test_a_torque_that_no_servo_level_gives_closes_the_brakes_and_is_named(
 def test_a_torque_at_its_limit_is_a_command_like_any_other() -> None:
     arm, made, _ = moving()
     assert arm.drive(made.bounds.torque.copy(), 0.0) is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["puma560", "k1607"])
-def test_limits_hold_at_every_step_when_brakes_close_and_open_at_any_time(name: str) -> None:
-    arm, made, _ = moving(name)
-    rng = np.random.default_rng(3)
-    for _ in range(60):
-        torque = rng.choice([-1.0, 1.0], len(made.home)) * made.bounds.torque
-        for _ in range(int(rng.integers(1, 30))):
-            arm.drive(torque, 0.0)
-            arm.step(1)
-        arm.brake()
-        arm.step(int(rng.integers(1, 20)))
-    assert (arm.violations, arm.first_violation) == (0, "")
 
 
 def test_the_limit_monitor_counts_every_step_beyond_a_limit_and_names_the_first() -> None:

@@ -13,7 +13,7 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels import arm as arm_package
 from rack.levels.algebra import Array, cholesky_solve
-from rack.levels.arm import SimulatedArm, drives, poses, substeps
+from rack.levels.arm import SimulatedArm, drives, sensors, substeps
 from rack.levels.compiled import compiled
 from rack.levels.messages import ARM_STATE, SCENE
 from rack.levels.robot import dynamics
@@ -47,10 +47,9 @@ def scene(arm: SimulatedArm, made: Cell) -> Message:
 
 def in_python(arm: SimulatedArm) -> None:
     """Replace an arm's compiled functions by their Python."""
-    arm._advance, arm._give_clear, arm._fill = substeps.advance, drives.give, poses.show
+    arm._advance, arm._copy_state = substeps.advance, substeps.copy_state
     arm._gate._is_clear = drives.is_clear
-    for used in (arm.dynamics, arm._gate._dynamics):
-        used._evaluate, used._carry = dynamics.evaluate, dynamics.carry
+    arm.dynamics._evaluate, arm.dynamics._carry = dynamics.evaluate, dynamics.carry
 
 
 @pytest.mark.slow
@@ -83,11 +82,11 @@ def test_solutions_and_coarse_samples_are_the_same_as_in_python() -> None:
     solution = cholesky_solve.load()(inertia, load)
     assert np.array_equal(solution, cholesky_solve(inertia, load))
     assert solution == pytest.approx(np.linalg.solve(inertia, load))
-    sensors = np.full((2, 6), 1e-3), np.array([[1e-4] * 6, [0.0] * 6])
+    rules = np.full((2, 6), 1e-3), np.array([[1e-4] * 6, [0.0] * 6])
     for tick in range(50):
         one, other = np.ones((2, 6)), np.ones((2, 6))
-        drives.sense_coarsely.load()(one, tick, 7, *sensors)
-        drives.sense_coarsely(other, tick, 7, *sensors)
+        sensors.sense_coarsely.load()(one, tick, 7, *rules)
+        sensors.sense_coarsely(other, tick, 7, *rules)
         assert np.array_equal(one, other)
 
 
@@ -104,7 +103,7 @@ def test_noise_is_normal_and_independent_of_joint_quantity_and_tick() -> None:
 def samples(tick: int) -> Array:
     """Return the noise of a tick in standard deviations, (2, joints)."""
     encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
-    return drives.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick) / [
+    return sensors.CoarseSensors(encoders, 5).sample(np.zeros(6), np.zeros(6), tick) / [
         [1e-3],
         [1e-2],
     ]
@@ -126,34 +125,11 @@ def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> 
         scene(arm, made)
     samples(1)
     functions: list[compiled[..., Any]] = [
-        *(dynamics.evaluate, dynamics.carry, substeps.advance, drives.give, drives.is_clear),
-        *(drives.sense_coarsely, poses.show),
+        *(dynamics.evaluate, dynamics.carry, substeps.advance, substeps.copy_state),
+        *(drives.is_clear, sensors.sense_coarsely),
     ]
     machines: list[Callable[..., Any]] = [function.load() for function in functions]
     assert [len(machine.signatures) for machine in machines] == [1] * len(machines)  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("elsewhere", [0.0, 1e-3])
-def test_the_gate_predicts_with_the_controllers_evaluation_only_if_it_is_of_the_arms_state(
-    elsewhere: float,
-) -> None:
-    made, looked = cell("puma560"), list[Array]()
-    arm, alone = (SimulatedArm(made, config("puma560")[1], CLOCK_NS) for _ in range(2))
-    admit = arm._gate.admit
-
-    def counted(torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
-        looked.append(q)
-        return admit(torque, q, qd)
-
-    arm._gate.admit = counted  # type: ignore[method-assign]
-    for _ in range(30):
-        sensed = arm.sense()
-        bias = arm.dynamics.terms(sensed.position + elsewhere, sensed.velocity).bias.copy()
-        for one in (arm, alone):
-            one.drive(bias, 0.0)
-            one.step(1)
-    assert len(looked) == (30 if elsewhere else 0)
-    assert np.array_equal(arm.sense().position, alone.sense().position)
 
 
 @pytest.mark.slow

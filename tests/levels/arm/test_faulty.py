@@ -9,7 +9,8 @@ import pytest
 
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS
-from rack.levels.arm import FaultyLink, SimulatedArm
+from rack.levels.arm import SimulatedArm
+from rack.levels.arm.faulty import FaultyLink
 from rack.levels.level import Fault
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics

@@ -13,8 +13,10 @@ import pytest
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, solve
-from rack.levels.arm import GuardedArm, JointTarget, SimulatedArm, set_points
-from rack.levels.arm.set_points import CascadedDrives
+from rack.levels.arm import Arm, JointTarget, SimulatedArm
+from rack.levels.arm import simulated as simulated_arm
+from rack.levels.arm.guard import GuardedArm
+from rack.levels.arm.simulated import CascadedDrives
 from rack.levels.level import Finding
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
@@ -72,6 +74,13 @@ def own(folder: Path, interface: Interface) -> tuple[ServoArm, GuardedArm]:
     return arm, GuardedArm(arm, arm.cell, robot.joints, TICK_S)
 
 
+def link_of(folder: Path, interface: Interface, is_own: bool) -> tuple[Arm, Arm | GuardedArm]:
+    if is_own:
+        return own(folder, interface)
+    arm, _ = simulated("puma560", interface)
+    return arm, arm
+
+
 def hostile(cell: Cell, kind: str, cycles: int, seed: int = 3) -> Iterator[JointTarget]:
     """Yield set points that no level would give, after one where the arm starts."""
     random = np.random.default_rng(seed)
@@ -110,8 +119,13 @@ def saved(arm: SimulatedArm) -> Message:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("interface", SET_POINTS)
-@pytest.mark.parametrize("name", ["puma560", "k1607"])
+@pytest.mark.parametrize(
+    ("name", "interface"),
+    [
+        *(("puma560", interface) for interface in SET_POINTS),
+        *(pytest.param("k1607", i, marks=pytest.mark.thorough) for i in SET_POINTS),
+    ],
+)
 def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
     name: str, interface: Interface, kind: str
 ) -> None:
@@ -129,12 +143,12 @@ def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("interface", SET_POINTS)
-@pytest.mark.parametrize("misses", [False, True])
+@pytest.mark.parametrize("misses", [pytest.param(False, marks=pytest.mark.thorough), True])
 def test_nor_an_arm_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interface: Interface, kind: str, misses: bool
 ) -> None:
     # Its drives cycle at 4 kHz, so they may be quick.
-    monkeypatch.setattr(set_points, "VELOCITY_GAIN", 400.0)
+    monkeypatch.setattr(simulated_arm, "VELOCITY_GAIN", 400.0)
 
     def beyond(is_guarded: bool) -> float:
         arm, guard = own(tmp_path, interface)
@@ -170,12 +184,7 @@ def test_nor_an_arm_of_ones_own(
 def test_what_no_drive_may_have_engages_the_brakes(
     tmp_path: Path, interface: Interface, is_own: bool, wrong: dict[str, float], alarm: Alarm
 ) -> None:
-    link: GuardedArm | SimulatedArm
-    arm: ServoArm | SimulatedArm
-    if is_own:
-        arm, link = own(tmp_path, interface)
-    else:
-        arm = link = simulated("puma560", interface)[0]
+    arm, link = link_of(tmp_path, interface, is_own)
     good = JointTarget(arm.cell.home, 0.0 * arm.cell.home, load(arm.cell))
     link.sense()
     assert link.follow(good, 0.0) is None
@@ -199,12 +208,7 @@ def test_what_no_drive_may_have_engages_the_brakes(
 def test_the_first_set_point_after_brakes_must_be_where_the_arm_is(
     tmp_path: Path, interface: Interface, is_own: bool
 ) -> None:
-    link: GuardedArm | SimulatedArm
-    arm: ServoArm | SimulatedArm
-    if is_own:
-        arm, link = own(tmp_path, interface)
-    else:
-        arm = link = simulated("puma560", interface)[0]
+    arm, link = link_of(tmp_path, interface, is_own)
     there = arm.cell.home.copy()
     there[1] += 0.02
     away = JointTarget(there, 0.0 * there, load(arm.cell))

@@ -51,18 +51,6 @@ def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
     )
 
 
-@pytest.mark.slow
-def test_a_free_arm_at_rest_senses_the_weight_upwards_and_no_contact(tmp_path: Path) -> None:
-    arm = arm_of(tmp_path)
-    arm.step(20)
-    weight = 1.1 * 9.81
-    turned = arm._data.site_xmat[arm.cell.wrist.site].reshape(3, 3)
-    assert np.allclose((turned * felt(arm)[:3]).sum(axis=1), [0.0, 0.0, weight], atol=1e-3)
-    contact = contact_of(arm)
-    contact.take(felt(arm), np.array(arm._state), STILL)
-    assert np.abs(contact.wrench).max() < 1e-3
-
-
 def test_before_its_first_step_an_arm_rests(tmp_path: Path) -> None:
     arm = arm_of(tmp_path)
     contact = contact_of(arm)

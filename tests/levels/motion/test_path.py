@@ -16,13 +16,6 @@ def points(path: BlendedPath, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return np.array(q), np.array(dq), np.array(d2q)
 
 
-def test_path_begins_and_ends_on_its_first_and_last_waypoint() -> None:
-    path = BlendedPath(CORNERED, BLEND)
-    assert path.evaluate(0.0).q == pytest.approx(CORNERED[0], abs=1e-15)
-    assert path.evaluate(path.length).q == pytest.approx(CORNERED[-1], abs=1e-12)
-    assert path.length == pytest.approx(np.linalg.norm(np.diff(CORNERED, axis=0), axis=1).sum())
-
-
 def test_derivatives_agree_with_finite_differences() -> None:
     path, step = BlendedPath(CORNERED, BLEND), 1e-5
     s = np.linspace(step, path.length - step, 2003)

@@ -80,11 +80,6 @@ def test_path_begins_and_ends_exactly_where_it_should(
     assert 3 <= len(around.waypoints) <= WAYPOINTS
 
 
-def test_corners_are_rounded_so_that_motion_does_not_stop(around: Path) -> None:
-    assert np.all(around.blend[1:-1] > 0.1)
-    assert BlendedPath(*around).stops == []
-
-
 @pytest.mark.slow
 def test_equal_questions_get_equal_paths_whatever_was_planned_before(
     puma: Cell, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
@@ -170,20 +165,20 @@ def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
 def test_a_motion_is_checked_at_the_places_and_in_the_order_of_ompl(
     planner: PathPlanner, puma: Cell, length: float, allowed: int
 ) -> None:
-    search, checked = planner._search, ([], [])
+    checked: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     one, other = puma.home, puma.home + length * np.array([1.0, 0.3, -0.7, 0.1, 0.9, -0.2])
 
     def free(scaled: np.ndarray) -> bool:
         checked[0].extend(scaled[: allowed + 1])
         return len(scaled) <= allowed
 
-    ours = search._space(np.array([one, other]), free)
-    states = [search._state(ours, q) for q in (one, other)]
+    ours = planner._space(np.array([one, other]), free)
+    states = [planner._state(ours, q) for q in (one, other)]
     # Without ours, it makes its own.
     theirs = base.SpaceInformation(ours.getStateSpace())
 
     def valid(state: base.State) -> bool:
-        checked[1].extend(search._values(state))
+        checked[1].extend(planner._values(state))
         return len(checked[1]) <= allowed
 
     theirs.setStateValidityChecker(valid)
@@ -207,6 +202,6 @@ def test_search_leaves_nothing_in_memory(
             alive.remove(self._free)
 
     monkeypatch.setattr(path_planner, "MotionCheck", Counted)
-    assert planner._search.search(np.array(sides), len, 1, 100)[1] > 1
+    assert planner._search(np.array(sides), len, 1, 100)[1] > 1
     gc.collect()
     assert alive == []

@@ -68,7 +68,3 @@ def test_stretched_out_no_single_joint_reaches_farther(cell: Cell, found: Abilit
     low, high = cell.limits.position.T
     assert ((low - 1e-12 <= far) & (far <= high + 1e-12)).all()
     assert all(((low <= position) & (position <= high)).all() for position in poses)
-
-
-def test_it_is_the_same_each_time(cell: Cell, found: Abilities) -> None:
-    assert abilities(cell) == found

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.robot.dynamics import OFF, Dynamics, Payload
 from rack.levels.tables import SceneConfig
@@ -46,10 +47,11 @@ def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
 
 @pytest.mark.parametrize("pose", PUMA)
 def test_puma_kinematics_match_the_robotics_toolbox(puma: Cell, pose: str) -> None:
-    position, rotation = Dynamics(puma).pose(np.array(PUMA[pose]["q"]))
-    wanted = np.array(PUMA[pose]["T"])
-    assert position == pytest.approx(wanted[:3, 3], abs=1e-12)
-    assert rotation == pytest.approx(wanted[:3, :3], abs=1e-10)
+    tool = InverseKinematics(puma, 0).tool_at(np.array(PUMA[pose]["q"]))
+    wanted, rotation = np.array(PUMA[pose]["T"]), np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, tool.quaternion)
+    assert tool.position == pytest.approx(wanted[:3, 3], abs=1e-12)
+    assert rotation == pytest.approx(wanted[:3, :3].ravel(), abs=1e-10)
 
 
 @pytest.mark.parametrize("pose", PUMA)

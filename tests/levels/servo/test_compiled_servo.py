@@ -15,8 +15,6 @@ from rack.levels.servo import (
     actuator_monitor,
     control,
     curves,
-    driver,
-    reference,
     sensor_monitor,
 )
 from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control, joint_torques
@@ -27,11 +25,9 @@ from tests.levels.servo.rig import Course, ServoRig
 JOINTS = 7
 MODULES = (
     curves,
-    reference,
     sensor_monitor,
     actuator_monitor,
     control,
-    driver,
     joint_control,
     joint_torques,
 )
@@ -124,15 +120,6 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         (table(1), 0.02, ends_s, 0.013, 0.00125, noise(2, 3, JOINTS))
         for ends_s in (0.01, 0.0135, np.inf)
     ],
-    "set_bridge": [(table(3), 0.02, 0.02, 0.013, noise(4), noise(5), 0.02, table(6))],
-    "is_within": [(table(7), 0.02, size * np.ones(JOINTS)) for size in (1e3, 1e5)],
-    "admit": (
-        [
-            (noise(k), noise(k + 1), -size, size, size)
-            for k, size in ((1, np.ones(JOINTS)), (3, np.full(JOINTS, 9.0)))
-        ]
-        + [(np.full(JOINTS, np.nan), noise(1), noise(2), noise(3), noise(4))]
-    ),
     "check": [sample_of(seed, error) for seed in range(35) for error in (1e-6, 1e-2, np.nan)],
     "left_over": [
         motion_of(k, following, size)
@@ -150,20 +137,8 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         )
         for k, size in ((1, 1.0), (2, 0.0))
     ],
-    "show": [
-        (
-            noise(1, 5 * JOINTS + 3),
-            noise(2, 3 * JOINTS),
-            noise(5),
-            *noise(3, 2, 3, JOINTS),
-            noise(4),
-            0.1,
-            0.2,
-            0.3,
-        )
-    ],
 }
-VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2, "add_up": 2}
+VERDICTS = {"check": 3, "left_over": 3, "set_torque": 2, "add_up": 2}
 """Kinds of verdicts that the cases reach; else: None."""
 
 

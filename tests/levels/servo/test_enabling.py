@@ -15,7 +15,7 @@ from rack.boards.config import load
 from rack.levels.arm import DriveState, Sensed, SimulatedArm
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation
-from rack.levels.robot.dynamics import Dynamics
+from rack.levels.planning.ik import InverseKinematics
 from rack.levels.servo import ServoExecutor
 from rack.levels.tables import SceneConfig
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
@@ -266,8 +266,8 @@ def test_offsets_make_positions_of_what_the_drives_give(tmp_path: Path, latency_
     assert np.abs(own.servo.arm._q - GOAL).max() < 5e-3  # type: ignore[attr-defined]
     assert np.abs(simulated.servo.arm._state[0] - GOAL).max() < 5e-3  # type: ignore[attr-defined]
     scene = own.rack.read("servo.scene")
-    position, _ = Dynamics(own.servo.cell).pose(own.servo.arm._q)  # type: ignore[attr-defined]
-    assert np.abs(scene.tool_position - position).max() < 1e-3
+    tool = InverseKinematics(own.servo.cell, 0).tool_at(own.servo.arm._q)  # type: ignore[attr-defined]
+    assert np.abs(scene.tool_position - tool.position).max() < 1e-3
 
 
 def test_guessed_values_keep_an_arm_of_ones_own_disabled_and_a_simulated_one_not(

@@ -48,23 +48,10 @@ def test_samples_are_steps_of_the_resolution_a_joint_and_brakes_and_gate_see_the
     assert arm._brake.rest[0] == 0.1234567
 
 
-def test_noise_is_that_of_its_tick_and_seed_and_has_its_size() -> None:
-    robot, scene = config("puma560")
-    cell = build_cell(coarse(robot, 0.0, 1e-3), scene, CLOCK_NS)
-    arm, other = (SimulatedArm(cell, scene, CLOCK_NS, seed=seed) for seed in (1, 2))
-    noise = []
-    for _ in range(200):
-        noise.append(arm.sense().position - arm._state[0])
-        assert np.array_equal(arm.sense().position, arm.sense().position)
-        assert not np.array_equal(arm.sense().position, other.sense().position)
-        arm.step(1)
-        other.step(1)
-    assert np.std(noise) == pytest.approx(1e-3, rel=0.1)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [0.0, 1e-4])
-@pytest.mark.parametrize("resolution", [1e-5, 1e-4, 3e-4, 1e-3])
+@pytest.mark.parametrize(
+    ("resolution", "noise"), [(1e-5, 0.0), (1e-5, 1e-4), (1e-3, 0.0), (1e-3, 1e-4)]
+)
 def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(
     resolution: float, noise: float
 ) -> None:

@@ -42,6 +42,8 @@ def test_a_two_second_move_is_followed_within_a_third_of_a_milliradian(name: str
     errors = rig.errors(move.at)
     assert np.abs(errors).max() < 0.33e-3
     assert np.sqrt(np.mean(errors**2)) < 0.1e-3
+    # The set points' own peak is 2.1 rad/s2: there is no jump in velocity.
+    assert np.abs(steps_of(rig.targets)).max() < 4.0
     assert rig.status.state == State.EXECUTING
     assert (rig.status.clipped, rig.status.touches, rig.status.error) == (0, 0, Error.NONE)
 
@@ -66,24 +68,6 @@ def test_without_a_planner_the_executor_uses_the_inertia_where_the_arm_is() -> N
     assert np.abs(rig.errors(move.at)).max() < 0.33e-3
 
 
-@pytest.mark.parametrize("name", GOALS)
-def test_before_any_set_point_the_arm_holds_home_with_the_gripper_open(name: str) -> None:
-    rig, (robot, _) = rig_of(name), config(name)
-    rig.run(200)
-    assert rig.status.position == pytest.approx(robot.home, abs=1e-3)
-    assert rig.status.holding == 1
-    assert rig.status.state == State.IDLE
-    assert rig.status.opening == pytest.approx(
-        robot.gripper.open if robot.gripper else 0.0, abs=1e-3
-    )
-
-
-def test_motion_between_set_points_has_no_jump_in_velocity() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.run(900, move.at)
-    assert np.abs(steps_of(rig.targets)).max() < 4.0  # the move's own peak is 2.1 rad/s2
-
-
 def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_limits() -> None:
     rig, move = rig_of("puma560"), course("puma560")
     limits = np.array(config("puma560")[0].acceleration)
@@ -99,20 +83,7 @@ def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_l
 
 
 @pytest.mark.slow
-def test_motion_resumes_smoothly_after_a_pause_above() -> None:
-    rig, move = rig_of("puma560"), course("puma560", 3.0)
-    limits = np.array(config("puma560")[0].acceleration)
-    rig.run(400, move.at)
-    rig.run(80)
-    assert rig.status.holding == 1
-    rig.run(1000, move.at)
-    assert rig.status.holding == 0
-    assert (np.abs(steps_of(rig.targets)) <= 2.2 * limits).all()
-    assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("late", [1, 3, PERIOD, 2 * PERIOD])
+@pytest.mark.parametrize("late", [1, 10 * PERIOD])
 def test_a_late_set_point_costs_no_jump(late: int) -> None:
     rig, move = rig_of("puma560"), course("puma560")
     rig.run(400, move.at)
@@ -126,7 +97,7 @@ def test_a_late_set_point_costs_no_jump(late: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("missed", [1, 3, 20, 200])
+@pytest.mark.parametrize("missed", [1, 200])
 def test_missed_cycles_do_not_stretch_simulated_time_nor_break_the_motion(missed: int) -> None:
     rig, move = rig_of("puma560"), course("puma560", 3.0)
     rig.run(500, move.at)
@@ -206,20 +177,6 @@ def test_a_set_point_due_in_the_far_future_is_refused() -> None:
     rig.run(20)
     assert rig.status.holding == 1
     assert rig.status.clipped == 20
-
-
-def test_equal_runs_give_equal_messages() -> None:
-    raws = []
-    for _ in range(2):
-        rig = rig_of("puma560")
-        rig.run(300, course("puma560").at)
-        raws.append(
-            [
-                bytes(rig.rack.read(f"servo.{port}").raw)
-                for port in ("status", "state", "scene", "plan")
-            ]
-        )
-    assert raws[0] == raws[1]
 
 
 def test_a_scene_is_filled_in_the_cycle_before_those_of_its_readers() -> None:
@@ -321,7 +278,7 @@ def test_a_restart_does_not_drop_the_held_object(grasping: ServoRig) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("early", [0, 3, PERIOD - 1])
+@pytest.mark.parametrize("early", [3, PERIOD - 1])
 def test_set_points_that_come_early_wait_for_their_turn(early: int) -> None:
     move, targets = course("puma560"), []
     for ahead in (0, early):

@@ -42,7 +42,13 @@ def run(rack: WholeRack, most_s: float, seed: int | None = None) -> list[tuple[i
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["nasrem", "nasrem-1khz", "crossing", "k1607"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("nasrem", "k1607"),
+        *(pytest.param(name, marks=pytest.mark.thorough) for name in ("nasrem-1khz", "crossing")),
+    ],
+)
 def test_a_whole_task_finds_nothing_and_breaks_no_limit(name: str) -> None:
     rack = WholeRack(name, motion=load(name).scene.motion)
     assert run(rack, 60.0) == []

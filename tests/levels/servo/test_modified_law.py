@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
 from rack.levels.level import Finding, LevelContext
-from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 from rack.levels.servo.common_modifications import DeadZone, JointPd, Notch
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.modification import (
@@ -130,13 +128,7 @@ class Bench:
         self.tick = 0
 
     def switch(self, name: str, is_on: bool) -> str:
-        message = Message(OPERATOR_COMMAND.dtype({}))
-        message.what, message.name, message.goal = (
-            Operation.MODIFY,
-            name,
-            Goal.ON if is_on else Goal.OFF,
-        )
-        return self.law.obey(message)
+        return self.law.switch(name, is_on)
 
     def run(self, samples: int, wanted: Callable[[int], float] = lambda tick: 0.0) -> Array:
         """Return the torque of the third joint in each sample, N m."""
@@ -157,10 +149,6 @@ class Bench:
 
 def swing(tick: int) -> float:
     return 0.5 * np.sin(0.01 * tick)
-
-
-def test_without_a_modification_put_in_the_torque_is_the_laws() -> None:
-    assert Bench(half="Half").run(3).tolist() == [3.0] * 3
 
 
 @pytest.mark.parametrize(

@@ -42,13 +42,6 @@ def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None
     assert (rig.status.answer, rig.status.standing) == (Answer.DONE, Operation.HOLD)
     assert (rig.status.holding, rig.status.stopped, rig.status.braked) == (1, 1, 0)
     assert np.abs(rig.status.position - held).max() < 1e-4
-
-
-@pytest.mark.slow
-def test_a_hold_brakes_no_joint_harder_than_planned_motion(rig: ServoRig) -> None:
-    rig.run(SECOND, COURSE.at)
-    Operator(rig.rack).say("servo", Operation.HOLD)
-    rig.run(SECOND, COURSE.at)
     assert_within_limits(np.array(rig.targets[SECOND:]))
 
 

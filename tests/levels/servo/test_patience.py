@@ -59,7 +59,7 @@ def swinging(**params: float) -> ServoRig:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("cycles", [1, 25])
+@pytest.mark.parametrize("cycles", [pytest.param(1, marks=pytest.mark.thorough), 25])
 @pytest.mark.parametrize(("kind", "parameters", "error"), KINDS)
 def test_a_fault_of_any_joint_that_ends_in_time_is_recovered_from_within_its_bound(
     kind: str, parameters: dict[str, float], error: Error, cycles: int
@@ -81,8 +81,14 @@ def test_a_fault_of_any_joint_that_ends_in_time_is_recovered_from_within_its_bou
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("joint", range(6))
-@pytest.mark.parametrize(("kind", "parameters", "error"), KINDS)
+@pytest.mark.parametrize(
+    ("kind", "parameters", "error", "joint"),
+    [
+        pytest.param(*kind, joint, marks=[pytest.mark.thorough] * (joint != number % 6))
+        for number, kind in enumerate(KINDS)
+        for joint in range(6)
+    ],
+)
 def test_a_fault_of_any_joint_that_outlasts_the_patience_is_latched_with_its_cause(
     kind: str, parameters: dict[str, float], error: Error, joint: int
 ) -> None:

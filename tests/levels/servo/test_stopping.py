@@ -44,8 +44,7 @@ def under_fire(at: tuple[float, float], end_y: float, speed: float) -> ServoRig:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("motion", [stand, turn])
-@pytest.mark.parametrize("at", [FOREARM, HAND])
+@pytest.mark.parametrize(("at", "motion"), [(FOREARM, turn), (HAND, stand)])
 def test_a_blow_at_4_m_s_is_a_collision_and_no_fault_of_motor_or_sensor_nor_a_broken_limit(
     at: tuple[float, float], motion: type
 ) -> None:
@@ -140,8 +139,9 @@ def test_stop_ramps_to_rest_within_the_acceleration_limits_and_then_brakes() -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
-@pytest.mark.parametrize("ticks", [1, 30, 300])
+@pytest.mark.parametrize(
+    ("demand", "ticks"), [(Demand.STOP, 1), (Demand.STOP, 300), (Demand.BRAKE, 30)]
+)
 def test_afterwards_motion_starts_where_the_arm_stands_and_joins_the_set_points(
     demand: Demand, ticks: int
 ) -> None:
@@ -172,19 +172,7 @@ def test_an_arm_braked_from_the_start_stays_where_it_is_without_an_alarm() -> No
     assert rig.status.position == pytest.approx(config("puma560")[0].home, abs=1e-3)
 
 
-@pytest.mark.parametrize(("missed", "seen"), [(1, None), (2, 2), (40, 40)])
-def test_brakes_engaged_by_missed_cycles_are_reported_once_the_servo_runs_again(
-    missed: int, seen: int | None
-) -> None:
-    rig, move = rig_under_way()
-    rig.miss(missed)
-    rig.run(100, move.at)
-    values = [(f.finding.alarm, f.finding.value) for f in rig.found]
-    assert values[:1] == ([] if seen is None else [(Alarm.BRAKES_CLOSED, seen)])
-    assert rig.status.stopped == 0
-
-
-@pytest.mark.parametrize("missed", [2, 3, 40])
+@pytest.mark.parametrize("missed", [1, 2, 40])
 def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_their_time(
     missed: int,
 ) -> None:
@@ -197,7 +185,9 @@ def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_the
         (Alarm.BRAKES_CLOSED, NO_TORQUE, missed, begun + 1),
         (Alarm.BRAKES_OPENED, NO_TORQUE, missed - 1, None),
     )
-    assert rig.found == [(begun + missed, closed), (begun + missed, opened)]
+    found = [(begun + missed, closed), (begun + missed, opened)]
+    assert rig.found == (found if missed > 1 else [])
+    assert rig.status.stopped == 0
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from rack.backplane.process import name_process
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards import config
-from rack.levels.arm.monitors import LimitMonitor
+from rack.levels.arm.simulation import Simulation
 from rack.tools.console.answer import Failure
 from rack.tools.faults.campaigns.environment import children, examine, left_behind, load
 from tests.processes import FORKS, forked, runs, wait_until
@@ -79,7 +79,7 @@ def test_a_counter_of_violations_that_counts_passes() -> None:
 def test_a_counter_of_violations_that_does_not_count_ends_the_campaign(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(LimitMonitor, "_count", lambda monitor, *_: None)
+    monkeypatch.setattr(Simulation, "_judge_limits", lambda plant: False)
     with pytest.raises(
         Failure,
         match=r"violation counter: joint 'j1' at \d+.* rad/s, twice its limit, is not counted",

@@ -1,0 +1,103 @@
+"""Simulated sensors: encoders of finite resolution, and one of force and torque at the wrist."""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from rack.levels.algebra import Array
+from rack.levels.compiled import compiled, compiled_for
+from rack.levels.robot.limits import EDGE_TIMING_S, Encoders
+from rack.levels.robot.wrist import Wrist
+
+AXES = 6
+STREAM = 0x57524953
+"""Added to the seed: the noise of the wrist sensor is not that of the encoders."""
+
+
+class CoarseSensors:
+    """Samples positions and velocities of the joints: noise on the truth, then the nearest step of
+    the encoder.
+
+    Velocities are the drive's, which times the encoder's edges: as coarse, and as noisy, as
+    positions over `EDGE_TIMING_S`. The noise of a tick is always the same, even on a restarted
+    board or when sampled twice.
+    """
+
+    def __init__(self, encoders: Encoders, seed: int) -> None:
+        per_second = np.array([[1.0], [1.0 / EDGE_TIMING_S]])
+        self._sensors = seed, encoders.noise * per_second, encoders.resolution * per_second
+        self._sense = sense_coarsely.load()
+
+    def sample(self, position: Array, velocity: Array, tick: int) -> Array:
+        """Return (2, joints): positions, rad, and velocities, rad/s, of a tick as sensed."""
+        sample = np.array((position, velocity))
+        self._sense(sample, tick, *self._sensors)
+        return sample
+
+
+class WristSensor:
+    """Samples the simulated wrist sensor: MuJoCo's numbers, noise, then the end of the range.
+
+    It gives the force and torque between the flange and all that hangs on it: of a contact, of the
+    weight, and of the inertia. MuJoCo gives them as those of the parent on the child, in the frame
+    of the site: a tool at rest that nothing touches reads its weight upwards, and one that presses
+    down on a table reads less than that. The noise of a tick is always the same, even on a
+    restarted board or when sampled twice.
+    """
+
+    def __init__(self, wrist: Wrist, data: mujoco.MjData, seed: int) -> None:
+        self._numbers = data.sensordata
+        self._places = wrist.addresses
+        self._range = np.repeat(wrist.range, 3)
+        noise = np.repeat(wrist.noise, 3)
+        self._sensors = seed + STREAM, np.stack((noise, noise)), np.zeros((2, AXES))
+        self._sense = sense_coarsely.load()
+
+    def sample(self, tick: int) -> Array:
+        """Return force, N, and torque, N m, in the sensor's frame, (6,), of the last step before
+        `tick`."""
+        sample = np.zeros((2, AXES))  # of which the second row is not used
+        sample[0] = self._numbers[self._places]
+        self._sense(sample, tick, *self._sensors)
+        return np.asarray(np.clip(sample[0], -self._range, self._range))
+
+
+@compiled_for("f8[:,::1], i8, i8, f8[:,::1], f8[:,::1]")
+def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Array) -> None:
+    """Add noise to a true `sample` (2, joints), of standard deviation `noise`, and round it to
+    multiples of `step`."""
+    joints = sample.shape[1]
+    chance = uniform(seed, tick, 2 * joints)
+    for joint in range(joints):
+        # Box and Muller: two independent normal numbers from two uniform ones.
+        length = math.sqrt(-2.0 * math.log(chance[joint]))
+        angle = 2.0 * math.pi * chance[joints + joint]
+        sample[0, joint] += noise[0, joint] * length * math.cos(angle)
+        sample[1, joint] += noise[1, joint] * length * math.sin(angle)
+        for row in range(2):
+            if step[row, joint] > 0.0:
+                sample[row, joint] = (
+                    np.rint(sample[row, joint] / step[row, joint]) * step[row, joint]
+                )
+
+
+@compiled_for("i8, i8, i8")
+def uniform(seed: int, tick: int, count: int) -> Array:
+    """Return `count` random numbers between 0 and 1, neither included: a function of seed and tick
+    alone."""
+    bits = mixed(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
+    bits = mixed(mixed(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
+    return ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+
+
+@compiled
+def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return `bits` mixed as SplitMix64 does (Steele, Lea and Flood, OOPSLA 2014)."""
+    bits = bits + np.uint64(0x9E3779B97F4A7C15)
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
