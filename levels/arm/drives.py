@@ -36,16 +36,14 @@ class LimitGate:
     """
 
     def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
-        self._torque = bounds.torque
-        self._fastest = SPEED_PART * bounds.velocity
-        self._low = bounds.position[:, 0] + RANGE_KEPT_RAD
-        self._high = bounds.position[:, 1] - RANGE_KEPT_RAD
-        self._braking = braking
+        low, high = bounds.position.T
+        fastest = SPEED_PART * bounds.velocity
+        kept = low + RANGE_KEPT_RAD, high - RANGE_KEPT_RAD
+        # The rows of `is_clear`.
+        self._limits = np.stack((bounds.torque, fastest, *kept, braking, dynamics.dry))
+        self._torque, self._fastest, self._low, self._high, self._braking, _ = self._limits
         self._period_s = period_s
         self._dynamics = dynamics
-        self._limits = np.stack(
-            (self._torque, self._fastest, self._low, self._high, braking, dynamics.dry)
-        )  # for `is_clear`
         self._is_clear = is_clear.load()
         joints = len(braking)
         self._inertia = np.eye(joints)

@@ -75,8 +75,8 @@ class FaultyLink:
         self._motors = [(step.part(a), a) for step, a in steps if isinstance(step, MotorStep)]
         self._commands = [(step, a) for step, a in steps if isinstance(step, CommandStep)]
         most = np.full(len(self._limits), np.inf)
-        for part, active in self._motors:
-            np.minimum(most, part * self._limits, out=most, where=active.joints)
+        for part, weak in self._motors:
+            np.minimum(most, part * self._limits, out=most, where=weak.joints)
         self._arm.weaken(most if self._motors else None)
 
     def _joints(self, fault: Fault) -> Mask:

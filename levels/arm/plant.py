@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+
 import mujoco
 
 from rack.backplane.message import Message
@@ -12,8 +14,9 @@ from rack.levels.robot.cell import Cell
 
 EPISODE_TICKS = 20
 """Ticks without a finding of a kind after which the next one is reported again."""
-SAVED = ("tick", "waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
-"""Attributes of a plant that its `ARM_STATE` keeps."""
+SAVED = ("waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
+"""Attributes of a plant that its `ARM_STATE` keeps, and that seldom change."""
+read_saved = attrgetter(*SAVED)
 
 
 class Plant:
@@ -53,6 +56,7 @@ class Plant:
         )
         # the first violation, readable: which limit, by how much, and when
         self.first_violation = ""
+        self._saved: tuple[Message, object] | None = None  # last state filled, with these
         self._model = cell.model
         self._data = cell.start()
 
@@ -73,8 +77,12 @@ class Plant:
         A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.state`.
         """
         self.report_cycle()
-        for name in SAVED:
-            setattr(state, name, getattr(self, name))
+        state.tick = self.tick
+        saved = state, read_saved(self)
+        if saved != self._saved:
+            self._saved = saved
+            for name in SAVED:
+                setattr(state, name, getattr(self, name))
 
     def find(self, finding: Finding) -> None:
         """Add a finding, unless it continues an episode."""
@@ -104,6 +112,7 @@ class Plant:
     def restore(self, state: Message) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
         board."""
+        self.tick = state.tick
         for name in SAVED:
             setattr(self, name, getattr(state, name))
         self.braked = bool(state.braked)

@@ -165,14 +165,10 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
         marks, lengths, limits, pairwise(speeds), strict=False
     ):
         if limit.acceleration > 0.0:
-            wanted = ruckig.InputParameter(1)
-            wanted.current_position = [start]
-            wanted.current_velocity = [before]
+            wanted = _from(PathState(start, before, 0.0), limit.acceleration, limit.jerk)
             wanted.target_position = [start + length]
             wanted.target_velocity = [after]
             wanted.max_velocity = [limit.speed]
-            wanted.max_acceleration = [limit.acceleration]
-            wanted.max_jerk = [limit.jerk]
             yield from _calculated(wanted)
         else:
             lasts_s = length / before if before > 0.0 else np.inf
@@ -180,14 +176,20 @@ def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator
 
 
 def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
-    wanted = ruckig.InputParameter(1)
+    wanted = _from(state, acceleration, jerk)
     wanted.control_interface = ruckig.ControlInterface.Velocity
+    return _joined(_calculated(wanted), state.s)
+
+
+def _from(state: PathState, acceleration: float, jerk: float) -> ruckig.InputParameter:
+    """Return what ruckig is asked for from a state within limits, in one dimension."""
+    wanted = ruckig.InputParameter(1)
     wanted.current_position = [state.s]
     wanted.current_velocity = [state.ds]
     wanted.current_acceleration = [state.dds]
     wanted.max_acceleration = [acceleration]
     wanted.max_jerk = [jerk]
-    return _joined(_calculated(wanted), state.s)
+    return wanted
 
 
 def _calculated(wanted: ruckig.InputParameter) -> list[Section]:

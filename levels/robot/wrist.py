@@ -33,9 +33,9 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
     Raises `RobotError`."""
     if config is None:
         return None
-    names = {"force": config.force, "torque": config.torque}
-    sensors = {key: _sensor(model, key, name) for key, name in names.items()}
-    force, torque = (int(model.sensor_objid[sensor]) for sensor in sensors.values())
+    names = (config.force, config.torque)
+    sensors = [_sensor(model, key, name) for key, name in zip(KINDS, names, strict=True)]
+    force, torque = model.sensor_objid[sensors].tolist()
     if force != torque:
         sites = f"'{model.site(force).name}' and '{model.site(torque).name}'"
         raise RobotError(
@@ -45,26 +45,24 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
         raise RobotError(
             f"robot.wrist: site '{model.site(force).name}' is on a body that the arm does not move"
         )
-    most = {"force": config.most_force, "torque": config.most_torque}
-    for key, sensor in sensors.items():
-        reach = float(model.sensor_cutoff[sensor])
-        unit = UNITS[key]
+    most = (config.most_force, config.most_torque)
+    reaches = model.sensor_cutoff[sensors].tolist()
+    for (key, unit), name, reach, limit in zip(UNITS.items(), names, reaches, most, strict=True):
         if not reach > 0.0:
             raise RobotError(
-                f"robot.wrist.{key}: sensor '{names[key]}' has no range; give it a cutoff, {unit}"
+                f"robot.wrist.{key}: sensor '{name}' has no range; give it a cutoff, {unit}"
             )
-        if most[key] > reach:
+        if limit > reach:
             raise RobotError(
-                f"robot.wrist.most_{key}: {most[key]:g} {unit} is beyond the sensor's range; at"
+                f"robot.wrist.most_{key}: {limit:g} {unit} is beyond the sensor's range; at"
                 f" most {reach:g} is valid"
             )
-    first = model.sensor_adr[list(sensors.values())]
-    ranges = model.sensor_cutoff[list(sensors.values())]
+    first = model.sensor_adr[sensors]
     return Wrist(
         site=force,
         addresses=(first[:, None] + np.arange(3)).ravel().astype(int),
-        range=(float(ranges[0]), float(ranges[1])),
-        most=(config.most_force, config.most_torque),
+        range=(reaches[0], reaches[1]),
+        most=most,
         noise=(config.noise, 0.1 * config.noise),
     )
 

@@ -14,6 +14,7 @@ from rack.backplane.watch.alarms import BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, DriveState, Sensed, find_arm, preload
+from rack.levels.arm.above import numbers
 from rack.levels.arm.arm import Link
 from rack.levels.arm.faulty import STEPS, FaultyLink
 from rack.levels.arm.guard import GuardedArm, kept_bounds
@@ -109,6 +110,8 @@ class ArmDriver(Executor):
             (2, len(cell.home))
         )  # the motion wanted in the last cycle begins with: rad, rad/s
         self._wanted[0] = cell.home
+        # Views of what changes in every cycle, in status and state.
+        self._numbers: tuple[Array, Array, Array] | None = None
         self._shown: tuple[object, ...] = ()  # what seldom changes, in the last status
         self._started = False  # the first cycle has begun
         self._adopted = False  # the arm is enabled, and its pose then was taken over
@@ -339,13 +342,18 @@ class ArmDriver(Executor):
         change."""
         arm = self.arm
         status = write.status
-        status.position, status.velocity, _ = self.sensors.estimate
-        status.torque = self.motors.torque[:] = arm.torque
-        status.target, status.target_velocity = self._wanted[:2]
-        status.opening = sensed.opening
-        status.opening_velocity = sensed.opening_velocity
-        status.grip_force = arm.grip_force
-        write.state.position, write.state.velocity, write.state.doubt = self.sensors.estimate
+        if self._numbers is None:
+            self._numbers = (
+                numbers(status, "position", "target_velocity").reshape(5, -1),
+                numbers(status, "opening", "grip_force"),
+                numbers(write.state, "position", "doubt").reshape(3, -1),
+            )
+        joints, gripper, kept = self._numbers
+        kept[:] = self.sensors.estimate
+        joints[:2] = self.sensors.state
+        joints[2] = self.motors.torque[:] = arm.torque
+        joints[3:] = self._wanted[:2]
+        gripper[:] = sensed.opening, sensed.opening_velocity, arm.grip_force
         course = self.course(reaction)
         shown = (
             course,

@@ -86,9 +86,7 @@ class Stopping:
 
     def remember(self, state: Message) -> None:
         """Fill in the state for `recall`."""
-        error = self.error
-        if self.is_disabled and not error:
-            error = Error.DISABLED
+        error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
         if (self._kept, error) != self._remembered:
             self._remembered = self._kept, error
             state.kept = self._kept

@@ -177,7 +177,7 @@ class JointServo(Executor):
     def _obey(self, command: Message) -> str:
         """Modify the law, or set a live parameter; return why not, empty: it is done."""
         if command.what == Operation.MODIFY:
-            return self._modified.obey(command)
+            return self._modified.switch(command.name, command.goal == Goal.ON)
         self._given, why = set_live(self._given, command.name)
         self._given.fill(self._constants)
         return why

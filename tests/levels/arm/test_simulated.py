@@ -147,9 +147,7 @@ def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Wat
 
 
 @pytest.mark.slow
-def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(
-    watched: Watch,
-) -> None:
+def test_limits_hold_at_every_step_when_commands_stop_coming_at_speed(watched: Watch) -> None:
     arm, made = arm_of("puma560")
     arm._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     extremes, torque = watched(arm), made.bounds.torque * [1, -1, 1, 1, -1, 1]

@@ -139,7 +139,11 @@ def test_surfaces_that_meet_at_home_touch(tmp_path: Path, apart: float) -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(lambda folder: grippers.independent(folder, **FOLLOW), id="independent"),
+        pytest.param(
+            lambda folder: grippers.independent(folder, **FOLLOW),
+            id="independent",
+            marks=pytest.mark.thorough,
+        ),
         pytest.param(grippers.rotary, id="rotary"),
         pytest.param(grippers.soft, id="soft", marks=pytest.mark.thorough),
         pytest.param(grippers.one_finger, id="one finger", marks=pytest.mark.thorough),

@@ -9,13 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.message import State
 from rack.levels.errors import RobotError
 from rack.levels.robot.cell import Cell, build_cell
 from tests.levels.arms import CLOCK_NS, cell, four_bar
-from tests.levels.whole_rack import WholeRack
-
-TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 
 
 def built(folder: Path, old: str = "", new: str = "") -> Cell:
@@ -112,12 +108,3 @@ def test_joint_that_nothing_determines_is_refused_by_name(
 ) -> None:
     with pytest.raises(RobotError, match=rf"robot\.gripper: joint '{joint}' follows nothing"):
         built(tmp_path, f'name="{equality}"', f'name="{equality}" active="false"')
-
-
-@pytest.mark.slow
-def test_task_with_a_gripper_of_closed_loops_is_done(tmp_path: Path) -> None:
-    rack = WholeRack(arm=four_bar(tmp_path), actions=[TRANSFER])
-    assert rack.run_to_end(25.0).state == State.DONE
-    assert rack.move.replans == 0
-    assert rack.read("servo.status").touches == 0
-    assert rack.read("world.model").position[0] == pytest.approx(TRANSFER["to"], abs=0.002)

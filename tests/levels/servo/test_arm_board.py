@@ -113,9 +113,7 @@ def test_restarted_board_of_the_arm_finds_it_where_it_is() -> None:
     ("kind", "alarm", "parameters"),
     [
         ("sensor-bias", Alarm.SENSOR_MODEL, {"joint": 2, "size": 0.02}),
-        ("sensor-dropout", Alarm.SENSOR_SILENT, {}),
         ("actuator-off", Alarm.ACTUATOR, {"joint": 1}),
-        ("command-nan", Alarm.COMMAND_INVALID, {"joint": 0}),
         ("command-limit", Alarm.COMMAND_LIMIT, {"joint": 3, "factor": 5.0}),
     ],
 )

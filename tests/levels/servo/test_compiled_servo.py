@@ -10,27 +10,14 @@ import pytest
 
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
-from rack.levels.servo import (
-    ServoExecutor,
-    actuator_monitor,
-    control,
-    curves,
-    sensor_monitor,
-)
+from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, sensor_monitor
 from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control, joint_torques
 from tests.levels.arms import config
 from tests.levels.servo.joint_rig import APART, JointRig
 from tests.levels.servo.rig import Course, ServoRig
 
 JOINTS = 7
-MODULES = (
-    curves,
-    sensor_monitor,
-    actuator_monitor,
-    control,
-    joint_control,
-    joint_torques,
-)
+MODULES = (curves, sensor_monitor, actuator_monitor, control, joint_control, joint_torques)
 FUNCTIONS = {
     name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)
 }

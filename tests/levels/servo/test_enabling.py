@@ -94,10 +94,7 @@ def test_an_arm_of_ones_own_waits_for_its_operator_and_goes_on_from_where_it_is(
     assert np.abs(status.position - START - AWAY).max() == 0.0
     operator.say("servo", Operation.ENABLE)
     servo.run(3)
-    assert (servo.status.reason, servo.status.answer) == (
-        "drives are being enabled",
-        Answer.TAKEN,
-    )
+    assert (servo.status.reason, servo.status.answer) == ("drives are being enabled", Answer.TAKEN)
     servo.run(100)
     assert (servo.status.braked, servo.status.answer, servo.status.error) == (0, Answer.DONE, 0)
     # Held by torques, where it was.
@@ -314,7 +311,7 @@ def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
     assert (status.touches, status.violations) == (0, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_arm_moved_by_hand_in_the_middle_of_a_path_goes_on_to_its_end() -> None:
     rack, operator, arm = whole()
     rack.run(20.0, lambda rack: rack.read("primitive.status").progress > 0.5)

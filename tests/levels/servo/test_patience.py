@@ -185,7 +185,7 @@ def test_sensors_trusted_again_report_the_offset_found() -> None:
         assert rest[joint] == pytest.approx(thought[joint] + offset, abs=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.timeout(200)
 def test_nasrem_continues_after_all_sensors_were_stuck_for_half_a_second() -> None:
     rack = WholeRack("nasrem")

@@ -29,6 +29,7 @@ from tests.levels.servo.rig import TICK_S, Course, ServoRig
 COURSE = Course(START, GOAL, 0.8)
 OWN = "tests.levels.servo.test_set_point_law:"
 STUCK_AT = 150
+ONE = ["position", pytest.param("velocity", marks=pytest.mark.thorough)]
 
 
 class StuckServoArm(ServoArm):
@@ -84,7 +85,7 @@ def test_drives_that_count_from_elsewhere_get_set_points_as_they_count(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("interface", ONE)
 def test_the_end_of_a_bring_up_does_not_move_the_set_points(
     tmp_path: Path, interface: Interface
 ) -> None:
@@ -99,7 +100,7 @@ def test_the_end_of_a_bring_up_does_not_move_the_set_points(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("interface", ONE)
 def test_a_restarted_board_goes_on(tmp_path: Path, interface: Interface) -> None:
     servo = rig(tmp_path, interface)
     servo.run(160, COURSE.at)
@@ -126,7 +127,7 @@ def test_missed_cycles_brake_it_and_it_goes_on(tmp_path: Path, interface: Interf
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
+@pytest.mark.parametrize("interface", ONE)
 def test_as_often_as_cycles_are_missed_the_first_set_point_is_where_the_arm_is(
     tmp_path: Path, interface: Interface
 ) -> None:
@@ -180,8 +181,7 @@ def test_a_drive_that_does_not_follow_is_a_motor_fault(
 
 @pytest.mark.parametrize("interface", SET_POINTS)
 @pytest.mark.parametrize(
-    ("kind", "alarm"),
-    [("command-nan", Alarm.COMMAND_INVALID), ("sensor-nan", Alarm.SENSOR_RANGE)],
+    ("kind", "alarm"), [("command-nan", Alarm.COMMAND_INVALID), ("sensor-nan", Alarm.SENSOR_RANGE)]
 )
 def test_what_is_not_finite_is_not_followed(
     tmp_path: Path, interface: Interface, kind: str, alarm: Alarm
