@@ -1,14 +1,10 @@
-"""The messages of boards that drive an arm, or a hand, together: the commands of all of them must
-be fresh."""
+"""The commands of the boards above that drive an arm, or a hand, together: all of them must be
+fresh."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
-from rack.backplane.message import Message
-from rack.levels.algebra import Array
 from rack.levels.level import LevelContext, Reading, Verdict
 from rack.levels.robot.limits import MotorPatience
 
@@ -50,13 +46,3 @@ class CommandsAbove:
                 )
             all_know = all_know and sampled >= since
         return "" if all_know else f"{self._halted} until the boards above have seen it"
-
-
-def numbers(message: Message, first: str, last: str) -> Array:
-    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one
-    array."""
-    fields = message.record.dtype.fields
-    assert fields is not None
-    begin = fields[first][1]
-    end = fields[last][1] + fields[last][0].itemsize
-    return np.frombuffer(message.raw[begin:end])

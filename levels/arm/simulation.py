@@ -3,6 +3,7 @@ itself in it."""
 
 from __future__ import annotations
 
+from copy import copy
 from itertools import pairwise
 from typing import ClassVar
 
@@ -17,13 +18,16 @@ from rack.levels.arm.plant import Plant
 from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell, unintended_contacts
+from rack.levels.robot.engine import INTEGRATION, mj_update_sleep
 from rack.levels.robot.lookup import geom_name
-from rack.levels.robot.state import restore_state, sleeping
+from rack.levels.robot.state import SLEEP, view_state
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
 """Ticks after a contact, or after the last limit broken since, in which the motion is blamed on the
 blow."""
+STEPS_AT_REST = 10
+"""Steps in which a body is slower than `sleep_tolerance` before it sleeps: MuJoCo's mjMINAWAKE."""
 QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
 """What is judged of a joint, by row of a step."""
 
@@ -259,3 +263,43 @@ def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
                 share = min(1.0, since / push.rise, left / push.rise)
             total += np.array(push.force) * share
     return total
+
+
+def sleeping(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
+    """Return the model to step a simulation with: bodies at rest sleep where all that could move
+    them wakes them.
+
+    A mocap body that moves does not, and MuJoCo ends the process at tendon equalities and flexible
+    bodies that might sleep. Where steps are short, or gravity weak, a body would sleep in the air,
+    at the turning point of its flight. Only for whole steps: parts of one, called by themselves,
+    leave out what does not move.
+    """
+    found = copy(model)
+    option = found.opt
+    gained = STEPS_AT_REST * option.timestep * norm(option.gravity)  # m/s, in falling
+    tendons = model.eq_type == mujoco.mjtEq.mjEQ_TENDON
+    lingers = gained < 4.0 * option.sleep_tolerance  # in the air, for longer than those steps
+    if not (lingers or scene.motion or tendons.any() or model.nflex):
+        option.enableflags |= SLEEP
+    return found
+
+
+def save_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
+    """Fill `state`, (state_size,)."""
+    trees = state.size - model.ntree
+    mujoco.mj_getState(model, data, state[:trees], INTEGRATION)
+    state[trees:] = data.tree_asleep
+
+
+def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
+    """Set `data` to a state, so that its next steps are those of the data that was saved."""
+    data.tree_asleep[:] = -1
+    mj_update_sleep(model._address, data._address)
+    view_state(model, data, state)
+    asleep = state[state.size - model.ntree :]
+    if (asleep >= 0).any():
+        # Steps no longer compute what belongs to sleeping bodies: here, once, while they are awake.
+        mujoco.mj_forward(model, data)
+        view_state(model, data, state)
+    data.tree_asleep[:] = asleep
+    mj_update_sleep(model._address, data._address)

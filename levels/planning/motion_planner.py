@@ -192,18 +192,14 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
                 break
             points.append(q)
         else:
-            path = _smooth(np.array(points))
+            # Every corner is rounded by half of the shorter adjacent line: the motion never stops.
+            lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+            blend = np.zeros(len(points))
+            blend[1:-1] = 0.5 * np.minimum(lengths[:-1], lengths[1:])
+            path = Path(np.array(points), blend)
             if _stray(ik, path, begin, target) < MAX_STRAY_M:
                 return path
     return None
-
-
-def _smooth(points: Array) -> Path:
-    """Round every corner by half of the shorter adjacent line, so that the motion never stops."""
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    blend = np.zeros(len(points))
-    blend[1:-1] = 0.5 * np.minimum(lengths[:-1], lengths[1:])
-    return Path(points, blend)
 
 
 def _stray(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> float:

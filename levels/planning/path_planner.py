@@ -97,7 +97,12 @@ class PathPlanner:
 
     def rounded(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:
         """Return the path along `waypoints`, with each corner rounded as far as it stays free."""
-        blend = _largest_blends(waypoints)
+        # Blends must not overlap: up to half of an inner line, most of the first and the last.
+        lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+        room = 0.5 * lengths
+        room[[0, -1]] = END_PART * lengths[[0, -1]] if len(lengths) > 1 else 0.0
+        blend = np.zeros(len(waypoints))
+        blend[1:-1] = np.minimum(room[:-1], room[1:])
         for corner in range(1, len(waypoints) - 1):
             largest = float(blend[corner])
             blend[corner] = self._free_blend(waypoints, corner, largest, first_blocked)
@@ -167,7 +172,12 @@ class PathPlanner:
         planner.solve(base.PlannerTerminationCondition(lambda: count > budget))
         if not problem.hasExactSolution():
             return None, count
-        path = _simplified(information, problem.getSolutionPath())
+        path = problem.getSolutionPath()
+        simplifier = geometric.PathSimplifier(information)
+        simplifier.reduceVertices(path)
+        simplifier.partialShortcutPath(path)
+        simplifier.collapseCloseVertices(path)
+        simplifier.reduceVertices(path)
         polyline = self._values(*path.getStates()) / self._levers
         # Scaling there and back rounds: restore the exact ends.
         polyline[[0, -1]] = ends
@@ -245,28 +255,6 @@ def halved(ends: Array, count: int) -> Array:
                 stretches[known] = half
                 known += 1
     return places
-
-
-def _simplified(
-    information: base.SpaceInformation, path: geometric.PathGeometric
-) -> geometric.PathGeometric:
-    simplifier = geometric.PathSimplifier(information)
-    simplifier.reduceVertices(path)
-    simplifier.partialShortcutPath(path)
-    simplifier.collapseCloseVertices(path)
-    simplifier.reduceVertices(path)
-    return path
-
-
-def _largest_blends(waypoints: Array) -> Array:
-    """Return blends (k,) that do not overlap: up to half of an inner line, most of the first and
-    the last."""
-    lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-    room = 0.5 * lengths
-    room[[0, -1]] = END_PART * lengths[[0, -1]] if len(lengths) > 1 else 0.0
-    blend = np.zeros(len(waypoints))
-    blend[1:-1] = np.minimum(room[:-1], room[1:])
-    return blend
 
 
 def lever_arms(cell: Cell, seed: int) -> Array:

@@ -182,6 +182,16 @@ def index(
     if wrist is not None:  # contacts of a support and what hangs on the sensor are measured
         pressed = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
         touch[np.ix_(pressed, supports)] = touch[np.ix_(supports, pressed)] = False
+    gripper = None
+    if robot.gripper is not None and joint is not None:
+        gripper = Gripper(
+            dof=int(model.jnt_dofadr[joint]),
+            actuator=int(model.actuator(robot.gripper.actuator).id),
+            open=robot.gripper.open,
+            closed=robot.gripper.closed,
+            stiffness=robot.gripper.gains[0],
+            linkage=solve_linkage(model, robot.gripper, linked, joints),
+        )
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = robot.home
     data.qvel[model.jnt_dofadr[joints]] = robot.velocity
@@ -196,7 +206,7 @@ def index(
         begin=np.array(robot.start or robot.home),
         homing=robot.calibration.homing,
         tool=tool,
-        gripper=_gripper(model, robot.gripper, joint, linked, joints),
+        gripper=gripper,
         arm_geoms=arm_geoms,
         gripper_geoms=gripper_geoms,
         bodies=bodies,
@@ -243,25 +253,6 @@ def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -
     contact = data.contact
     pairs: NDArray[np.int32] = contact.geom
     return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < within)])
-
-
-def _gripper(
-    model: mujoco.MjModel,
-    config: GripperConfig | None,
-    joint: int | None,
-    linked: Mask,
-    arm: Ints,
-) -> Gripper | None:
-    if config is None or joint is None:
-        return None
-    return Gripper(
-        dof=int(model.jnt_dofadr[joint]),
-        actuator=int(model.actuator(config.actuator).id),
-        open=config.open,
-        closed=config.closed,
-        stiffness=config.gains[0],
-        linkage=solve_linkage(model, config, linked, arm),
-    )
 
 
 def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float) -> bool:

@@ -14,7 +14,6 @@ from rack.backplane.watch.alarms import BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, DriveState, Sensed, find_arm, preload
-from rack.levels.arm.above import numbers
 from rack.levels.arm.arm import Link
 from rack.levels.arm.faulty import STEPS, FaultyLink
 from rack.levels.arm.guard import GuardedArm, kept_bounds
@@ -407,3 +406,13 @@ class ArmDriver(Executor):
             broken = arm.first_violation if arm.violations else arm.first_touch
             slow = self.enabling.slow if slowed else ""
             status.reason = kept or broken or slow or self.note
+
+
+def numbers(message: Message, first: str, last: str) -> Array:
+    """Return a view of the fields from `first` to `last`, which are adjacent numbers, as one
+    array."""
+    fields = message.record.dtype.fields
+    assert fields is not None
+    begin = fields[first][1]
+    end = fields[last][1] + fields[last][0].itemsize
+    return np.frombuffer(message.raw[begin:end])

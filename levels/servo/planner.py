@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, mat_vec, transposed_mat_vec
+from rack.levels.algebra import mat_vec, transposed_mat_vec
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
 from rack.levels.robot.cell import cell_of
@@ -42,23 +42,21 @@ class ServoPlanner(Planner):
     def plan(self, read: Ports, write: Message, tick: int) -> None:
         """Fill a `SERVO_PLAN`."""
         command: Message = read.command.value
-        held = (
-            command.held
-            if command.due != 0 and read.scene.is_there and 0 <= command.held < self._objects
-            else -1
-        )
-        payload = Payload(0.0, np.zeros(3)) if held < 0 else self._payload(read.scene.value, held)
-        write.inertia = self._dynamics.terms(self._position(read), self._rest, payload).inertia
+        held = -1
+        payload = Payload(0.0, np.zeros(3))
+        if command.due != 0 and read.scene.is_there and 0 <= command.held < self._objects:
+            held = command.held
+            payload = self._payload(read.scene.value, held)
+        # Plan for the set point due, else for where the arm is, else for home.
+        position = self._home
+        if command.due != 0 and np.isfinite(command.position).all():
+            position = command.position
+        elif read.status.is_there:
+            position = read.status.value.position
+        write.inertia = self._dynamics.terms(position, self._rest, payload).inertia
         write.held = held
         write.payload_mass = payload.mass
         write.payload_offset = payload.offset
-
-    def _position(self, read: Ports) -> Array:
-        """Return the joint positions to plan for: the set point due, else where the arm is, else
-        home."""
-        if read.command.value.due != 0 and np.isfinite(read.command.value.position).all():
-            return np.asarray(read.command.value.position)
-        return np.asarray(read.status.value.position) if read.status.is_there else self._home
 
     def _payload(self, scene: Message, held: int) -> Payload:
         """Return mass and centre, in the frame of the tool, of an object as the scene shows it."""

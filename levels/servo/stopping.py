@@ -192,8 +192,12 @@ class Stopping:
             reaction = self._on_sensors if sensors.drivable else Reaction.BRAKE
             cause = self._about_sensors(sensors)
         if self._retry_at is not None:
-            reaction = max(reaction, self._about_motors(self._retry_at, tick))
-            cause = self._motor if self._retry_at is not None else cause
+            if tick >= self._retry_at + self._good_ticks:
+                self._retry_at = None
+            else:
+                on_motors = self._on_failure if tick < self._retry_at else Reaction.HOLD
+                reaction = max(reaction, on_motors)
+                cause = self._motor
         if self._struck_until is not None:
             if tick < self._struck_until:
                 return max(reaction, self._on_blow), self._blow
@@ -218,9 +222,3 @@ class Stopping:
             what = f"{refused.value:.3g} rad from the joint"
             text = f"rejected: set point of '{self._joints[refused.subject]}' is {what}"
         return Cause(Error.LIMIT, text, refused.subject, refused.value)
-
-    def _about_motors(self, retry_at: int, tick: int) -> Reaction:
-        if tick >= retry_at + self._good_ticks:
-            self._retry_at = None
-            return Reaction.NONE
-        return self._on_failure if tick < retry_at else Reaction.HOLD

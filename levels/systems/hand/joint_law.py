@@ -20,10 +20,10 @@ from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, Mask
-from rack.levels.arm.above import numbers
 from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
+from rack.levels.servo.driver import numbers
 from rack.levels.tables import NotNegative, Positive, Table
 
 

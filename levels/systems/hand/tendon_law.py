@@ -24,10 +24,10 @@ from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, Mask
-from rack.levels.arm.above import numbers
 from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
+from rack.levels.servo.driver import numbers
 from rack.levels.tables import NotNegative, Positive, Table
 
 MOST_LEARNED = 0.1

@@ -11,7 +11,6 @@ import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
-from rack.levels.arm.above import numbers
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports
 from rack.levels.messages import Error
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
@@ -20,6 +19,7 @@ from rack.levels.robot.cell import cell_of
 from rack.levels.servo import curves, reference
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
+from rack.levels.servo.driver import numbers
 from rack.levels.servo.modification import ModifiableParams, misfits_of, names_of
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.arm.above import CommandsAbove, numbers
+from rack.levels.arm.above import CommandsAbove
 from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext, Reading
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
 from rack.levels.robot.engine import one_view
 from rack.levels.servo.curves import Motion
+from rack.levels.servo.driver import numbers
 
 
 class JointTorques(CommandsAbove):

@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from rack.levels.arm.simulation import save_state
 from rack.levels.robot.engine import contact_views, mj_step
-from rack.levels.robot.state import save_state, state_size
+from rack.levels.robot.state import state_size
 from tests.levels.arms import cell
 
 

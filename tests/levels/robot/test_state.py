@@ -11,9 +11,10 @@ import pytest
 from rack.backplane.message import Message
 from rack.boards.checkpoint.kinds import part_kind
 from rack.levels.arm import SimulatedArm
+from rack.levels.arm.simulation import sleeping
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import sizes
-from rack.levels.robot.state import SLEEP, sleeping
+from rack.levels.robot.state import SLEEP
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
 

@@ -10,9 +10,9 @@ import rerun.blueprint as rrb
 
 from rack.backplane.message import MessageType
 from rack.backplane.segment import Launch
+from rack.levels.arm.simulation import save_state
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
-from rack.levels.robot.state import save_state
 from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
 from rack.tools.viewer.cell import Poses
 from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of

@@ -88,9 +88,9 @@ def examine(config: RackConfig) -> None:
 
     from rack.backplane.message import Message
     from rack.levels.arm import SimulatedArm
+    from rack.levels.arm.simulation import save_state
     from rack.levels.messages import ARM_STATE
     from rack.levels.robot.cell import build_cell, sizes
-    from rack.levels.robot.state import save_state
 
     if config.robot is None:
         return

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from rack.boards.config.cell import built_cell
-from rack.levels.robot.state import restore_state, sleeping
+from rack.levels.arm.simulation import restore_state, sleeping
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 

@@ -13,7 +13,7 @@ import pytest
 
 from rack.backplane.trace import RECORD
 from rack.boards.config import load, wire
-from rack.levels.robot.state import sleeping
+from rack.levels.arm.simulation import sleeping
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import physics
