@@ -131,7 +131,7 @@ class SimulatedArm(Simulation, Arm):
         return None
 
     def _release(self) -> None:
-        """Release the brakes."""
+        """Release the brakes, and let the motors give the command."""
         self.waited = 0
         self.braked = False
         self._give()

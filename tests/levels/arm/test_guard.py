@@ -150,7 +150,7 @@ def test_as_coarse_as_its_encoders_may_be_it_keeps_them_too(
     assert cell.encoders.off.min() > 2e-3
     arm = kind(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(arm, cell, robot.joints, TICK_S)
-    assert max(excess(cell, driven(guard, arm, random_torques(cell, seed, 1500)))) <= 0.0
+    assert max(excess(cell, driven(guard, arm, random_torques(cell, seed, 800)))) <= 0.0
     assert arm.clipped > 50
     assert arm.violations == 0
 
@@ -185,7 +185,7 @@ def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path, seed: int) ->
         link = GuardedArm(arm, cell, robot.joints, TICK_S) if is_guarded else arm
         arm.enable()
         worst = -np.inf
-        for torque in random_torques(cell, seed, 1500):
+        for torque in random_torques(cell, seed, 800):
             link.sense()
             link.drive(torque, 0.0)
             # The torque is kept until the brakes engage, at the latest.
@@ -319,11 +319,11 @@ def test_during_bring_up_no_torques_lead_beyond_its_part_of_the_speed(
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(arm, cell, robot.joints, TICK_S, part=0.1)
-    _, slow = driven(guard, arm, random_torques(cell, seed, 1500))
+    _, slow = driven(guard, arm, random_torques(cell, seed, 800))
     assert (np.abs(slow) / cell.bounds.velocity).max() <= 0.1
     assert (arm.violations, arm.clipped > 50) == (0, True)
     guard.permit(1.0)
-    motion = driven(guard, arm, random_torques(cell, seed, 1500))
+    motion = driven(guard, arm, random_torques(cell, seed, 800))
     assert (np.abs(motion[1]) / cell.bounds.velocity).max() > 0.1
     assert max(excess(cell, motion)) <= 0.0
 

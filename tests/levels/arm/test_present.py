@@ -166,7 +166,7 @@ def test_late_samples_lead_beyond_no_limit(
     arm.late = latency
     own = arm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(own, cell, robot.joints, TICK_S, PresentLink(own, cell, TICK_S))
-    assert max(excess(cell, driven(guard, own, random_torques(cell, seed, 1500)))) <= 0.0
+    assert max(excess(cell, driven(guard, own, random_torques(cell, seed, 800)))) <= 0.0
     assert own.clipped > 50
     assert own.violations == 0
 

@@ -141,7 +141,14 @@ def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "jumps",
+        "beyond",
+        *(pytest.param(k, marks=pytest.mark.thorough) for k in ("swings", "ramps")),
+    ],
+)
 @pytest.mark.parametrize("interface", SET_POINTS)
 @pytest.mark.parametrize("misses", [pytest.param(False, marks=pytest.mark.thorough), True])
 def test_nor_an_arm_of_ones_own(

@@ -126,7 +126,7 @@ def test_a_restored_arm_keeps_the_torque_that_it_was_given_last() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["puma560", "k1607"])
+@pytest.mark.parametrize("name", ["puma560", pytest.param("k1607", marks=pytest.mark.thorough)])
 def test_limits_hold_at_every_step_whatever_is_commanded(name: str, watched: Watch) -> None:
     arm, made = arm_of(name)
     arm._model.opt.disableflags |= int(

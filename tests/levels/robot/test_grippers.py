@@ -135,19 +135,15 @@ def test_surfaces_that_meet_at_home_touch(tmp_path: Path, apart: float) -> None:
         assert build_cell(robot, SceneConfig(), CLOCK_NS).gripper is None
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(
-            lambda folder: grippers.independent(folder, **FOLLOW),
-            id="independent",
-            marks=pytest.mark.thorough,
-        ),
+        pytest.param(lambda folder: grippers.independent(folder, **FOLLOW), id="independent"),
         pytest.param(grippers.rotary, id="rotary"),
-        pytest.param(grippers.soft, id="soft", marks=pytest.mark.thorough),
-        pytest.param(grippers.one_finger, id="one finger", marks=pytest.mark.thorough),
-        pytest.param(four_bar, id="four-bar", marks=pytest.mark.thorough),
+        pytest.param(grippers.soft, id="soft"),
+        pytest.param(grippers.one_finger, id="one finger"),
+        pytest.param(four_bar, id="four-bar"),
     ],
 )
 def test_a_transfer_is_done_with_every_kind_of_gripper(tmp_path: Path, kind: Any) -> None:

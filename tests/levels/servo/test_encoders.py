@@ -140,7 +140,7 @@ def test_by_default_an_arm_of_ones_own_may_be_sampled_early_or_late(
         start, goal = ends[::-1] if turn % 2 else ends
         return Course(start, goal, 1.4).at(time_s - 1.5 * turn)
 
-    rig.run(3600, back_and_forth)  # 9 s
+    rig.run(1800, back_and_forth)  # 4.5 s
     assert np.abs(rig.servo.arm._qd).max() < 3.0  # type: ignore[attr-defined]
     closed = rig.alarms().count(Alarm.BRAKES_CLOSED)
     assert (closed > 0) == brakes
