@@ -8,7 +8,7 @@ import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
-from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
+from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import (
     MOVE_COMMAND,
     MOVE_PLAN,
@@ -27,7 +27,7 @@ from rack.levels.operator import (
     OPERATOR_COMMAND,
     Orders,
 )
-from rack.levels.tables import GripperConfig, read_params
+from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
@@ -83,15 +83,10 @@ class ElementalMoveExecutor(Executor):
             while (taken := segments.take_done(status.done)) is not None:
                 self._done = int(taken["move"])
                 self._replans_of_move = 0
-                gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
-                if (
-                    gripper is not None
-                    and taken["opening"] == gripper.closed
-                    and self._is_shut(status)
+                if taken["kind"] == SegmentKind.GRIPPER and (
+                    shut := self._shut(status, taken["opening"])
                 ):
-                    self._fail(
-                        Error.GRASP_MISSED, f"{closed_so_far(gripper, status)}: it holds nothing"
-                    )
+                    self._fail(Error.GRASP_MISSED, f"{shut}: it holds nothing")
             self._check_below(status, segments)
         if not self._error:
             self._replan_if_blocked(status, segments, tick)
@@ -139,9 +134,8 @@ class ElementalMoveExecutor(Executor):
         if status.state == State.ERROR:
             self._fail(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
-        gripper = self._gripper
-        if gripper is not None and moving and status.held >= 0 and self._is_shut(status):
-            self._fail(Error.OBJECT_LOST, f"{closed_so_far(gripper, status)}: the object is lost")
+        if moving and status.held >= 0 and (shut := self._shut(status)):
+            self._fail(Error.OBJECT_LOST, f"{shut}: the object is lost")
 
     def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
         """Request another path where the arm rests in front of an obstacle; cancel the request when
@@ -232,13 +226,21 @@ class ElementalMoveExecutor(Executor):
         # another cycle later.
         return by_s - 2.0 * self.context.period_s - self._params.answer
 
-    def _is_shut(self, status: Message) -> bool:
+    def _shut(self, status: Message, wanted: float | None = None) -> str:
+        """Return how far the gripper has closed, if that is so far that it holds nothing, else an
+        empty text.
+
+        `wanted` is the opening to which it was to go, by default the closed one.
+        """
         gripper = self._gripper
-        if gripper is None:
-            return False
-        return bool(
-            abs(status.opening - gripper.closed) < (self._params.grasp_gap or gripper.still)
-        )
+        if gripper is None or wanted not in (None, gripper.closed):
+            return ""
+        away = status.opening - gripper.closed
+        if not abs(away) < (self._params.grasp_gap or gripper.still):
+            return ""
+        # As a part of its way: that is a length or an angle.
+        part = away / (gripper.open - gripper.closed)
+        return f"the gripper has closed to {part:.1%} of its way"
 
     def _fail(self, error: Error, reason: str) -> None:
         if not self._error:
@@ -251,12 +253,8 @@ class ElementalMoveExecutor(Executor):
         status = read.status.value
         report.echo = command.id
         report.state = self._state(command)
-        waits = (
-            self._reason_to_wait(read.command, read.status)
-            if report.state == State.EXECUTING
-            else ""
-        )
-        if waits:
+        waits = ""
+        if report.state == State.EXECUTING and (waits := self._reason_to_wait(read)):
             report.state = State.HOLDING
         report.error = self._error
         report.reason = self._reason if self._error else waits
@@ -299,9 +297,11 @@ class ElementalMoveExecutor(Executor):
             self._orders.done()
         self._orders.report(write.status, above)
 
-    def _reason_to_wait(self, command: Reading, below: Reading) -> str:
+    def _reason_to_wait(self, read: Ports) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
+        command = read.command
+        below = read.status
         if self._orders.stands:
             return self._orders.keeps(self.context.board)
         if command.is_lost:
@@ -320,10 +320,3 @@ class ElementalMoveExecutor(Executor):
         if not command.id:
             return State.IDLE
         return State.DONE if self._done >= command.id else State.EXECUTING
-
-
-def closed_so_far(gripper: GripperConfig, status: Message) -> str:
-    """Say how far the gripper is from closed, as a part of its way: that is a length or an
-    angle."""
-    part = (status.opening - gripper.closed) / (gripper.open - gripper.closed)
-    return f"the gripper has closed to {part:.1%} of its way"

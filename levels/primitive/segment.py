@@ -88,6 +88,7 @@ class Memory:
     """The state with which the executor continues after a restart of its board; its own last
     messages hold it."""
 
+    is_known: bool = False  # True once this level, restarts included, was in step with the servo
     done: int = 0  # newest segment done
     interrupted: int = 0  # segment that was interrupted; 0: none
     progress: float = 0.0  # part of its path done, 0 to 1
@@ -101,14 +102,15 @@ class Memory:
         return self.held if self.held is not None else -1
 
 
-def recall(read: Ports) -> Memory | None:
-    """Return the state in the level's own last messages; None before the first ones."""
+def recall(read: Ports) -> Memory:
+    """Return the state in the level's own last messages; not `is_known` before the first ones."""
     status = read.last_status
     command = read.last_command
     if not (status.is_there and command.is_there and command.value.id):
-        return None
+        return Memory()
     held = status.value.held if status.value.held >= 0 else None
     return Memory(
+        is_known=True,
         done=status.value.done,
         interrupted=status.value.current,
         progress=status.value.progress,

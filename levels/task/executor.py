@@ -150,16 +150,8 @@ class TaskExecutor(Executor):
     def _check_progress(self, plan: Message, read: Ports, waits: str, tick: int) -> None:
         """Fail when nothing has moved for too long, unless an operator keeps it from moving."""
         below = read.status.value
-        progress = (
-            plan.id,
-            self._done,
-            below.done,
-            below.planned,
-            below.current,
-            below.progress,
-            self._detour.move,
-        )
-        progress = (*progress, *self._stage())
+        reported = below.done, below.planned, below.current, below.progress
+        progress = (plan.id, self._done, *reported, self._detour.move, *self._stage())
         operated = below.operated or self._orders.stands
         if operated or progress != self._progress:
             self._progress = progress
@@ -201,13 +193,11 @@ class TaskExecutor(Executor):
         status: Message = write.status
         status.echo = plan.id
         status.state = self._state(plan)
-        if waits and status.state == State.EXECUTING:
+        holds = waits and status.state == State.EXECUTING
+        if holds:
             status.state = State.HOLDING
         status.error = self._error
-        if self._error:
-            status.reason = self._reason
-        else:
-            status.reason = waits if status.state == State.HOLDING else ""
+        status.reason = self._reason if self._error else waits if holds else ""
         status.action = self._actions_done(plan)
         status.actions = len(self._actions)
         status.moves_done = self._done

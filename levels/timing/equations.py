@@ -12,7 +12,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from math import floor, gcd
+from math import gcd
 from statistics import pstdev
 from typing import Literal, NamedTuple
 
@@ -37,19 +37,9 @@ class Relation(NamedTuple):
     sign: Sign
     right: float
 
-    @property
-    def holds(self) -> bool:
-        """Whether the numbers satisfy the relation."""
-        return _HOLDS[self.sign](self.left, self.right)
-
-    @property
-    def margin(self) -> float:
-        """Right side minus left side; negative if the relation fails."""
-        return self.right - self.left
-
     def __bool__(self) -> bool:
-        """Return whether it holds: a tuple of three would always be true."""
-        return self.holds
+        """Return whether the numbers satisfy it: a tuple of three would always be true."""
+        return _HOLDS[self.sign](self.left, self.right)
 
 
 def fits_cycle(processing_ns: float, communication_ns: float, cycle_ns: float) -> Relation:
@@ -61,17 +51,6 @@ def fits_cycle(processing_ns: float, communication_ns: float, cycle_ns: float) -
 def system_response_bound_ns(cycles_ns: Sequence[float]) -> float:
     """Return the bound on the system's response time, n R_max for n levels (eq. 3.2)."""
     return len(cycles_ns) * max(cycles_ns)
-
-
-def system_response_ns(
-    machine_cycles_ns: Sequence[float], goal_cycles_ns: Sequence[float]
-) -> float:
-    """Return the system's response time: R_s = sum of R_i + sum of R_j (eq. 3.3).
-
-    `machine_cycles_ns` are tied to the update rate of the machine, `goal_cycles_ns` chosen to meet
-    the goal.
-    """
-    return sum(machine_cycles_ns) + sum(goal_cycles_ns)
 
 
 def grid_wait(written: TickGrid, read: TickGrid) -> int:
@@ -102,12 +81,6 @@ def executes_in_time(execution_ns: float, longest_cycle_ns: float) -> Relation:
     return Relation(execution_ns, "<", longest_cycle_ns)
 
 
-def response_time_ns(execution_ns: float, communication_ns: float, residual_ns: float) -> float:
-    """Return a level's response time from its parts: R_i = t_exec + t_comm + t_residual (eq.
-    3.5)."""
-    return execution_ns + communication_ns + residual_ns
-
-
 def residual_ns(cycle_ns: float, execution_ns: float, communication_ns: float) -> float:
     """Return the rest of a cycle, t_residual = R_i - t_exec - t_comm (eq. 3.5); negative if the
     cycle is too short."""
@@ -119,8 +92,7 @@ def parts_make_cycle(execution_ns: float, communication_ns: float, cycle_ns: flo
 
     A cycle too short for the first two has a residual of 0: its parts then exceed it.
     """
-    left_ns = max(residual_ns(cycle_ns, execution_ns, communication_ns), 0)
-    return Relation(response_time_ns(execution_ns, communication_ns, left_ns), "=", cycle_ns)
+    return Relation(max(execution_ns + communication_ns, cycle_ns), "=", cycle_ns)
 
 
 def residual_bound_ns(
@@ -148,16 +120,10 @@ def residual_deviation_ns(
     return pstdev([e + c for e, c in zip(executions_ns, communications_ns, strict=True)])
 
 
-def cycle_start_ns(first_ns: int, period_ns: int, cycle: int) -> int:
-    """Return the start of a cycle on the fixed grid of the system clock: t_(k+1) = t_k + c (eq.
-    3.7)."""
-    return first_ns + cycle * period_ns
-
-
 def cycle_is_on_grid(cycle_ns: float, clock_ns: int) -> Relation:
     """Compare a cycle with the nearest whole number of clock periods: R_i = k c (required by eq.
     3.7)."""
-    return Relation(cycle_ns, "=", cycle_start_ns(0, clock_ns, max(round(cycle_ns / clock_ns), 1)))
+    return Relation(cycle_ns, "=", max(round(cycle_ns / clock_ns), 1) * clock_ns)
 
 
 def plan_fits_tight(
@@ -171,54 +137,22 @@ def plan_fits_tight(
     return Relation(plan_ns / cycles, "<", residual_ns - 2 * context_switch_ns)
 
 
-def plan_cycles_tight(plan_ns: float, residual_ns: float, context_switch_ns: float) -> int | None:
-    """Return the fewest cycles in which such a planner finishes (eq. 3.8); None: it never does."""
-    left_ns = residual_ns - 2 * context_switch_ns
-    return floor(plan_ns / left_ns) + 1 if left_ns > 0 else None
-
-
 def plan_fits_loose(plan_ns: float, cycles: int, cycle_ns: float) -> Relation:
     """Compare a planner on its own processor with its time slice: t_plan <= d R_i (section 3.4,
     fig. 4)."""
     return Relation(plan_ns, "<=", cycles * cycle_ns)
 
 
-def communication_ns(interlevel_ns: float, executor_planner_ns: float) -> float:
-    """Return a level's communication in a cycle: t_comm = t_interlevel + t_executor-planner (eq.
-    3.9)."""
-    return interlevel_ns + executor_planner_ns
-
-
-def response_time_tight_ns(
-    execution_ns: float,
-    communication_ns: float,
-    plan_and_residual_ns: float,
-    context_switch_ns: float,
-) -> float:
-    """Return the response time of a level whose planner shares its executor's processor (eq. 3.9).
-
-    R_i = t_exec + t_comm + t_(plan+residual) + 2 t_cs.
-    """
-    return execution_ns + communication_ns + plan_and_residual_ns + 2 * context_switch_ns
-
-
 def leaves_time_to_plan(
     execution_ns: float, communication_ns: float, context_switch_ns: float, cycle_ns: float
 ) -> Relation:
-    """Compare a cycle without its planning with the whole: t_exec + t_comm + 2 t_cs < R_i (eq.
-    3.9).
+    """Compare a tightly coupled cycle without its planning with the whole: t_exec + t_comm + 2 t_cs
+    < R_i (eq. 3.9).
 
     The margin is t_(plan+residual). `communication_ns` is of the worst cycle, in which the plan is
     updated.
     """
-    return Relation(
-        response_time_tight_ns(execution_ns, communication_ns, 0, context_switch_ns), "<", cycle_ns
-    )
-
-
-def plan_update_share(executor_planner_ns: float, cycle_ns: float) -> float:
-    """Return the share of a cycle spent on updating the plan (eq. 3.10)."""
-    return executor_planner_ns / cycle_ns
+    return Relation(execution_ns + communication_ns + 2 * context_switch_ns, "<", cycle_ns)
 
 
 def coupling_may_be_tight(
@@ -229,4 +163,4 @@ def coupling_may_be_tight(
 
     Both sides are shares of the cycle. If it fails, planner and executor should be split.
     """
-    return Relation(plan_update_share(executor_planner_ns, cycle_ns), "<=", small)
+    return Relation(executor_planner_ns / cycle_ns, "<=", small)

@@ -30,8 +30,8 @@ class FramePlace:
     `limit_ns`.
 
     `job_ns` is its budget with two context switches. `slack_ns` is the time from its end to the
-    limit; negative: so much of its work is left then. `until` is the board that begins at the
-    limit; empty: the frame ends there.
+    limit; negative: so much of its work is left then, if the limit stops nothing. `until` is the
+    board that begins at the limit; empty: the frame ends there.
     """
 
     board: str
@@ -40,16 +40,6 @@ class FramePlace:
     limit_ns: int
     slack_ns: int
     until: str
-
-    @property
-    def end_ns(self) -> int:
-        """Its end; if it is late, what its end would be if the limit stopped nothing."""
-        return self.limit_ns - self.slack_ns
-
-    @property
-    def limit(self) -> str:
-        """The event that is its limit, as text."""
-        return f"'{self.until}' begins" if self.until else "the frame ends"
 
 
 @dataclass(frozen=True)

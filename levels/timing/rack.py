@@ -155,7 +155,9 @@ class RackTiming:
         budget = table.budget
         if budget is None:
             raise KeyError(board)
-        executor = LevelTiming(
+        planned = table.is_plan_budgeted
+        plan_ns = budget.plan_ns + self.interrupted_ns(f"{board}.planner")
+        return LevelTiming(
             board=board,
             coupling=table.coupling,
             cycle_ns=table.every * self.tick_ns,
@@ -164,19 +166,10 @@ class RackTiming:
             execution_ns=budget.process_ns,
             write_ns=budget.write_ns,
             exchange_ns=table.exchange_ns,
-            plan_ns=None,
-            update_ns=0,
-            within_cycles=None,
-            plan_within_ns=None,
-        )
-        if not table.is_plan_budgeted:
-            return executor
-        return replace(
-            executor,
-            plan_ns=budget.plan_ns + self.interrupted_ns(f"{board}.planner"),
-            update_ns=budget.update_ns,
-            within_cycles=table.within_cycles,
-            plan_within_ns=table.plan_within_ns,
+            plan_ns=plan_ns if planned else None,
+            update_ns=budget.update_ns if planned else 0,
+            within_cycles=table.within_cycles if planned else None,
+            plan_within_ns=table.plan_within_ns if planned else None,
         )
 
     def interrupted_ns(self, task: str) -> int:

@@ -2,11 +2,10 @@
 beyond the paper.
 
 The recurrence is M. Joseph and P. Pandya's, *Finding Response Times in a Real-Time System*, The
-Computer Journal 29 (1986); with blocking and release jitter it is N. Audsley et al.'s, *Applying
-New Scheduling Theory to Static Priority Pre-emptive Scheduling*, Software Engineering Journal 8
-(1993):
+Computer Journal 29 (1986); with blocking it is N. Audsley et al.'s, *Applying New Scheduling Theory
+to Static Priority Pre-emptive Scheduling*, Software Engineering Journal 8 (1993):
 
-    R = w + J,  w = B + C + sum over all tasks above of ceil((w + J_j) / T_j) C_j.
+    R = B + C + sum over all tasks above of ceil(R / T_j) C_j.
 
 This is the response of a job released together with all tasks above it. A rack without phases
 releases all tasks together at tick 0, so the bound is attained. Phases may keep tasks apart for
@@ -17,7 +16,7 @@ repeats. Times are integers in one unit; a rack uses ns.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
@@ -27,8 +26,8 @@ from typing import Any
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
-Load = tuple[int, int, int]
-"""Demand of a task on its core: cost C of a job, period T, release jitter J."""
+Load = tuple[int, int]
+"""Demand of a task on its core: cost C of a job, and period T."""
 
 TURN_NS = 4_000_000
 """Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own
@@ -48,7 +47,6 @@ def response_time(
     cost: int,
     above: Sequence[Load],
     blocking: int,
-    jitter: int,
     *,
     sharing: Sequence[Load],
     horizon: int,
@@ -67,32 +65,27 @@ def response_time(
     Linux does not guarantee.
     """
     # Below full load a bound exists; near full load the search for it may take too long.
-    if cost and sum(Fraction(c, t) for c, t, _ in above) >= 1:
+    if cost and sum(Fraction(*load) for load in above) >= 1:
         return None
 
     def work(until: int) -> int:
         turns = sum(min(_released(until, load), cost + TURN_NS) for load in sharing)
         return blocking + cost + turns + sum(_released(until, load) for load in above)
 
-    end = _fixed_point(work, blocking + cost, horizon)
-    return None if end is None else end + jitter
-
-
-def _fixed_point(work: Callable[[int], int], guess: int, horizon: int) -> int | None:
-    """Return the smallest w >= `guess` at which all work released before w is done; None if there
-    is none."""
+    # The end is the smallest time at which all work released before it is done.
+    end = blocking + cost
     for _ in range(MAX_STEPS):
-        if guess > horizon:
+        if end > horizon:
             break
-        if (needed := work(guess)) <= guess:
-            return guess
-        guess = needed
+        if (needed := work(end)) <= end:
+            return end
+        end = needed
     return None
 
 
 def _released(until: int, load: Load) -> int:
-    cost, period, jitter = load
-    return -(-(until + jitter) // period) * cost
+    cost, period = load
+    return -(-until // period) * cost
 
 
 def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[str, int | None]:
@@ -116,7 +109,6 @@ def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> di
             job_ns(task, context_switch_ns),
             [_load(other, context_switch_ns) for other in above],
             blocking_ns(task, others),
-            task.jitter_ns,
             sharing=[_load(other, context_switch_ns) for other in shares],
             horizon=HORIZON_DEADLINES * task.period_ns,
         )
@@ -136,7 +128,7 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
     period = lcm(*(task.period_ns for task in tasks))
     first = max(task.phase_ns for task in tasks)
     until = first + 2 * period
-    is_open = any(task.role == "planner" or task.jitter_ns for task in tasks)
+    is_open = any(task.role == "planner" for task in tasks)
     if is_open or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
         return {}
     whole = [
@@ -236,4 +228,4 @@ def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, flo
 
 
 def _load(task: TimedTask, context_switch_ns: int) -> Load:
-    return job_ns(task, context_switch_ns), task.period_ns, task.jitter_ns
+    return job_ns(task, context_switch_ns), task.period_ns

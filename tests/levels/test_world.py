@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import SCENE
-from rack.levels.world import WorldModel, find_motion
+from rack.levels.world import WorldModel
 from tests.levels.arms import config
 from tests.levels.box import lose_some
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
@@ -158,29 +158,3 @@ def test_a_moving_body_keeps_its_velocity_until_the_next_scene_is_due() -> None:
     assert rig.model.velocity[0, 0] == pytest.approx(0.25, rel=0.2)
     rig.run(2 * PERIOD * TICK_S, None)
     assert not rig.model.velocity.any()
-
-
-def test_compiled_code_gives_the_bits_of_numpy() -> None:
-    WorldModel.preload()
-    rng, memories = np.random.default_rng(3), []
-    scenes = np.cumsum(
-        rng.normal(0.0, 0.002, (200, 4, 7)) * (rng.random((200, 1, 1)) < 0.3), axis=0
-    )
-    for find in (find_motion, find_motion.load()):
-        poses, moving, slow_s, velocity = (
-            np.zeros((2, 4, 7)),
-            np.zeros(4, dtype=bool),
-            np.zeros(4),
-            np.zeros((4, 3)),
-        )
-        memories.append([])
-        for scene in scenes:
-            quaternion = np.array([1.0, 0.0, 0.0, 0.0]) + scene[:, 3:]
-            quaternion /= np.linalg.norm(quaternion, axis=1)[:, None]
-            rules = 0.002, 0.02, 0.005, 0.1, 0.06, 0.02
-            changed = find(scene[:, :3].copy(), quaternion, *poses, moving, slow_s, velocity, rules)
-            memories[-1].append(
-                (changed, poses.tolist(), moving.tolist(), slow_s.tolist(), velocity.tolist())
-            )
-    assert memories[0] == memories[1]
-    assert {changed for changed, *_ in memories[0]} == {False, True}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import pytest
 
 from rack.levels.timing import equations as timing
@@ -34,15 +32,13 @@ def residual(cycle_ns: int, executions_ns: tuple[int, ...]) -> float:
 def test_a_relation_is_as_true_as_its_sides_make_it(
     left: int, sign: str, right: int, holds: bool
 ) -> None:
-    relation = Relation(left, sign, right)
-    assert (relation.holds, bool(relation), relation.margin) == (holds, holds, right - left)
+    assert bool(Relation(left, sign, right)) == holds
 
 
 def test_figure_2_one_processor_with_8_ms_cycles_plans_in_time() -> None:
     left = residual(8 * MS, EXECUTE)
     assert left == 3 * MS
     assert timing.plan_fits_tight(PLAN + UPDATE, WORST_PLAN_CYCLES, left, 0)
-    assert timing.plan_cycles_tight(PLAN + UPDATE, left, 0) == 3
 
 
 def test_figure_2_with_2_ms_of_executor_plans_within_16_ms() -> None:
@@ -55,8 +51,7 @@ def test_figure_3_one_processor_with_6_ms_cycles_has_no_plan_within_three_cycles
     assert left == 1 * MS
     relation = timing.plan_fits_tight(PLAN + UPDATE, WORST_PLAN_CYCLES, left, 0)
     assert not relation
-    assert relation.margin == pytest.approx(-4 / 3 * MS)
-    assert timing.plan_cycles_tight(PLAN + UPDATE, left, 0) == 8
+    assert relation.right - relation.left == pytest.approx(-4 / 3 * MS)
 
 
 def test_figure_4_two_processors_with_6_ms_cycles_plan_in_time() -> None:
@@ -71,18 +66,17 @@ def test_figure_4_two_processors_with_6_ms_cycles_plan_in_time() -> None:
 
 def test_figure_4_with_a_longer_executor_has_no_time_to_talk_to_its_planner() -> None:
     assert timing.fits_cycle(4 * MS, READ + WRITE, 6 * MS)
-    assert timing.fits_cycle(4 * MS, PLANNER_EXCHANGE + READ + WRITE, 6 * MS).margin == -1 * MS
+    longer = timing.fits_cycle(4 * MS, PLANNER_EXCHANGE + READ + WRITE, 6 * MS)
+    assert longer == (7 * MS, "<=", 6 * MS)
 
 
 def test_context_switches_come_off_the_residual_twice() -> None:
     assert timing.plan_fits_tight(5.9 * MS, 2, 3 * MS, 0)
     assert not timing.plan_fits_tight(5.9 * MS, 2, 3 * MS, 0.1 * MS)
-    assert timing.plan_cycles_tight(PLAN, 0.2 * MS, 0.1 * MS) is None
 
 
 def test_a_plan_that_needs_all_of_the_residual_does_not_fit() -> None:
     assert not timing.plan_fits_tight(6 * MS, 2, 3 * MS, 0)
-    assert timing.plan_cycles_tight(6 * MS, 3 * MS, 0) == 3
 
 
 def test_residual_is_what_the_worst_execution_and_the_worst_communication_leave() -> None:
@@ -98,28 +92,13 @@ def test_residual_deviation_is_zero_only_for_equal_cycles() -> None:
 
 
 def test_system_responds_within_as_many_longest_cycles_as_there_are_levels() -> None:
-    machine, goal = [2.5 * MS, 20 * MS], [250 * MS, 1000 * MS]
-    response = timing.system_response_ns(machine, goal)
-    assert response == 1272.5 * MS
-    assert timing.system_response_bound_ns(machine + goal) == 4000 * MS
-
-
-def test_cycle_starts_never_drift() -> None:
-    starts = [timing.cycle_start_ns(17, 2_500_000, k) for k in range(400_001)]
-    assert {b - a for a, b in pairwise(starts)} == {2_500_000}
-    assert starts[-1] == 17 + 1_000 * 1_000_000_000
+    assert timing.system_response_bound_ns([2.5 * MS, 20 * MS, 250 * MS, 1000 * MS]) == 4000 * MS
 
 
 def test_a_cycle_between_two_ticks_is_off_the_grid() -> None:
     assert timing.cycle_is_on_grid(20 * MS, 2_500_000)
     assert timing.cycle_is_on_grid(21 * MS, 2_500_000) == (21 * MS, "=", 20 * MS)
     assert not timing.cycle_is_on_grid(1 * MS, 2_500_000)
-
-
-def test_response_time_is_the_sum_of_its_parts_in_both_couplings() -> None:
-    assert timing.response_time_ns(3 * MS, 2 * MS, 3 * MS) == 8 * MS
-    talk = timing.communication_ns(2 * MS, 0.5 * MS)
-    assert timing.response_time_tight_ns(3 * MS, talk, 2.3 * MS, 0.1 * MS) == pytest.approx(8 * MS)
 
 
 def test_parts_of_a_cycle_make_the_cycle_until_they_are_longer_than_it() -> None:
@@ -132,7 +111,7 @@ def test_parts_of_a_cycle_make_the_cycle_until_they_are_longer_than_it() -> None
 def test_two_context_switches_come_on_top_of_a_tightly_coupled_cycle() -> None:
     # Figure 2, its cycle with the update, and the paper's 100 us a switch: 8 - 2 - 3 - 0.2.
     relation = timing.leaves_time_to_plan(2 * MS, READ + WRITE + UPDATE, 0.1 * MS, 8 * MS)
-    assert relation.margin == pytest.approx(2.8 * MS)
+    assert relation.right - relation.left == pytest.approx(2.8 * MS)
     assert not timing.leaves_time_to_plan(2 * MS, 3 * MS, 0.1 * MS, 5.2 * MS)
 
 
@@ -142,7 +121,6 @@ def test_executor_must_leave_something_of_the_cycle() -> None:
 
 
 def test_plan_update_that_takes_much_of_a_cycle_asks_for_a_processor_of_its_own() -> None:
-    assert timing.plan_update_share(1 * MS, 8 * MS) == pytest.approx(0.125)
     assert not timing.coupling_may_be_tight(1 * MS, 8 * MS)
     assert timing.coupling_may_be_tight(1 * MS, 20 * MS)
     assert timing.coupling_may_be_tight(1 * MS, 8 * MS, small=0.2) == (0.125, "<=", 0.2)

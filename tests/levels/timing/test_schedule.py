@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from dataclasses import replace
 
 import pytest
 
@@ -142,13 +141,6 @@ def test_every_job_costs_two_context_switches() -> None:
     assert row(chart) == "-RXXW--P-RXXW-PP"
     assert ends(chart, "level") == [(0, 5), (8, 13)]
     assert [job.end_ns for job in chart.late("level.planner")] == [None]
-
-
-def test_a_release_that_is_known_late_delays_its_job() -> None:
-    late = replace(executor("X2", 5), jitter_ns=2)
-    chart = simulate([late], 10)
-    assert row(chart) == "--XX---XX-"
-    assert ends(chart, "level") == [(0, 4), (5, 9)]
 
 
 def test_what_is_not_done_when_the_schedule_ends_has_no_end() -> None:
