@@ -85,7 +85,7 @@ def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
 JOINTS = tuple(f"joint{k}" for k in range(1, 7))
 
 
-def arm_of(*joints: str, every: int = 4, goal_ns: float | None = None) -> RackTiming:
+def arm_of(*joints: str) -> RackTiming:
     """A board a joint between a trajectory level, which has a planner's board above it, and the
     board of the arm."""
     names = " ".join(joints)
@@ -94,12 +94,7 @@ def arm_of(*joints: str, every: int = 4, goal_ns: float | None = None) -> RackTi
         board("path", 20, "plan", names),
         board("arm", 2, names),
     ]
-    return rack(
-        *boards,
-        *(board(name, every, "path", "arm") for name in joints),
-        board("alone", 500),
-        goal_ns=goal_ns,
-    )
+    return rack(*boards, *(board(name, 4, "path", "arm") for name in joints), board("alone", 500))
 
 
 def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
@@ -143,15 +138,8 @@ def test_a_response_through_a_queue_is_said_to_be_that_of_an_empty_one() -> None
 
 def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
-    found = rack(*boards, goal_ns=60 * 2.0 * MS).longest_cycles
-    assert found == {"top": 20, "middle": 20, "low": 20}
-
-
-def test_a_goal_for_the_response_is_divided_among_the_levels() -> None:
-    timing = rack(
-        board("top", 40, below="a"), board("a", 4, "top"), board("alone", 7), goal_ns=30 * 2.0 * MS
-    )
-    assert timing.longest_cycles == {"top": 15, "a": 15, "alone": 7}
+    found = rack(*boards, board("alone", 7), goal_ns=60 * 2.0 * MS).longest_cycles
+    assert found == {"top": 20, "middle": 20, "low": 20, "alone": 7}
 
 
 def test_boards_without_a_budget_are_named_and_not_judged() -> None:
