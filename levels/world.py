@@ -97,7 +97,7 @@ class WorldModel(Executor):
 def distances(poses: Array, others: Array) -> Array:
     """Return the distances, m, of poses from others, both (bodies, 7)."""
     x, y, z = (poses - others)[:, :3].T
-    return np.sqrt(x * x + y * y + z * z)
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def turns(poses: Array, others: Array) -> Array:

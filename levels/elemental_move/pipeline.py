@@ -191,11 +191,11 @@ class SegmentWindow:
         segment["opening"] = opening
         segment["force"] = force
 
-    def end(self) -> Array | None:
-        """Return the last waypoint (joints,) of the newest path in the window; None: there is
-        none."""
+    def end(self, move: int | None = None) -> Array | None:
+        """Return the last waypoint (joints,) of the newest path in the window, or of that of
+        `move`; None: there is none."""
         for segment in self._segments[: self.count][::-1]:
-            if segment["kind"] == SegmentKind.PATH:
+            if segment["kind"] == SegmentKind.PATH and move in (None, segment["move"]):
                 return np.array(segment["waypoints"][segment["count"] - 1])
         return None
 

@@ -149,7 +149,7 @@ class PrimitiveExecutor(Executor):
         elif work is not None:
             work.begin()
 
-    def _carry(self, row: int | None, tick: int) -> None:
+    def _carry(self, row: int, tick: int) -> None:
         self._sight.carry(row, tick - SEEN_CYCLES * self.context.every)
 
     def _do_segments(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
@@ -277,7 +277,7 @@ class PrimitiveExecutor(Executor):
         if memory.is_known:
             command.opening = memory.opening
             command.force = memory.force
-            command.held = memory.held_row
+            command.held = memory.held
 
     def _write_status(self, read: Ports, status: Message, serials: list[int], tick: int) -> None:
         memory = self._memory
@@ -289,7 +289,7 @@ class PrimitiveExecutor(Executor):
             status.state = State.HOLDING
         status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
         status.done = memory.done
-        status.held = memory.held_row
+        status.held = memory.held
         interrupted = memory.interrupted if memory.interrupted in serials else 0
         status.current = self._work.segment.id if self._work is not None else interrupted
         if read.status.is_there:

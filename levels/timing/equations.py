@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from math import gcd
 from statistics import pstdev
 from typing import Literal, NamedTuple
@@ -58,22 +57,6 @@ def grid_wait(written: TickGrid, read: TickGrid) -> int:
     (eq. 3.7)."""
     common = gcd(written.every, read.every)
     return read.every - common + (read.phase - written.phase) % common
-
-
-def response_ticks(cycles: Sequence[int], waits: Sequence[int] | None = None) -> int:
-    """Return the longest time from the first level's release to the end of the last level's cycle
-    that acts on it.
-
-    `cycles` are in ticks, in the order in which the information passes. Each level takes its cycle
-    (eq. 3.3); a message also waits for its next read on the common grid. `waits` are those times
-    (`grid_wait`), by default of levels without phases that read in every cycle: a wait is 0 if the
-    reader's cycle divides the writer's.
-    """
-    if waits is None:
-        waits = [
-            grid_wait(TickGrid(earlier), TickGrid(later)) for earlier, later in pairwise(cycles)
-        ]
-    return sum(cycles) + sum(waits)
 
 
 def executes_in_time(execution_ns: float, longest_cycle_ns: float) -> Relation:

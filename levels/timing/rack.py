@@ -10,7 +10,7 @@ from math import prod
 from typing import Any, NamedTuple
 
 from rack.levels.timing.chains import ParallelChains
-from rack.levels.timing.equations import grid_wait, response_ticks
+from rack.levels.timing.equations import grid_wait
 from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.level import BoardTiming, LevelTiming
 from rack.levels.timing.response_time import TaskResponse, load_of, task_responses
@@ -100,12 +100,15 @@ class RackTiming:
 
     def response_ticks(self, boards: Sequence[str]) -> int:
         """Return the longest response along boards, in the order in which the information passes,
-        ticks."""
+        ticks: from the release of the first to the end of the cycle of the last that acts on it.
+
+        Each level takes its cycle (eq. 3.3); a message also waits for its next read on the grid.
+        """
         passed = [self.boards[name] for name in boards]
         waits = [
             grid_wait(one.releases, other.reads_from(one.name)) for one, other in pairwise(passed)
         ]
-        return response_ticks([board.every for board in passed], waits)
+        return sum(waits) + sum(board.every for board in passed)
 
     @cached_property
     def connected(self) -> tuple[frozenset[str], ...]:

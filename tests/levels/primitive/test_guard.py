@@ -132,7 +132,7 @@ def test_missing_world_model_holds_the_arm_until_it_is_back() -> None:
 class Watched:
     """A guard over a path of the crossing cell, and the world model that it is shown."""
 
-    def __init__(self, waypoints: np.ndarray, touch: bool = False, held: int | None = None) -> None:
+    def __init__(self, waypoints: np.ndarray, held: int = -1) -> None:
         _, scene = arms.config(CROSSING)
         self.cell: Cell = arms.cell(CROSSING)
         self.guard = Guard(self.cell, scene, lookahead_s=2.0, delay_s=0.0)
@@ -144,7 +144,7 @@ class Watched:
         self.path = BlendedPath(waypoints, np.zeros(len(waypoints)))
         self.trajectory = make_trajectory(self.path, self.cell.limits)
         self.segment = MotionSegment(
-            1, SegmentKind.PATH, held, touch, waypoints, np.zeros(2), 0.0, 0.0, 0.0
+            1, SegmentKind.PATH, held, False, waypoints, np.zeros(2), 0.0, 0.0, 0.0
         )
 
     def watch(self) -> None:

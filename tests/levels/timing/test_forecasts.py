@@ -17,7 +17,7 @@ from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.response_time import load_of, response_times
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Budget
-from tests.snapshots import ROOT, Snapshots, each_shipped_rack
+from tests.snapshots import QUICK, ROOT, SHIPPED, Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
 SHARES = (0.02, 0.3)
@@ -65,7 +65,10 @@ def model(rack: RackTiming) -> Iterable[object]:
     ]
 
 
-@each_shipped_rack
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.thorough) for name in SHIPPED],
+)
 def test_the_timing_of_a_shipped_rack_is_as_before(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

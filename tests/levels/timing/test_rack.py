@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from rack.levels.timing.forecast import NO_BUDGET, Forecast
 from rack.levels.timing.level import BoardTiming
 from rack.levels.timing.rack import RackTiming
@@ -80,6 +82,22 @@ def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
     assert timing.chains == (("top", "a"), ("top", "b"))
     assert timing.hierarchy.chains == (("top", "b"),)
     assert timing.longest_cycles == {"top": 60, "a": 60, "b": 60, "alone": 7}
+
+
+@pytest.mark.parametrize(
+    ("cycles", "ticks"),
+    [
+        ([8], 8),
+        ([400, 100, 8, 1], 509 + 4),  # 100 and 8 meet every 4 ticks only
+        ([1, 8, 100, 400], 509 + 7 + 96 + 300),
+    ],
+)
+def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(
+    cycles: list[int], ticks: int
+) -> None:
+    names = [f"b{cycle}" for cycle in cycles]
+    boards = [board(name, cycle) for name, cycle in zip(names, cycles, strict=True)]
+    assert rack(*boards).response_ticks(names) == ticks
 
 
 JOINTS = tuple(f"joint{k}" for k in range(1, 7))
