@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from rack.backplane.message import Message, State
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
 from rack.levels.level import Executor, Input, LevelContext, Ports
@@ -180,8 +178,8 @@ class ElementalMoveExecutor(Executor):
     def _fill(self, command: Message, segments: SegmentWindow, tick: int) -> None:
         """Hand down the next moves, as far as they are planned and the window has room."""
         while not (self._request or self._error or segments.is_full):
-            at = np.flatnonzero(command.moves["id"][: command.count] == self._handed_down + 1)
-            if not at.size or not self._hand_down(command.moves[at[0]], segments, tick):
+            move = find_move(command.moves[: command.count], self._handed_down + 1)
+            if move is None or not self._hand_down(move, segments, tick):
                 return
             self._handed_down += 1
             self._waiting_since = None
@@ -260,21 +258,18 @@ class ElementalMoveExecutor(Executor):
         report.reason = self._reason if self._error else waits
         report.operated = status.operated or self._orders.stands
         # Report what is done, and the progress of the move under way.
-        under_way = segments.first if segments.count else None
+        window = command.moves[: command.count]
+        under_way = segments.first
         report.done = self._done
         report.held = status.held
         report.replans = self._replans
-        report.current = int(under_way["move"]) if under_way is not None else 0
-        is_begun = under_way is not None and under_way["id"] == status.current
+        report.current = int(under_way["move"])
+        is_begun = segments.count and under_way["id"] == status.current
         report.progress = status.progress if is_begun else 0.0
-        under_way_at = np.flatnonzero(command.moves["id"][: command.count] == report.current)
-        report.verb = (
-            int(command.moves["verb"][under_way_at[0]])
-            if report.current and under_way_at.size
-            else Verb.NONE
-        )
+        move = find_move(window, report.current)
+        report.verb = Verb.NONE if move is None else int(move["verb"])
         # Report how far moves are planned: the planner continues from there.
-        report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
+        report.planned = self._plans.reach(window, self._handed_down)
         end = self._plans.end(report.planned)
         if end is None:
             # That path was handed down before a restart of this board, or has replaced such a path.
@@ -320,3 +315,8 @@ class ElementalMoveExecutor(Executor):
         if not command.id:
             return State.IDLE
         return State.DONE if self._done >= command.id else State.EXECUTING
+
+
+def find_move(window: Any, serial: int) -> Any:
+    """Return the move of that serial in a window of `ELEMENTAL_MOVE`; None: it is not there."""
+    return next((move for move in window if move["id"] == serial), None)

@@ -145,7 +145,7 @@ class SegmentWindow:
 
     @property
     def first(self) -> Any:
-        """The oldest segment; valid while `count` is not 0."""
+        """The oldest segment; all zeros while `count` is 0."""
         return self._segments[0]
 
     @property

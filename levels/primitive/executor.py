@@ -281,7 +281,7 @@ class PrimitiveExecutor(Executor):
 
     def _write_status(self, read: Ports, status: Message, serials: list[int], tick: int) -> None:
         memory = self._memory
-        path_work = self._work if isinstance(self._work, PathWork) else None
+        work = self._work
         status.echo = read.command.value.id
         status.state = self._state(serials)
         reason = self._reason_to_wait(read) if status.state == State.EXECUTING else ""
@@ -291,23 +291,22 @@ class PrimitiveExecutor(Executor):
         status.done = memory.done
         status.held = memory.held
         interrupted = memory.interrupted if memory.interrupted in serials else 0
-        status.current = self._work.segment.id if self._work is not None else interrupted
+        status.current = work.segment.id if work is not None else interrupted
         if read.status.is_there:
             status.opening = read.status.value.opening
         status.position[:] = self._position
-        status.progress = (
-            path_work.progress if path_work is not None else memory.progress * bool(interrupted)
-        )
+        status.progress = memory.progress * bool(interrupted)
         servo = read.status.value
         status.operated = self._orders.stands or servo.standing > 0 or servo.error == Error.DISABLED
-        # Out of step, the world is not the reason why motion holds.
-        status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
-        status.resting = path_work is None or path_work.motion.resting
-        status.ends = (
-            path_work.ends_s(self._due(tick) * self.context.tick_s)
-            if path_work is not None
-            else 0.0
-        )
+        status.blocked = False
+        status.resting = True
+        status.ends = 0.0
+        if isinstance(work, PathWork):
+            status.progress = work.progress
+            # Out of step, the world is not the reason why motion holds.
+            status.blocked = work.blocked and self._tracking.in_step
+            status.resting = work.motion.resting
+            status.ends = work.ends_s(self._due(tick) * self.context.tick_s)
         status.wants, status.begin = self._wanted(read, serials)
 
     def _reason_to_wait(self, read: Ports) -> str:
