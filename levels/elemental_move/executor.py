@@ -108,7 +108,7 @@ class ElementalMoveExecutor(Executor):
             self._replans = last.replans
             if last.state == State.ERROR:
                 self._fail(Error(last.error), last.reason)
-            self._handed_down = max(last.done, segments.newest_move)
+            self._handed_down = max(last.done, *write.command.segments["move"].tolist())
             if self._handed_down >= last.planned:
                 write.status.end = last.end
             end = segments.end()

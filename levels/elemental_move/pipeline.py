@@ -148,11 +148,6 @@ class SegmentWindow:
         """The oldest segment; all zeros while `count` is 0."""
         return self._segments[0]
 
-    @property
-    def newest_move(self) -> int:
-        """The move of the newest segment; 0 in an empty window."""
-        return int(self._segments["move"][self.count - 1]) if self.count else 0
-
     def take_done(self, done: int) -> Any:
         """Remove and return the oldest segment if its serial is at most `done`; else return
         None."""

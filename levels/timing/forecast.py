@@ -61,6 +61,11 @@ class Forecast:
     def document(self) -> dict[str, Any]:
         """Return everything as plain data; times whose names end in _ns are wall-clock times."""
         rack = self.rack
+        schedule = None
+        if rack.schedule is not None:
+            minor_ms, major_ms = (ticks * rack.tick_ns * 1e-6 for ticks in rack.schedule)
+            cores = [found.document() for found in self.frames]
+            schedule = {"minor_ms": minor_ms, "major_ms": major_ms, "cores": cores}
         return {
             **asdict(self.system),
             "context_switch_ns": rack.context_switch_ns,
@@ -69,19 +74,10 @@ class Forecast:
             "responses": [response.document() for response in rack.responses],
             "loads": {str(core): load for core, load in rack.loads.items()},
             "inboxes": list(self.inboxes),
-            "schedule": self._schedule(),
+            "schedule": schedule,
             "notes": list(self.notes),
             "holds": self.holds,
         }
-
-    def _schedule(self) -> dict[str, Any] | None:
-        """Return the static schedule as plain data; None: there is none."""
-        if self.rack.schedule is None:
-            return None
-        minor, major = self.rack.schedule
-        tick_ms = self.rack.tick_ns * 1e-6
-        cores = [found.document() for found in self.frames]
-        return {"minor_ms": minor * tick_ms, "major_ms": major * tick_ms, "cores": cores}
 
 
 def _uncounted(rack: RackTiming) -> dict[str, str]:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.response_time import job_ns
+from rack.levels.timing.response_time import as_one_part
 from rack.levels.timing.schedule import Span, simulate
-from rack.levels.timing.tasks import Part, TimedTask, Unit
+from rack.levels.timing.tasks import TimedTask
 
 Work = dict[tuple[str, int], list[Span]]
 """The stretches of work of every job, in order, by task and release."""
@@ -74,11 +74,8 @@ def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
     if rack.schedule is None:
         return ()
     minor, major = (ticks * rack.tick_ns for ticks in rack.schedule)
-    # A job with its switches is one stretch of work.
     tasks = [
-        replace(task, parts=(Part(Unit.PROCESS, job_ns(task, rack.context_switch_ns)),))
-        for task in rack.tasks
-        if task.role != "planner"
+        as_one_part(task, rack.context_switch_ns) for task in rack.tasks if task.role != "planner"
     ]
     work: Work = defaultdict(list)
     for span in simulate(tasks, 2 * major + 2 * minor).spans:

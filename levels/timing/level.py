@@ -49,10 +49,6 @@ class BoardTiming:
         """The ticks at which its cycles begin."""
         return TickGrid(self.every, self.phase)
 
-    def reads_from(self, board: str) -> TickGrid:
-        """Return the ticks at which it reads the messages of another board."""
-        return self.reads.get(board, self.releases)
-
     @property
     def is_plan_budgeted(self) -> bool:
         """Whether the budget covers its planner: in a measured run the planner may have made no

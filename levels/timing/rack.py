@@ -106,20 +106,10 @@ class RackTiming:
         """
         passed = [self.boards[name] for name in boards]
         waits = [
-            grid_wait(one.releases, other.reads_from(one.name)) for one, other in pairwise(passed)
+            grid_wait(one.releases, other.reads.get(one.name, other.releases))
+            for one, other in pairwise(passed)
         ]
         return sum(waits) + sum(board.every for board in passed)
-
-    @cached_property
-    def connected(self) -> tuple[frozenset[str], ...]:
-        """The boards of every hierarchy: all that are connected by chains."""
-        found: list[frozenset[str]] = []
-        for chain in self.chains:
-            joined = [boards for boards in found if not boards.isdisjoint(chain)]
-            found = [boards for boards in found if boards.isdisjoint(chain)] + [
-                frozenset(chain).union(*joined)
-            ]
-        return tuple(found)
 
     @cached_property
     def ranks(self) -> tuple[tuple[str, ...], ...]:
@@ -143,10 +133,10 @@ class RackTiming:
         """
         found = {name: float(board.every) for name, board in self.boards.items()}
         if self.response_goal_ns is None:
-            for boards in self.connected:
-                found |= dict.fromkeys(
-                    boards, float(max(self.boards[name].every for name in boards))
-                )
+            # Chains that share a board are of one hierarchy: the longest passes from one to the
+            # next, at least one chain farther in each round.
+            for chain in self.chains * len(self.chains):
+                found |= dict.fromkeys(chain, max(found[name] for name in chain))
         else:
             for chain in sorted(self.chains, key=len):
                 found |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))

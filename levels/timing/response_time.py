@@ -88,35 +88,6 @@ def _released(until: int, load: Load) -> int:
     return -(-until // period) * cost
 
 
-def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[str, int | None]:
-    """Return the worst-case response time of every task with a cost, ns, by name.
-
-    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both.
-    None: no bound, or none within `HORIZON_DEADLINES` deadlines. Tasks of equal priority delay each
-    other by whole jobs; tasks under ordinary scheduling (priority 0) take turns. The bound is exact
-    for tasks of different priorities without blocking; it does not credit a job for its own parts
-    that cannot be preempted. On a core with phases the schedule itself is exact, if it repeats.
-    """
-    busy = [task for task in tasks if task.cost_ns]
-    found = {}
-    for task in busy:
-        others = [other for other in busy if other.core == task.core and other is not task]
-        shares = [other for other in others if not task.priority and not other.priority]
-        above = [
-            other for other in others if other.priority >= task.priority and other not in shares
-        ]
-        found[task.name] = response_time(
-            job_ns(task, context_switch_ns),
-            [_load(other, context_switch_ns) for other in above],
-            blocking_ns(task, others),
-            sharing=[_load(other, context_switch_ns) for other in shares],
-            horizon=HORIZON_DEADLINES * task.period_ns,
-        )
-    for core in {task.core for task in busy if task.phase_ns}:
-        found |= _scheduled([task for task in busy if task.core == core], context_switch_ns)
-    return found
-
-
 def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, int]:
     """Return the response times of the tasks of one core, from their schedule; empty where it
     decides nothing.
@@ -131,10 +102,7 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
     is_open = any(task.role == "planner" for task in tasks)
     if is_open or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
         return {}
-    whole = [
-        replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),))
-        for task in tasks
-    ]
+    whole = [as_one_part(task, context_switch_ns) for task in tasks]
     chart = simulate(whole, until + max(task.period_ns for task in tasks))
     priorities = {task.name: task.priority for task in tasks}
     spent = defaultdict[int, list[tuple[int, int]]](list)
@@ -181,27 +149,59 @@ class TaskResponse:
         return asdict(self) | {"holds": self.holds}
 
 
-def task_responses(tasks: Sequence[TimedTask], context_switch_ns: int) -> tuple[TaskResponse, ...]:
-    """Return the worst case of every task with a cost."""
-    found = response_times(tasks, context_switch_ns)
-    return tuple(
-        TaskResponse(
-            task=task.name,
-            core=task.core,
-            priority=task.priority,
-            job_ns=job_ns(task, context_switch_ns),
-            blocking_ns=blocking_ns(task, tasks),
-            response_ns=found[task.name],
-            deadline_ns=task.period_ns,
+def task_responses(
+    tasks: Iterable[TimedTask], context_switch_ns: int = 0
+) -> tuple[TaskResponse, ...]:
+    """Return the worst case of every task with a cost.
+
+    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both.
+    Tasks of equal priority delay each other by whole jobs; tasks under ordinary scheduling
+    (priority 0) take turns. The bound is exact for tasks of different priorities without blocking;
+    it does not credit a job for its own parts that cannot be preempted. On a core with phases the
+    schedule itself is exact, if it repeats.
+    """
+    busy = [task for task in tasks if task.cost_ns]
+    exact: dict[str, int] = {}
+    for core in {task.core for task in busy if task.phase_ns}:
+        exact |= _scheduled([task for task in busy if task.core == core], context_switch_ns)
+    found = []
+    for task in busy:
+        others = [other for other in busy if other.core == task.core and other is not task]
+        shares = [other for other in others if not task.priority and not other.priority]
+        above = [
+            other for other in others if other.priority >= task.priority and other not in shares
+        ]
+        job = job_ns(task, context_switch_ns)
+        blocking = blocking_ns(task, others)
+        bound = response_time(
+            job,
+            [_load(other, context_switch_ns) for other in above],
+            blocking,
+            sharing=[_load(other, context_switch_ns) for other in shares],
+            horizon=HORIZON_DEADLINES * task.period_ns,
         )
-        for task in tasks
-        if task.name in found
-    )
+        found.append(
+            TaskResponse(
+                task=task.name,
+                core=task.core,
+                priority=task.priority,
+                job_ns=job,
+                blocking_ns=blocking,
+                response_ns=exact.get(task.name, bound),
+                deadline_ns=task.period_ns,
+            )
+        )
+    return tuple(found)
 
 
 def job_ns(task: TimedTask, context_switch_ns: int) -> int:
     """Return the processor time of one job with its two context switches."""
     return task.cost_ns + 2 * context_switch_ns
+
+
+def as_one_part(task: TimedTask, context_switch_ns: int) -> TimedTask:
+    """Return a task whose job with its switches is one stretch of work."""
+    return replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),))
 
 
 def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:

@@ -53,12 +53,13 @@ class Chart:
 
     def late(self, task: str) -> list[Job]:
         """Return the jobs of a task that missed their deadline, unfinished ones included."""
-        return [job for job in self.jobs if job.task == task and self._is_late(job)]
-
-    def _is_late(self, job: Job) -> bool:
-        return (
-            job.deadline_ns <= self.end_ns if job.end_ns is None else job.deadline_ns < job.end_ns
-        )
+        unfinished = self.end_ns + 1  # on a deadline at the end, too
+        return [
+            job
+            for job in self.jobs
+            if job.task == task
+            and job.deadline_ns < (unfinished if job.end_ns is None else job.end_ns)
+        ]
 
     def window(self, start_ns: int, end_ns: int) -> Chart:
         """Return the chart from `start_ns` to `end_ns`: spans are cut there, jobs kept whole.

@@ -55,7 +55,7 @@ def test_a_config_saved_before_is_wired_as_today(name: str) -> None:
     assert wire(saved) == wire(config)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
     config = load("rccl", [f"name={rack_name}", "clock.mode=lockstep"])
     saved, used = as_saved_before(config)

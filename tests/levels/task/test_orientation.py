@@ -175,7 +175,7 @@ def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
     assert refused.value.code == Error.NO_PATH
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_place_that_only_a_lean_between_those_of_ten_degrees_reaches(tmp_path: Path) -> None:
     layout = draw(np.random.default_rng([1990, 21]))
     x, y = layout.end[0]

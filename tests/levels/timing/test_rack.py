@@ -142,10 +142,11 @@ def test_a_joint_that_is_slower_than_the_others_is_judged_by_itself() -> None:
 def test_chains_of_equal_cycles_are_one_only_if_they_are_every_combination() -> None:
     pairs = [board("a", 40), board("b", 4, "a"), board("c", 40), board("d", 4, "c")]
     assert [chains.text for chains in rack(*pairs).parallel] == ["a > b", "c > d"]
-    assert [sorted(boards) for boards in rack(*pairs).connected] == [["a", "b"], ["c", "d"]]
+    slower = rack(*pairs).changed("c", every=80).longest_cycles
+    assert slower == {"a": 40, "b": 40, "c": 80, "d": 80}
     crossed = rack(*pairs[:3], board("d", 4, "a c"))
     assert [chains.text for chains in crossed.parallel] == ["a > b", "a > d", "c > d"]
-    assert [sorted(boards) for boards in crossed.connected] == [["a", "b", "c", "d"]]
+    assert set(crossed.changed("c", every=80).longest_cycles.values()) == {80}
 
 
 def test_a_response_through_a_queue_is_said_to_be_that_of_an_empty_one() -> None:

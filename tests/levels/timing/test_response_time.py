@@ -16,7 +16,7 @@ from rack.levels.timing.response_time import (
     blocking_ns,
     load_of,
     response_time,
-    response_times,
+    task_responses,
 )
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
@@ -64,6 +64,10 @@ def response(
     horizon: int = 10**5,
 ) -> int | None:
     return response_time(cost, above, blocking, sharing=sharing, horizon=horizon)
+
+
+def response_times(tasks: Sequence[TimedTask], switch_ns: int = 0) -> dict[str, int | None]:
+    return {found.task: found.response_ns for found in task_responses(tasks, switch_ns)}
 
 
 def analysed(tasks: list[Plain], blocked: int = 0) -> list[int | None]:
@@ -151,7 +155,7 @@ def test_what_takes_no_time_responds_at_once() -> None:
 def test_two_context_switches_come_with_every_job() -> None:
     tasks = [timed("high", 0, 20, 10, computing(2)), timed("low", 0, 10, 40, computing(9))]
     # 9 + 2 and two jobs of 2 + 2.
-    assert response_times(tasks, context_switch_ns=1) == {"high": 4, "low": 19}
+    assert response_times(tasks, 1) == {"high": 4, "low": 19}
     assert load_of(tasks, context_switch_ns=1) == {0: pytest.approx(4 / 10 + 11 / 40)}
 
 
