@@ -6,8 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, TickGrid
-from rack.levels.timing.equations import grid_wait
-from rack.levels.timing.rack import RackTiming
+from rack.levels.timing.rack import RackTiming, grid_wait
 from rack.levels.timing.system_response import mailboxes_along
 
 

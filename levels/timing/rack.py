@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from math import prod
+from math import gcd, prod
 from typing import Any, NamedTuple
 
+from rack.backplane.layout import TickGrid
 from rack.levels.timing.chains import ParallelChains
-from rack.levels.timing.equations import grid_wait
 from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.level import BoardTiming, LevelTiming
 from rack.levels.timing.response_time import TaskResponse, load_of, task_responses
@@ -258,3 +258,10 @@ class RackTiming:
 
 def _nonzero(*parts: Part) -> tuple[Part, ...]:
     return tuple(part for part in parts if part.time_ns)
+
+
+def grid_wait(written: TickGrid, read: TickGrid) -> int:
+    """Return the longest time, ticks, from a message on the grid of its writer to the next read
+    (eq. 3.7)."""
+    common = gcd(written.every, read.every)
+    return read.every - common + (read.phase - written.phase) % common

@@ -1,24 +1,34 @@
 """Verdicts: every equation of the timing model applied to every level, core and task of a rack.
 
-Equations 3.1 to 3.10 are judged as in the paper, each level as if it had its own processor.
-Response times and core loads account for levels that share a core.
+Equations 3.1 to 3.10 (NISTIR 90-4251, section 3) are judged as in the paper, each level as if it
+had its own processor. Response times and core loads account for levels that share a core.
+
+The paper's symbols: R_i is a level's response time, which is its cycle; R_max the longest cycle of
+all levels; t_exec the executor's processing in a cycle; t_comm its reading and writing, waiting
+included; t_residual the rest of the cycle; t_plan one plan with its update; d the cycles that a
+plan may take; t_cs one context switch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import operator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import chain
 from math import inf, isfinite
-from typing import Any
+from typing import Any, Literal
 
-from rack.levels.timing import equations
 from rack.levels.timing.chains import ParallelChains
-from rack.levels.timing.equations import Relation, Sign
 from rack.levels.timing.frames import core_frames
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
 
+Sign = Literal["<", "<=", "="]
+_HOLDS: dict[Sign, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    "=": operator.eq,
+}
 SYSTEM = "system"
 """The subject of the system's response."""
 LOOSE_PLAN = "fig. 4"
@@ -58,7 +68,7 @@ class EquationVerdict:
     @property
     def holds(self) -> bool:
         """Whether the numbers satisfy the equation."""
-        return bool(Relation(self.left, self.sign, self.right))
+        return _HOLDS[self.sign](self.left, self.right)
 
     @property
     def margin(self) -> float:
@@ -117,13 +127,12 @@ def _of_chains(
     rack: RackTiming, chains: ParallelChains, goal_ns: float | None
 ) -> Iterator[EquationVerdict]:
     subject = response_subject(rack, chains)
-    cycles_ns = [cycle * rack.tick_ns for cycle in chains.cycles]
     bound = goal_ns
     limit = "timing.response_ms"
     if bound is None:
-        bound = equations.system_response_bound_ns(cycles_ns)
+        bound = chains.bound * rack.tick_ns
         limit = "n R_max"
-    total = sum(cycles_ns)
+    total = sum(chains.cycles) * rack.tick_ns
     yield EquationVerdict("3.3", subject, total, "<=", bound, f"R_s = sum of R_i <= {limit}")
     for way, ticks in (
         ("command", rack.command_ticks(chains)),
@@ -134,21 +143,18 @@ def _of_chains(
 
 
 def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
-    executes = level.execution_ns
-    communicates = level.communication_ns
+    board = level.board
     cycle = level.cycle_ns
-    relations = {
-        "3.1": (equations.fits_cycle(executes, communicates, cycle), "t_proc + t_c <= R_i"),
-        "3.4": (equations.executes_in_time(executes, level.longest_cycle_ns), "t_exec < R_max"),
-        "3.5": (
-            equations.parts_make_cycle(executes, communicates, cycle),
-            "t_exec + t_comm + t_residual = R_i",
-        ),
-        "3.6": (equations.residual_is_left(level.residual_ns), "0 < t_residual <= alpha"),
-        "3.7": (equations.cycle_is_on_grid(cycle, tick_ns), "R_i = k c, k whole"),
-    }
-    for equation, (relation, meaning) in relations.items():
-        yield EquationVerdict(equation, level.board, *relation, meaning)
+    used = level.execution_ns + level.communication_ns
+    yield EquationVerdict("3.1", board, used, "<=", cycle, "t_proc + t_c <= R_i")
+    longest = level.longest_cycle_ns
+    yield EquationVerdict("3.4", board, level.execution_ns, "<", longest, "t_exec < R_max")
+    # A cycle too short for its parts has a residual of 0: they then exceed it.
+    meaning = "t_exec + t_comm + t_residual = R_i"
+    yield EquationVerdict("3.5", board, max(used, cycle), "=", cycle, meaning)
+    yield EquationVerdict("3.6", board, 0, "<", level.residual_ns, "0 < t_residual <= alpha")
+    on_grid = max(round(cycle / tick_ns), 1) * tick_ns
+    yield EquationVerdict("3.7", board, cycle, "=", on_grid, "R_i = k c, k whole")
 
 
 def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
@@ -156,25 +162,27 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
         return
     board = level.board
     cycle = level.cycle_ns
-    if level.plan_within_ns is not None:
-        within_ns = level.plan_within_ns
+    within_ns = level.plan_within_ns
+    if within_ns is not None:
         meaning = "d R_i <= budget.plan_within_ms"
         yield EquationVerdict(PLAN_WITHIN, board, level.slice_ns, "<=", within_ns, meaning)
     if level.coupling == "loose":
-        fits = equations.plan_fits_loose(level.planning_ns, level.within_cycles, cycle)
-        yield EquationVerdict(LOOSE_PLAN, board, *fits, "t_plan <= d R_i")
+        time_slice = level.slice_ns
+        yield EquationVerdict(
+            LOOSE_PLAN, board, level.planning_ns, "<=", time_slice, "t_plan <= d R_i"
+        )
         return
-    fits = equations.plan_fits_tight(
-        level.planning_ns, level.within_cycles, level.residual_ns, switch_ns
-    )
-    yield EquationVerdict("3.8", board, *fits, "t_plan / d < t_residual - 2 t_cs")
-    communicates = level.interlevel_ns + level.executor_planner_ns
-    leaves = equations.leaves_time_to_plan(level.execution_ns, communicates, switch_ns, cycle)
-    yield EquationVerdict(
-        "3.9", board, *leaves, "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
-    )
-    share = equations.coupling_may_be_tight(level.executor_planner_ns, cycle, small)
-    yield EquationVerdict("3.10", board, *share, "t_executor-planner / R_i, small", "1")
+    share = level.planning_ns / level.within_cycles
+    left = level.residual_ns - 2 * switch_ns
+    yield EquationVerdict("3.8", board, share, "<", left, "t_plan / d < t_residual - 2 t_cs")
+    # In the worst cycle the plan is updated, too.
+    talks = level.interlevel_ns + level.executor_planner_ns
+    taken = level.execution_ns + talks + 2 * switch_ns
+    meaning = "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
+    yield EquationVerdict("3.9", board, taken, "<", cycle, meaning)
+    update = level.executor_planner_ns / cycle
+    meaning = "t_executor-planner / R_i, small"
+    yield EquationVerdict("3.10", board, update, "<=", small, meaning, "1")
 
 
 def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
