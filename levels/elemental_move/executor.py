@@ -203,7 +203,11 @@ class ElementalMoveExecutor(Executor):
             if not segments.count:
                 self._wait(plan, tick)
             return False
-        segments.add_path(move, plan, self._time_below(float(move["by"])))
+        # A status from below waits up to a cycle to be read, and this level's becomes visible
+        # another cycle later.
+        by_s = float(move["by"])
+        below_s = by_s - 2.0 * self.context.period_s - self._params.answer
+        segments.add_path(move, plan, below_s if by_s > 0.0 else 0.0)
         return True
 
     def _wait(self, refusal: Message, tick: int) -> None:
@@ -214,15 +218,6 @@ class ElementalMoveExecutor(Executor):
         waited_s = (tick - self._waiting_since) * self.context.tick_s
         if refusal.error != Error.NO_PATH or waited_s > self._params.patience:
             self._fail(Error(refusal.error), refusal.reason)
-
-    def _time_below(self, by_s: float) -> float:
-        """Return the time by which the level below must be done for this level to report it by
-        `by_s`."""
-        if by_s <= 0.0:
-            return 0.0
-        # A status from below waits up to a cycle to be read, and this level's becomes visible
-        # another cycle later.
-        return by_s - 2.0 * self.context.period_s - self._params.answer
 
     def _shut(self, status: Message, wanted: float | None = None) -> str:
         """Return how far the gripper has closed, if that is so far that it holds nothing, else an

@@ -176,14 +176,12 @@ class TaskExecutor(Executor):
     def _hand_down(self, plan: Message, command: Message) -> None:
         """Show the program's next moves, or the operator's goto."""
         detour = self._detour
-        window = self._window
-        is_ready = detour.is_known if detour.move else bool(plan.count)
-        if self._error or not is_ready:
-            window.show_none(command)
-        elif detour.move:
-            window.show_one(detour.as_move(self._actions_done(plan)), command)
+        if detour.move and detour.is_known and not self._error:
+            self._window.show_one(detour.as_move(self._actions_done(plan)), command)
         else:
-            window.show(plan, self._done, command, self._shown_until(plan))
+            is_kept = self._error or detour.move
+            until = 0 if is_kept else self._shown_until(plan)
+            self._window.show(plan, self._done, command, until)
 
     def _shown_until(self, plan: Message) -> int:
         """Return the first move of the plan that must not begin."""

@@ -63,8 +63,8 @@ class ShownWindow:
         return done, True
 
     def show(self, plan: Message, done: int, command: Message, until: int) -> None:
-        """Show the moves from the first one that is not done up to `until`; after the last, the
-        window stays.
+        """Show the moves from the first one that is not done up to `until`, none before it; after
+        the last, the window stays.
 
         Moves that were done under other ids are not shown again: the level below would repeat them.
         """
@@ -78,10 +78,6 @@ class ShownWindow:
         """Show one move alone."""
         move.write_to(command.moves[0])
         self._end(command, 1)
-
-    def show_none(self, command: Message) -> None:
-        """Withdraw all moves."""
-        self._end(command, 0)
 
     def _end(self, command: Message, count: int) -> None:
         command.count = count

@@ -212,7 +212,8 @@ def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
     priority (eq. 3.10).
     """
     below = (t for t in tasks if t.core == task.core and t.priority < task.priority <= t.ceiling)
-    return max((other.locked_ns for other in below), default=0)
+    locked = (part.time_ns for t in below for part in t.parts if not part.preemptible)
+    return max(locked, default=0)
 
 
 def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:

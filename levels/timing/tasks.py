@@ -79,8 +79,3 @@ class TimedTask:
     def cost_ns(self) -> int:
         """Processor time of one job, without context switches."""
         return sum(part.time_ns for part in self.parts)
-
-    @property
-    def locked_ns(self) -> int:
-        """The longest part of a job that is not preemptible."""
-        return max((part.time_ns for part in self.parts if not part.preemptible), default=0)

@@ -72,7 +72,8 @@ def test_a_planner_has_the_ceiling_of_its_executor_only_in_a_critical_section() 
     planners = [
         rack(replace(FIGURE_3, is_critical=critical)).tasks[1] for critical in (True, False)
     ]
-    assert [(planner.ceiling, planner.locked_ns) for planner in planners] == [(80, MS), (0, 0)]
+    found = [(planner.ceiling, planner.parts[-1].preemptible) for planner in planners]
+    assert found == [(80, False), (0, True)]
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
