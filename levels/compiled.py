@@ -17,7 +17,6 @@ from __future__ import annotations
 import errno
 import os
 import pickle
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -38,11 +37,7 @@ _A = ParamSpec("_A")
 _T = TypeVar("_T")
 
 
-def unheard(function: str) -> None:
-    """Tell nobody that a function is compiled."""
-
-
-on_compile: Callable[[str], object] = unheard
+on_compile: Callable[[str], object] | None = None
 """Called with the name of each function before it is compiled, which takes seconds."""
 
 
@@ -152,15 +147,15 @@ class _Kept:
         # Without a home, or permission to read there, nothing is kept.
         with suppress(OSError):
             path = self._path(types, target.codegen())
-            if path.exists():
-                content = path.read_bytes() if path.is_file() else b""
+            if path.is_file():
+                content = path.read_bytes()
                 code = content[DIGEST:]
                 # Damaged machine code must never run.
                 if content[:DIGEST] == _digest(code):
                     return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
                 _say(f"{path}: damaged; compiled again")
-                _remove(path)
-        on_compile(self._name)
+        if on_compile is not None:
+            on_compile(self._name)
         return None
 
     def save_overload(self, types: Any, result: Any) -> None:
@@ -180,10 +175,10 @@ class _Kept:
                 part.write_bytes(_digest(code) + code)
                 part.replace(path)
             finally:
-                _remove(part)
+                part.unlink(missing_ok=True)
             for old in path.parent.glob(f"{self._name}-*"):
                 if not old.name.startswith(f"{self._name}-{self._source}-"):
-                    _remove(old)
+                    old.unlink(missing_ok=True)
         except OSError as error:
             _say(
                 "compiled code cannot be kept, and every launch compiles:"
@@ -234,14 +229,6 @@ def _folder() -> Path:
 
 def _digest(content: bytes) -> bytes:
     return blake2b(content, digest_size=DIGEST).digest()
-
-
-def _remove(path: Path) -> None:
-    with suppress(OSError):
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
 
 
 @cache

@@ -174,9 +174,6 @@ class Orders:
         self._before = self.basis, self.standing, self._in_force
         self._news: list[_Told] = []  # answers that no status has shown
         self._shown = self._in_force
-        self._reported: int | None = (
-            None  # newest command rested on, in the last report; None: there is news
-        )
 
     @property
     def in_force(self) -> int:
@@ -282,7 +279,6 @@ class Orders:
 
     def _tell(self, told: _Told) -> None:
         """Show an answer in the status, in place of an older one to the same command."""
-        self._reported = None
         for at, waiting in enumerate(self._news):
             if waiting.serial == told.serial:
                 self._news[at] = told
@@ -295,17 +291,14 @@ class Orders:
         return max(self.basis, above)
 
     def report(self, status: Message, above: int = 0) -> None:
-        """Fill the fields of `ANSWER` when they change."""
-        rests_on = max(self.basis, above)
-        if rests_on != self._reported:
-            if self._news:
-                self._shown = self._news.pop(0)
-            status.operator = rests_on
-            status.order = self._shown.serial
-            status.answer = self._shown.answer
-            status.standing = self.standing
-            status.objection = self._shown.objection
-            self._reported = None if self._news else rests_on
+        """Fill the fields of `ANSWER`."""
+        if self._news:
+            self._shown = self._news.pop(0)
+        status.operator = self.rests_on(above)
+        status.order = self._shown.serial
+        status.answer = self._shown.answer
+        status.standing = self.standing
+        status.objection = self._shown.objection
 
 
 def answered(status: Message) -> int:

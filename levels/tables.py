@@ -67,11 +67,10 @@ class Table(BaseModel):
     @classmethod
     def _with_tuples(cls, table: Any) -> Any:
         """Turn TOML's lists into tuples, which are frozen."""
-        return (
-            {key: _tuple(value) for key, value in table.items()}
-            if isinstance(table, dict)
-            else table
-        )
+        if not isinstance(table, dict):
+            return table
+        # Dicts of the user's own keys stay as given.
+        return {k: v if isinstance(v, dict) else frozen(v) for k, v in table.items()}
 
 
 def keys_of(kind: type[BaseModel]) -> dict[str, FieldInfo]:
@@ -106,10 +105,6 @@ def frozen(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: frozen(item) for key, item in value.items()}
     return tuple(map(frozen, value)) if isinstance(value, list) else value
-
-
-def _tuple(value: Any) -> Any:
-    return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
 
 
 Params = TypeVar("Params", bound=Table)

@@ -148,7 +148,7 @@ class Crate:
 
             with suppress(RobotError):
                 build_cell(wanted.cell.robot, wanted.cell.scene, wanted.cell.clock_ns)
-        compiled.on_compile = compiled.unheard
+        compiled.on_compile = None
         gc.freeze()
         gc.enable()
 

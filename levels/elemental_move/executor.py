@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from rack.backplane.message import Message, State
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
-from rack.levels.level import Executor, Input, LevelContext, Ports, Reading
+from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import (
     MOVE_COMMAND,
     MOVE_PLAN,
@@ -27,7 +25,7 @@ from rack.levels.operator import (
     OPERATOR_COMMAND,
     Orders,
 )
-from rack.levels.tables import GripperConfig, read_params
+from rack.levels.tables import read_params
 
 
 class ElementalMoveExecutor(Executor):
@@ -83,15 +81,10 @@ class ElementalMoveExecutor(Executor):
             while (taken := segments.take_done(status.done)) is not None:
                 self._done = int(taken["move"])
                 self._replans_of_move = 0
-                gripper = self._gripper if taken["kind"] == SegmentKind.GRIPPER else None
-                if (
-                    gripper is not None
-                    and taken["opening"] == gripper.closed
-                    and self._is_shut(status)
+                if taken["kind"] == SegmentKind.GRIPPER and (
+                    shut := self._shut(status, taken["opening"])
                 ):
-                    self._fail(
-                        Error.GRASP_MISSED, f"{closed_so_far(gripper, status)}: it holds nothing"
-                    )
+                    self._fail(Error.GRASP_MISSED, f"{shut}: it holds nothing")
             self._check_below(status, segments)
         if not self._error:
             self._replan_if_blocked(status, segments, tick)
@@ -115,7 +108,7 @@ class ElementalMoveExecutor(Executor):
             self._replans = last.replans
             if last.state == State.ERROR:
                 self._fail(Error(last.error), last.reason)
-            self._handed_down = max(last.done, segments.newest_move)
+            self._handed_down = max(last.done, *write.command.segments["move"].tolist())
             if self._handed_down >= last.planned:
                 write.status.end = last.end
             end = segments.end()
@@ -139,9 +132,8 @@ class ElementalMoveExecutor(Executor):
         if status.state == State.ERROR:
             self._fail(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
-        gripper = self._gripper
-        if gripper is not None and moving and status.held >= 0 and self._is_shut(status):
-            self._fail(Error.OBJECT_LOST, f"{closed_so_far(gripper, status)}: the object is lost")
+        if moving and status.held >= 0 and (shut := self._shut(status)):
+            self._fail(Error.OBJECT_LOST, f"{shut}: the object is lost")
 
     def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
         """Request another path where the arm rests in front of an obstacle; cancel the request when
@@ -186,8 +178,8 @@ class ElementalMoveExecutor(Executor):
     def _fill(self, command: Message, segments: SegmentWindow, tick: int) -> None:
         """Hand down the next moves, as far as they are planned and the window has room."""
         while not (self._request or self._error or segments.is_full):
-            at = np.flatnonzero(command.moves["id"][: command.count] == self._handed_down + 1)
-            if not at.size or not self._hand_down(command.moves[at[0]], segments, tick):
+            move = find_move(command.moves[: command.count], self._handed_down + 1)
+            if move is None or not self._hand_down(move, segments, tick):
                 return
             self._handed_down += 1
             self._waiting_since = None
@@ -211,7 +203,11 @@ class ElementalMoveExecutor(Executor):
             if not segments.count:
                 self._wait(plan, tick)
             return False
-        segments.add_path(move, plan, self._time_below(float(move["by"])))
+        # A status from below waits up to a cycle to be read, and this level's becomes visible
+        # another cycle later.
+        by_s = float(move["by"])
+        below_s = by_s - 2.0 * self.context.period_s - self._params.answer
+        segments.add_path(move, plan, below_s if by_s > 0.0 else 0.0)
         return True
 
     def _wait(self, refusal: Message, tick: int) -> None:
@@ -223,22 +219,21 @@ class ElementalMoveExecutor(Executor):
         if refusal.error != Error.NO_PATH or waited_s > self._params.patience:
             self._fail(Error(refusal.error), refusal.reason)
 
-    def _time_below(self, by_s: float) -> float:
-        """Return the time by which the level below must be done for this level to report it by
-        `by_s`."""
-        if by_s <= 0.0:
-            return 0.0
-        # A status from below waits up to a cycle to be read, and this level's becomes visible
-        # another cycle later.
-        return by_s - 2.0 * self.context.period_s - self._params.answer
+    def _shut(self, status: Message, wanted: float | None = None) -> str:
+        """Return how far the gripper has closed, if that is so far that it holds nothing, else an
+        empty text.
 
-    def _is_shut(self, status: Message) -> bool:
+        `wanted` is the opening to which it was to go, by default the closed one.
+        """
         gripper = self._gripper
-        if gripper is None:
-            return False
-        return bool(
-            abs(status.opening - gripper.closed) < (self._params.grasp_gap or gripper.still)
-        )
+        if gripper is None or wanted not in (None, gripper.closed):
+            return ""
+        away = status.opening - gripper.closed
+        if not abs(away) < (self._params.grasp_gap or gripper.still):
+            return ""
+        # As a part of its way: that is a length or an angle.
+        part = away / (gripper.open - gripper.closed)
+        return f"the gripper has closed to {part:.1%} of its way"
 
     def _fail(self, error: Error, reason: str) -> None:
         if not self._error:
@@ -251,32 +246,25 @@ class ElementalMoveExecutor(Executor):
         status = read.status.value
         report.echo = command.id
         report.state = self._state(command)
-        waits = (
-            self._reason_to_wait(read.command, read.status)
-            if report.state == State.EXECUTING
-            else ""
-        )
-        if waits:
+        waits = ""
+        if report.state == State.EXECUTING and (waits := self._reason_to_wait(read)):
             report.state = State.HOLDING
         report.error = self._error
         report.reason = self._reason if self._error else waits
         report.operated = status.operated or self._orders.stands
         # Report what is done, and the progress of the move under way.
-        under_way = segments.first if segments.count else None
+        window = command.moves[: command.count]
+        under_way = segments.first
         report.done = self._done
         report.held = status.held
         report.replans = self._replans
-        report.current = int(under_way["move"]) if under_way is not None else 0
-        is_begun = under_way is not None and under_way["id"] == status.current
+        report.current = int(under_way["move"])
+        is_begun = segments.count and under_way["id"] == status.current
         report.progress = status.progress if is_begun else 0.0
-        under_way_at = np.flatnonzero(command.moves["id"][: command.count] == report.current)
-        report.verb = (
-            int(command.moves["verb"][under_way_at[0]])
-            if report.current and under_way_at.size
-            else Verb.NONE
-        )
+        move = find_move(window, report.current)
+        report.verb = Verb.NONE if move is None else int(move["verb"])
         # Report how far moves are planned: the planner continues from there.
-        report.planned = self._plans.reach(command.moves[: command.count], self._handed_down)
+        report.planned = self._plans.reach(window, self._handed_down)
         end = self._plans.end(report.planned)
         if end is None:
             # That path was handed down before a restart of this board, or has replaced such a path.
@@ -299,9 +287,11 @@ class ElementalMoveExecutor(Executor):
             self._orders.done()
         self._orders.report(write.status, above)
 
-    def _reason_to_wait(self, command: Reading, below: Reading) -> str:
+    def _reason_to_wait(self, read: Ports) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
+        command = read.command
+        below = read.status
         if self._orders.stands:
             return self._orders.keeps(self.context.board)
         if command.is_lost:
@@ -322,8 +312,6 @@ class ElementalMoveExecutor(Executor):
         return State.DONE if self._done >= command.id else State.EXECUTING
 
 
-def closed_so_far(gripper: GripperConfig, status: Message) -> str:
-    """Say how far the gripper is from closed, as a part of its way: that is a length or an
-    angle."""
-    part = (status.opening - gripper.closed) / (gripper.open - gripper.closed)
-    return f"the gripper has closed to {part:.1%} of its way"
+def find_move(window: Any, serial: int) -> Any:
+    """Return the move of that serial in a window of `ELEMENTAL_MOVE`; None: it is not there."""
+    return next((move for move in window if move["id"] == serial), None)

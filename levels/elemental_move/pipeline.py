@@ -145,13 +145,8 @@ class SegmentWindow:
 
     @property
     def first(self) -> Any:
-        """The oldest segment; valid while `count` is not 0."""
+        """The oldest segment; all zeros while `count` is 0."""
         return self._segments[0]
-
-    @property
-    def newest_move(self) -> int:
-        """The move of the newest segment; 0 in an empty window."""
-        return int(self._segments["move"][self.count - 1]) if self.count else 0
 
     def take_done(self, done: int) -> Any:
         """Remove and return the oldest segment if its serial is at most `done`; else return
@@ -191,11 +186,11 @@ class SegmentWindow:
         segment["opening"] = opening
         segment["force"] = force
 
-    def end(self) -> Array | None:
-        """Return the last waypoint (joints,) of the newest path in the window; None: there is
-        none."""
+    def end(self, move: int | None = None) -> Array | None:
+        """Return the last waypoint (joints,) of the newest path in the window, or of that of
+        `move`; None: there is none."""
         for segment in self._segments[: self.count][::-1]:
-            if segment["kind"] == SegmentKind.PATH:
+            if segment["kind"] == SegmentKind.PATH and move in (None, segment["move"]):
                 return np.array(segment["waypoints"][segment["count"] - 1])
         return None
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.elemental_move.pipeline import ElementalMoveParams
+from rack.levels.elemental_move.pipeline import ElementalMoveParams, SegmentWindow
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import (
@@ -180,7 +180,7 @@ class ElementalMovePlanner(Planner):
             return None
         for move in self._window:
             if move.id == status.current:
-                end = end_handed_down(read.handed_down.value, move)
+                end = SegmentWindow(read.handed_down.value).end(move.id)
                 return PlanningJob(move, np.array(status.start), end, status.replan)
         return None
 
@@ -203,16 +203,14 @@ class ElementalMovePlanner(Planner):
         """Return the first move without a path."""
         status = read.status.value
         primitive = read.primitive.value
-        newest = status.planned
-        if self._published:
-            newest = max(newest, self._published[-1].move.id)
-        move = next_motion(self._window, newest)
-        if move is None:
-            return None
         # The executor's report of a path's end is exact, but it may not have received the newest
         # path yet.
-        if self._published and self._published[-1].move.id > status.planned:
-            return PlanningJob(move, self._published[-1].path.end)
+        unseen = [p for p in self._published[-1:] if p.move.id > status.planned]
+        move = next_motion(self._window, unseen[0].move.id if unseen else status.planned)
+        if move is None:
+            return None
+        if unseen:
+            return PlanningJob(move, unseen[0].path.end)
         if status.planned > status.done:
             return PlanningJob(move, np.array(status.end))
         return PlanningJob(move, np.array(primitive.position)) if primitive.resting else None
@@ -267,15 +265,6 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
             if move.is_motion:
                 return move
             newest = move.id
-    return None
-
-
-def end_handed_down(command: Message, move: Move) -> Array | None:
-    """Return the end of the path of `move` in a `MOVE_COMMAND`, (joints,), rad; None: it has none
-    there."""
-    for segment in command.segments[: command.count]:
-        if segment["move"] == move.id and segment["kind"] == SegmentKind.PATH:
-            return np.array(segment["waypoints"][segment["count"] - 1])
     return None
 
 

@@ -90,9 +90,7 @@ class PrimitiveExecutor(Executor):
         self._silent_cycles = self._rules.cycles(params.silent)
         self._plans = Plans()
         self._orders = Orders(self.commands)
-        self._memory: Memory | None = (
-            None  # None until this level, restarts included, was first in step with the servo
-        )
+        self._memory = Memory()
         self._work: Work | None = None
         self._fault: SegmentFault | None = None
         self._begun = 0  # serial of the last segment begun
@@ -118,7 +116,7 @@ class PrimitiveExecutor(Executor):
         if servo.error == Error.DISABLED:
             # Plan from where the arm is: while it is not enabled, it may be moved by hand.
             self._displaced = True
-            if self._memory is None:
+            if not self._memory.is_known:
                 self._position[:] = servo.position
         if self._tracking.update(read.status):
             self._resume(servo, tick)
@@ -137,10 +135,10 @@ class PrimitiveExecutor(Executor):
     def _resume(self, servo: Message, tick: int) -> None:
         """Continue from the position at which the servo holds the arm."""
         work = self._work
-        self._displaced |= self._memory is not None
-        if self._memory is None:
+        self._displaced |= self._memory.is_known
+        if not self._memory.is_known:
             force = self._gripper.force if self._gripper is not None else 0.0
-            self._memory = Memory(opening=servo.opening, force=force)
+            self._memory = Memory(is_known=True, opening=servo.opening, force=force)
         self._fault = None
         self._straying.forget()
         self._position[:] = servo.target
@@ -151,7 +149,7 @@ class PrimitiveExecutor(Executor):
         elif work is not None:
             work.begin()
 
-    def _carry(self, row: int | None, tick: int) -> None:
+    def _carry(self, row: int, tick: int) -> None:
         self._sight.carry(row, tick - SEEN_CYCLES * self.context.every)
 
     def _do_segments(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
@@ -184,13 +182,12 @@ class PrimitiveExecutor(Executor):
 
     def _finish(self, servo: Message, tick: int) -> None:
         work = self._work
-        memory = self._memory
-        if work is None or memory is None or self._fault is not None or not work.done(servo):
+        if work is None or self._fault is not None or not work.done(servo):
             return
         if isinstance(work, GripperWork):
-            memory.held = work.held_after
-            self._carry(memory.held, tick)
-        memory.done = work.segment.id
+            self._memory.held = work.held_after
+            self._carry(work.held_after, tick)
+        self._memory.done = work.segment.id
         self._work = None
 
     def _withdraw(self, serials: list[int]) -> bool:
@@ -199,9 +196,9 @@ class PrimitiveExecutor(Executor):
         serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
             return False
-        if isinstance(self._work, PathWork) and not self._work.motion.resting:
-            return True
-        if isinstance(self._work, PathWork) and self._memory is not None:
+        if isinstance(self._work, PathWork):
+            if not self._work.motion.resting:
+                return True
             # Messages may arrive out of order: a withdrawn segment may return, and then continues.
             self._memory.interrupted = serial
             self._memory.progress = self._work.progress
@@ -212,8 +209,8 @@ class PrimitiveExecutor(Executor):
     def _begin(self, read: Ports, serials: list[int], hold: bool) -> None:
         """Begin the oldest segment that is not done; with `hold`, the gripper waits."""
         memory = self._memory
-        serial = next((s for s in serials if memory is not None and s > memory.done), 0)
-        if not serial or memory is None:
+        serial = next((s for s in serials if s > memory.done), 0)
+        if not serial:
             return
         self._begun = serial
         try:
@@ -222,18 +219,15 @@ class PrimitiveExecutor(Executor):
                 return
             if segment.kind is SegmentKind.PATH:
                 self._work = self._begin_path(segment, memory, read)
+            elif self._gripper is None:
+                raise ValueError(f"segment {serial}: the arm has no gripper; valid: paths")
             else:
-                self._work = self._begin_gripper(segment, memory)
+                memory.opening = segment.opening
+                memory.force = segment.force
+                self._work = GripperWork(segment, self._gripper, self._rules)
         except ValueError as error:
             self._fault = SegmentFault(Error.LIMIT, str(error))
         memory.interrupted = 0
-
-    def _begin_gripper(self, segment: MotionSegment, memory: Memory) -> GripperWork:
-        if self._gripper is None:
-            raise ValueError(f"segment {segment.id}: the arm has no gripper; valid: paths")
-        memory.opening = segment.opening
-        memory.force = segment.force
-        return GripperWork(segment, self._gripper, self._rules)
 
     def _begin_path(self, segment: MotionSegment, memory: Memory, read: Ports) -> PathWork:
         path = segment.path()
@@ -252,13 +246,16 @@ class PrimitiveExecutor(Executor):
         """Return the segment for which a trajectory is wanted, and the path parameter of its start;
         0: none."""
         work = self._work
-        done = self._memory.done if self._memory is not None else 0
         kinds = read.command.value.segments["kind"].tolist()
         for serial, kind in zip(serials, kinds, strict=False):
             begin = 0.0 if kind == SegmentKind.PATH else None
             if work is not None and serial == work.segment.id:
                 begin = work.begin_wanted if isinstance(work, PathWork) else None
-            if serial > done and begin is not None and self._plans.lacks(serial, begin):
+            if (
+                serial > self._memory.done
+                and begin is not None
+                and self._plans.lacks(serial, begin)
+            ):
                 return serial, begin
         return 0, 0.0
 
@@ -270,47 +267,46 @@ class PrimitiveExecutor(Executor):
         work = self._work
         memory = self._memory
         in_step = self._tracking.in_step
-        command.id = tick // self.context.every + 1 if memory is not None else 0
+        command.id = tick // self.context.every + 1 if memory.is_known else 0
         # Out of step the arm's position is not certain: no set point is better than a wrong one.
         command.due = self._due(tick) if in_step else 0
         set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
         command.velocity[:] = set_point.velocity
         command.acceleration[:] = set_point.acceleration
-        if memory is not None:
+        if memory.is_known:
             command.opening = memory.opening
             command.force = memory.force
-            command.held = memory.held_row
+            command.held = memory.held
 
     def _write_status(self, read: Ports, status: Message, serials: list[int], tick: int) -> None:
-        memory = self._memory or Memory()
-        path_work = self._work if isinstance(self._work, PathWork) else None
+        memory = self._memory
+        work = self._work
         status.echo = read.command.value.id
-        status.state = self._state(serials, memory)
+        status.state = self._state(serials)
         reason = self._reason_to_wait(read) if status.state == State.EXECUTING else ""
         if reason:
             status.state = State.HOLDING
         status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
         status.done = memory.done
-        status.held = memory.held_row
+        status.held = memory.held
         interrupted = memory.interrupted if memory.interrupted in serials else 0
-        status.current = self._work.segment.id if self._work is not None else interrupted
+        status.current = work.segment.id if work is not None else interrupted
         if read.status.is_there:
             status.opening = read.status.value.opening
         status.position[:] = self._position
-        status.progress = (
-            path_work.progress if path_work is not None else memory.progress * bool(interrupted)
-        )
+        status.progress = memory.progress * bool(interrupted)
         servo = read.status.value
         status.operated = self._orders.stands or servo.standing > 0 or servo.error == Error.DISABLED
-        # Out of step, the world is not the reason why motion holds.
-        status.blocked = path_work is not None and path_work.blocked and self._tracking.in_step
-        status.resting = path_work is None or path_work.motion.resting
-        status.ends = (
-            path_work.ends_s(self._due(tick) * self.context.tick_s)
-            if path_work is not None
-            else 0.0
-        )
+        status.blocked = False
+        status.resting = True
+        status.ends = 0.0
+        if isinstance(work, PathWork):
+            status.progress = work.progress
+            # Out of step, the world is not the reason why motion holds.
+            status.blocked = work.blocked and self._tracking.in_step
+            status.resting = work.motion.resting
+            status.ends = work.ends_s(self._due(tick) * self.context.tick_s)
         status.wants, status.begin = self._wanted(read, serials)
 
     def _reason_to_wait(self, read: Ports) -> str:
@@ -344,9 +340,9 @@ class PrimitiveExecutor(Executor):
         write.command.operator = self._orders.rests_on(above)
         self._orders.report(write.status, above)
 
-    def _state(self, serials: list[int], memory: Memory) -> State:
+    def _state(self, serials: list[int]) -> State:
         if self._fault is not None:
             return State.ERROR
-        if self._work is not None or any(serial > memory.done for serial in serials):
+        if self._work is not None or any(serial > self._memory.done for serial in serials):
             return State.EXECUTING
         return State.DONE if serials else State.IDLE

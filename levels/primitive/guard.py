@@ -71,7 +71,8 @@ class Guard:
     ) -> None:
         """Begin to watch the path of a segment, with the gripper at `opening`, in m."""
         self._checker.open_gripper(opening)
-        self._checker.permit(segment.object, segment.touch and segment.object is not None)
+        row = segment.object if segment.object >= 0 else None
+        self._checker.permit(row, segment.touch and row is not None)
         self._checker.place(world.position, world.quaternion)
         # Motion may start too close to something, but must not get closer.
         room = self._checker.room(path.evaluate(0.0).q)
@@ -152,11 +153,11 @@ class Sight:
         self._blind = has_bodies
         self._waiting: tuple[int, int] | None = None
 
-    def carry(self, row: int | None, since: int) -> None:
-        """Carry object `row` from its pose in a scene sensed at tick `since` or later; None: carry
+    def carry(self, row: int, since: int) -> None:
+        """Carry object `row` from its pose in a scene sensed at tick `since` or later; -1: carry
         nothing."""
-        self._waiting = (row, since) if row is not None else None
-        if row is None:
+        self._waiting = (row, since) if row >= 0 else None
+        if row < 0:
             self._guard.carry_nothing()
 
     def update(self, world: Reading, q: Array, tick: int) -> None:

@@ -104,14 +104,13 @@ class PathMotion:
             self.time_s = 0.0
             self.stopping = True
 
-    def advance(self, duration_s: float) -> JointSetPoint:
-        """Advance by `duration_s`; return the new set point. The next call overwrites its
-        arrays."""
+    def advance(self, duration_s: float) -> None:
+        """Advance the set point by `duration_s`."""
         position, velocity, acceleration = self.set_point
         if self.trajectory is None:
             velocity.fill(0.0)
             acceleration.fill(0.0)
-            return self.set_point
+            return
         self.time_s += duration_s
         self.s, ds, dds = self.trajectory.at(self.time_s)
         q, dq_ds, d2q_ds2 = self.path.evaluate(self.s)
@@ -132,7 +131,6 @@ class PathMotion:
                 value += np.multiply(self._offset, factor, out=self._scratch)
         if self.time_s >= self.trajectory.duration:
             self._come_to_rest()
-        return self.set_point
 
     def _rest(self, s: float, position: Array) -> float:
         self.s = s

@@ -66,7 +66,13 @@ class PrimitivePlanner(Planner):
             segment = read_segment(read.command.value, serial)
             trajectory = make_trajectory(self._path(segment), self._rules.limits, begin)
             start_s = max((published + context.every) * context.tick_s, status.ends)
-            fault = self._write(write, segment, trajectory, start_s)
+            sections = trajectory.sections
+            write.duration = trajectory.duration
+            write.count = len(sections)
+            write.sections[: len(sections)] = sections
+            write.earliest = start_s + trajectory.duration + self._rules.latency_s
+            if trajectory.begin == 0.0 and 0.0 < segment.by < write.earliest:
+                fault = segment.too_late(write.earliest)
         except (ValueError, ArithmeticError) as error:
             fault = SegmentFault(Error.LIMIT, f"segment {serial}: {error}")
         write.error, write.reason, write.earliest = fault or (0, "", write.earliest)
@@ -86,57 +92,42 @@ class PrimitivePlanner(Planner):
             raise ValueError(f"{place}; valid: {low[j]:.4f} to {high[j]:.4f}")
         return path
 
-    def _write(
-        self, write: Message, segment: MotionSegment, trajectory: Trajectory, start_s: float
-    ) -> SegmentFault | None:
-        sections = trajectory.sections
-        write.duration = trajectory.duration
-        write.count = len(sections)
-        write.sections[: len(sections)] = sections
-        write.earliest = start_s + trajectory.duration + self._rules.latency_s
-        fresh = trajectory.begin == 0.0
-        if fresh and 0.0 < segment.by < write.earliest:
-            return segment.too_late(write.earliest)
-        return None
-
 
 class Plans:
     """The executor's copies of plans: the newest trajectory, or refusal, of every segment in the
     window."""
 
     def __init__(self) -> None:
-        self._trajectories: dict[int, Trajectory] = {}
-        self._refusals: dict[int, SegmentFault] = {}
+        self._plans: dict[int, Trajectory | SegmentFault] = {}
 
     def accept(self, plan: Reading, window: Collection[int]) -> None:
         """Copy a new plan; drop those of segments that have left the window."""
-        for kept in (self._trajectories, self._refusals):
-            for serial in [s for s in kept if s not in window]:
-                del kept[serial]
+        for serial in [s for s in self._plans if s not in window]:
+            del self._plans[serial]
         message = plan.value
         serial = message.segment
         if not plan.is_new or serial not in window:
             return
         if message.error:
-            self._refusals[serial] = SegmentFault(
+            self._plans[serial] = SegmentFault(
                 Error(message.error), message.reason, message.earliest
             )
         else:
-            self._trajectories[serial] = Trajectory(
+            self._plans[serial] = Trajectory(
                 message.sections[: message.count].copy(), message.duration
             )
-            self._refusals.pop(serial, None)
 
     def trajectory(self, serial: int, begin: float) -> Trajectory | None:
         """Return the trajectory of a segment from path parameter `begin`; None: none yet."""
-        trajectory = self._trajectories.get(serial)
-        return trajectory if trajectory is not None and trajectory.begin == begin else None
+        plan = self._plans.get(serial)
+        return plan if isinstance(plan, Trajectory) and plan.begin == begin else None
 
     def lacks(self, serial: int, begin: float) -> bool:
         """Return whether there is neither a trajectory from `begin` nor a refusal of the
         segment."""
-        return self.trajectory(serial, begin) is None and serial not in self._refusals
+        return self.trajectory(serial, begin) is None and self.refusal(serial) is None
 
     def refusal(self, serial: int) -> SegmentFault | None:
         """Return why the planner refuses a segment; None: it does not."""
-        return self._refusals.get(serial)
+        plan = self._plans.get(serial)
+        return plan if isinstance(plan, SegmentFault) else None

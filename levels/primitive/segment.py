@@ -25,11 +25,11 @@ class SegmentFault(NamedTuple):
 
 @dataclass(frozen=True)
 class MotionSegment:
-    """A copy of one SEGMENT; see there for units."""
+    """A copy of one SEGMENT; see there for units. `object` is -1 for none."""
 
     id: int
     kind: SegmentKind
-    object: int | None
+    object: int
     touch: bool
     waypoints: Array  # (count, joints)
     blend: Array  # (count,)
@@ -64,16 +64,14 @@ def read_segment(command: Message, serial: int) -> MotionSegment:
     record = command.segments[window(command).index(serial)]
     count = int(record["count"])
     kind = int(record["kind"])
-    row = int(record["object"])
     if kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):
         raise ValueError(f"segment {serial}: kind {kind}; valid: 1 (path), 2 (gripper)")
     if not np.isfinite([record["by"], record["opening"], record["force"]]).all():
         raise ValueError(f"segment {serial}: by, opening or force is not finite")
-    held = row if row >= 0 else None
     return MotionSegment(
         id=serial,
         kind=SegmentKind(kind),
-        object=held,
+        object=int(record["object"]),
         touch=bool(record["touch"]),
         waypoints=record["waypoints"][:count].copy(),
         blend=record["blend"][:count].copy(),
@@ -88,31 +86,27 @@ class Memory:
     """The state with which the executor continues after a restart of its board; its own last
     messages hold it."""
 
+    is_known: bool = False  # True once this level, restarts included, was in step with the servo
     done: int = 0  # newest segment done
     interrupted: int = 0  # segment that was interrupted; 0: none
     progress: float = 0.0  # part of its path done, 0 to 1
-    held: int | None = None  # row of the object in the gripper
+    held: int = -1  # row of the object in the gripper; -1: none
     opening: float = 0.0  # commanded to the gripper, m
     force: float = 0.0  # commanded to the gripper, N
 
-    @property
-    def held_row(self) -> int:
-        """`held` as in messages: -1 for none."""
-        return self.held if self.held is not None else -1
 
-
-def recall(read: Ports) -> Memory | None:
-    """Return the state in the level's own last messages; None before the first ones."""
+def recall(read: Ports) -> Memory:
+    """Return the state in the level's own last messages; not `is_known` before the first ones."""
     status = read.last_status
     command = read.last_command
     if not (status.is_there and command.is_there and command.value.id):
-        return None
-    held = status.value.held if status.value.held >= 0 else None
+        return Memory()
     return Memory(
+        is_known=True,
         done=status.value.done,
         interrupted=status.value.current,
         progress=status.value.progress,
-        held=held,
+        held=status.value.held,
         opening=command.value.opening,
         force=command.value.force,
     )

@@ -266,10 +266,10 @@ class GripperWork:
         self._quiet = self._rules.quiet()
 
     @property
-    def held_after(self) -> int | None:
+    def held_after(self) -> int:
         """The object in the gripper afterwards: the segment's, if the gripper ends nearer to closed
-        than to open."""
-        return self.segment.object if self._closes else None
+        than to open; -1: none."""
+        return self.segment.object if self._closes else -1
 
     def done(self, status: Message) -> bool:
         """Return whether the gripper rests."""

@@ -150,16 +150,8 @@ class TaskExecutor(Executor):
     def _check_progress(self, plan: Message, read: Ports, waits: str, tick: int) -> None:
         """Fail when nothing has moved for too long, unless an operator keeps it from moving."""
         below = read.status.value
-        progress = (
-            plan.id,
-            self._done,
-            below.done,
-            below.planned,
-            below.current,
-            below.progress,
-            self._detour.move,
-        )
-        progress = (*progress, *self._stage())
+        reported = below.done, below.planned, below.current, below.progress
+        progress = (plan.id, self._done, *reported, self._detour.move, *self._stage())
         operated = below.operated or self._orders.stands
         if operated or progress != self._progress:
             self._progress = progress
@@ -184,14 +176,12 @@ class TaskExecutor(Executor):
     def _hand_down(self, plan: Message, command: Message) -> None:
         """Show the program's next moves, or the operator's goto."""
         detour = self._detour
-        window = self._window
-        is_ready = detour.is_known if detour.move else bool(plan.count)
-        if self._error or not is_ready:
-            window.show_none(command)
-        elif detour.move:
-            window.show_one(detour.as_move(self._actions_done(plan)), command)
+        if detour.move and detour.is_known and not self._error:
+            self._window.show_one(detour.as_move(self._actions_done(plan)), command)
         else:
-            window.show(plan, self._done, command, self._shown_until(plan))
+            is_kept = self._error or detour.move
+            until = 0 if is_kept else self._shown_until(plan)
+            self._window.show(plan, self._done, command, until)
 
     def _shown_until(self, plan: Message) -> int:
         """Return the first move of the plan that must not begin."""
@@ -201,13 +191,11 @@ class TaskExecutor(Executor):
         status: Message = write.status
         status.echo = plan.id
         status.state = self._state(plan)
-        if waits and status.state == State.EXECUTING:
+        holds = waits and status.state == State.EXECUTING
+        if holds:
             status.state = State.HOLDING
         status.error = self._error
-        if self._error:
-            status.reason = self._reason
-        else:
-            status.reason = waits if status.state == State.HOLDING else ""
+        status.reason = self._reason if self._error else waits if holds else ""
         status.action = self._actions_done(plan)
         status.actions = len(self._actions)
         status.moves_done = self._done

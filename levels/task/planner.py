@@ -16,7 +16,7 @@ from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, TaskConfig, TaskParams, read_program
-from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times, pipeline_periods
+from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times
 
 FIRST_PLAN = 1
 """Serial of the first plan."""
@@ -57,7 +57,6 @@ class TaskPlanner(Planner):
         self._id = FIRST_PLAN
         self._ahead_s = 0.0  # the time of the program's `by`, less simulated time here
         self._needs = read_params(self.params, context.params)
-        self._periods = pipeline_periods(context)
         cell = cell_of(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._plan: Message | None = None  # made by this process
@@ -157,7 +156,7 @@ class TaskPlanner(Planner):
     def _promise(self, moves: Sequence[Rehearsed], visible_s: float, write: Message) -> None:
         """Raise `Refused` with the earliest possible time if an action cannot be done by its
         time."""
-        finish_s = finish_times(moves, visible_s, self._periods, self._needs)
+        finish_s = finish_times(moves, visible_s, self.context, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):
             action = self._program.action[move.action]
             earliest_s = finished_s + self._ahead_s

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from rack.levels.algebra import Array
-from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.messages import SEGMENTS, WINDOW, Verb
 from rack.levels.planning.moves import Move, Situation
@@ -75,27 +74,8 @@ class Rehearsal:
         return replace(self, q=path.end, moves=(*self.moves, rehearsed))
 
 
-class PipelinePeriods(NamedTuple):
-    """The periods on which the promise of a time depends, in s."""
-
-    own_s: float  # cycle of the task level
-    below_s: float  # cycle of the level below
-    planning_s: float  # time slice of a plan there
-
-
-def pipeline_periods(context: LevelContext) -> PipelinePeriods:
-    """Return the periods of a task level. Raises `LevelError` if it has no level below."""
-    if not context.below:
-        raise LevelError(
-            f"level '{context.board}' has no level below; it needs one to carry out its moves"
-        )
-    (below,) = context.below.values()
-    below_s = below.every * context.tick_s
-    return PipelinePeriods(context.period_s, below_s, below_s * below.within_cycles)
-
-
 def finish_times(
-    moves: Sequence[Rehearsed], visible_s: float, periods: PipelinePeriods, needs: TaskParams
+    moves: Sequence[Rehearsed], visible_s: float, context: LevelContext, needs: TaskParams
 ) -> list[float]:
     """Return for every move the latest simulated time, in s, at which the task level reads that it
     is done.
@@ -105,17 +85,18 @@ def finish_times(
     waits at most one cycle to be read and one to be seen. The result assumes that nothing is in the
     way.
     """
-    below = periods.below_s
+    (pace,) = context.below.values()
+    below = pace.every * context.tick_s
     done: list[float] = []
     planned = visible_s
     for k, (move, duration_s) in enumerate(moves):
         shown = visible_s
         if k >= WINDOW:
-            shown = max(visible_s, done[k - WINDOW] + 2.0 * below + 2.0 * periods.own_s)
+            shown = max(visible_s, done[k - WINDOW] + 2.0 * below + 2.0 * context.period_s)
         if move.is_motion:
             # The planner makes one plan after the other; only a move that it has waited for costs a
             # cycle more.
-            planned = max(planned, shown + below) + periods.planning_s
+            planned = max(planned, shown + below) + below * pace.within_cycles
         at_hand = max(planned, shown) if move.is_motion else shown
         room = done[k - SEGMENTS] + below if k >= SEGMENTS else 0.0
         arrives = max(at_hand, room) + 2.0 * below
@@ -125,4 +106,4 @@ def finish_times(
         end = begun + lasts_s
         # A move with a time is stretched to end just before it: the next one begins no sooner.
         done.append(max(end, move.by_s - 2.0 * below))
-    return [time_s + 2.0 * below + periods.own_s for time_s in done]
+    return [time_s + 2.0 * below + context.period_s for time_s in done]

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message, State, copied
+from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.messages import WINDOW, Verb
 from rack.levels.operator import Answer, Goal, Operation, Orders, described, joints_of
 from rack.levels.planning.moves import Move
-from rack.levels.planning.pose import pointing, pose
+from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.tables import RobotConfig
 
 JUMP = 2
@@ -63,8 +63,8 @@ class ShownWindow:
         return done, True
 
     def show(self, plan: Message, done: int, command: Message, until: int) -> None:
-        """Show the moves from the first one that is not done up to `until`; after the last, the
-        window stays.
+        """Show the moves from the first one that is not done up to `until`, none before it; after
+        the last, the window stays.
 
         Moves that were done under other ids are not shown again: the level below would repeat them.
         """
@@ -78,10 +78,6 @@ class ShownWindow:
         """Show one move alone."""
         move.write_to(command.moves[0])
         self._end(command, 1)
-
-    def show_none(self, command: Message) -> None:
-        """Withdraw all moves."""
-        self._end(command, 0)
 
     def _end(self, command: Message, count: int) -> None:
         command.count = count
@@ -107,7 +103,8 @@ class Detour:
         self._robot = robot
         self._orders = orders
         self._window = window
-        self._goal: Message | None = None
+        self._goal = Goal.NONE
+        self._target: tuple[Verb, Pose, Array] | None = None  # kind of move, and its end
         self._is_new = False
         self.move = move  # id of the goto on the bus; 0: the program is not interrupted
         self.holds = False  # the arm must rest before the program can be interrupted
@@ -117,27 +114,23 @@ class Detour:
     def is_known(self) -> bool:
         """False if this board was restarted and a hold came after the goto: the goal is then
         lost."""
-        return self._goal is not None
+        return self._target is not None
 
     def reason(self) -> str:
         """Return the state of the goto, and the command that ends it."""
-        goal = described(Operation.GOTO, self._goal.goal) if self._goal is not None else "goto"
+        goal = described(Operation.GOTO, self._goal)
         stage = "done" if self._orders.answer is Answer.DONE else "under way"
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
     def begin(self, message: Message, is_new: bool) -> None:
         """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under
         its id."""
-        goal = copied(message)
         try:
-            if goal.goal == Goal.JOINTS:
-                self._joints(goal)
-            elif goal.goal != Goal.HOME:
-                _check_pose(goal)
+            self._target = self._read(message)
         except ValueError as error:
             self._orders.refuse(str(error))
             return
-        self._goal = goal
+        self._goal = Goal(message.goal)
         self._is_new = is_new
 
     def step(self, plan: Message, done: int, below: Message) -> int:
@@ -175,17 +168,8 @@ class Detour:
     def as_move(self, action: int) -> Move:
         """Return the goto as a move; `action` is the program's next, though the move serves
         none."""
-        goal = self._goal
-        assert goal is not None, "there is a move only for a goal"
-        joints = np.array(self._robot.home)
-        verb = Verb.MOVE_JOINTS
-        tool = pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
-        if goal.goal == Goal.JOINTS:
-            joints = self._joints(goal)
-        elif goal.goal != Goal.HOME:
-            turned = goal.quaternion if goal.goal == Goal.POSE else pointing(goal.direction)
-            verb = Verb.MOVE
-            tool = pose(goal.position, turned)
+        assert self._target is not None, "there is a move only for a goal"
+        verb, tool, joints = self._target
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 
     def _follow(self, below: Message) -> None:
@@ -194,13 +178,21 @@ class Detour:
         elif below.state == State.ERROR and below.done >= self._window.before:
             self._orders.fail(below.reason)
 
-    def _joints(self, goal: Message) -> Array:
-        names = self._robot.joints
-        return joints_of(goal, names, np.tile((-MAX_JOINT_RAD, MAX_JOINT_RAD), (len(names), 1)))
-
-
-def _check_pose(goal: Message) -> None:
-    """Raise `ValueError` for an invalid position or orientation."""
-    turned = goal.quaternion if goal.goal == Goal.POSE else goal.direction
-    if not (np.isfinite(goal.position).all() and np.isfinite(turned).all() and turned.any()):
-        raise ValueError("position, quaternion or direction is not finite, or all zero")
+    def _read(self, message: Message) -> tuple[Verb, Pose, Array]:
+        """Return the kind of move to a goal, and its end. Raises `ValueError` for an invalid
+        one."""
+        joints = np.array(self._robot.home)
+        tool = pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
+        goal = message.goal
+        if goal == Goal.JOINTS:
+            names = self._robot.joints
+            ranges = np.tile((-MAX_JOINT_RAD, MAX_JOINT_RAD), (len(names), 1))
+            joints = joints_of(message, names, ranges)
+        if goal in (Goal.JOINTS, Goal.HOME):
+            return Verb.MOVE_JOINTS, tool, joints
+        turned = np.array(message.quaternion if goal == Goal.POSE else message.direction)
+        position = np.array(message.position)
+        if not (np.isfinite(position).all() and np.isfinite(turned).all() and turned.any()):
+            raise ValueError("position, quaternion or direction is not finite, or all zero")
+        tool = pose(position, turned if goal == Goal.POSE else pointing(turned))
+        return Verb.MOVE, tool, joints

@@ -48,6 +48,11 @@ class ParallelChains:
         )
 
     @property
+    def bound(self) -> int:
+        """The bound on the system's response along them, n R_max for n levels (eq. 3.2), ticks."""
+        return len(self.cycles) * max(self.cycles, default=0)
+
+    @property
     def text(self) -> str:
         """All of them in one line: "trajectory > joint1 ... joint6 > arm"."""
         return " > ".join(self.levels)

@@ -6,8 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, TickGrid
-from rack.levels.timing.equations import grid_wait, response_ticks
-from rack.levels.timing.rack import RackTiming
+from rack.levels.timing.rack import RackTiming, grid_wait
 from rack.levels.timing.system_response import mailboxes_along
 
 
@@ -69,7 +68,7 @@ class CommandPath:
             grid_wait(written, read)
             for written, read in zip(self.releases, self.reads[1:], strict=False)
         ]
-        return self.delay + self.reads[0].every - 1 + response_ticks(self.cycles, waits)
+        return self.delay + self.reads[0].every - 1 + sum(self.cycles) + sum(waits)
 
 
 def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:

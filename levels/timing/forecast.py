@@ -7,9 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from rack.levels.timing.frames import CoreFrames, core_frames
-from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.rack import CyclicSchedule, RackTiming
-from rack.levels.timing.response_time import TaskResponse
+from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import Prediction, predict
 from rack.levels.timing.verdicts import EquationVerdict, verdicts
 
@@ -18,23 +16,17 @@ NO_BUDGET = "no budget"
 
 @dataclass(frozen=True)
 class Forecast:
-    """The timing of a rack from its budgets. `loads` are by core; `notes` are the limits of the
-    prediction; `uncounted` gives for every board, planner and host board that it leaves out the
-    reason.
+    """The timing of a rack from its budgets. `notes` are the limits of the prediction; `uncounted`
+    gives for every board, planner and host board that it leaves out the reason.
 
-    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it. `schedule`
-    is the static one, in ticks of `tick_ns`, and `frames` what its cores do in its frames.
+    `inboxes` are what interrupts cost each board, as `InboxTiming.document` returns it. `frames`
+    are what cores do in the frames of a static schedule.
     """
 
+    rack: RackTiming
     system: Prediction
-    context_switch_ns: int
-    levels: tuple[LevelTiming, ...]
     verdicts: tuple[EquationVerdict, ...]
-    responses: tuple[TaskResponse, ...]
-    loads: dict[int, float]
     inboxes: tuple[dict[str, Any], ...]
-    tick_ns: int
-    schedule: CyclicSchedule | None
     frames: tuple[CoreFrames, ...]
     notes: tuple[str, ...]
     uncounted: dict[str, str]
@@ -49,18 +41,13 @@ class Forecast:
             hosts: Host boards, which the timing model does not know.
         """
         return cls(
+            rack=rack,
             system=predict(rack),
-            context_switch_ns=rack.context_switch_ns,
-            levels=tuple(rack.levels.values()),
             verdicts=tuple(verdicts(rack)),
-            responses=rack.responses,
-            loads=rack.loads,
             inboxes=tuple(
                 inbox.document(rack.slice_ticks(name) * rack.clock_ns)
                 for name, inbox in rack.inboxes.items()
             ),
-            tick_ns=rack.tick_ns,
-            schedule=rack.schedule,
             frames=core_frames(rack),
             notes=tuple(_notes(rack, has_cores)),
             uncounted=_uncounted(rack) | dict.fromkeys(hosts, "a host board, without a rate"),
@@ -73,28 +60,24 @@ class Forecast:
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data; times whose names end in _ns are wall-clock times."""
+        rack = self.rack
+        schedule = None
+        if rack.schedule is not None:
+            minor_ms, major_ms = (ticks * rack.tick_ns * 1e-6 for ticks in rack.schedule)
+            cores = [found.document() for found in self.frames]
+            schedule = {"minor_ms": minor_ms, "major_ms": major_ms, "cores": cores}
         return {
             **asdict(self.system),
-            "context_switch_ns": self.context_switch_ns,
-            "levels": [level.document() for level in self.levels],
+            "context_switch_ns": rack.context_switch_ns,
+            "levels": [level.document() for level in rack.levels.values()],
             "verdicts": [verdict.document() for verdict in self.verdicts],
-            "responses": [response.document() for response in self.responses],
-            "loads": {str(core): load for core, load in self.loads.items()},
+            "responses": [response.document() for response in rack.responses],
+            "loads": {str(core): load for core, load in rack.loads.items()},
             "inboxes": list(self.inboxes),
-            "schedule": self._schedule(),
+            "schedule": schedule,
             "notes": list(self.notes),
             "holds": self.holds,
         }
-
-    def _schedule(self) -> dict[str, Any] | None:
-        """Return the static schedule as plain data; None: there is none."""
-        if self.schedule is None:
-            return None
-        sizes = {
-            f"{name}_ms": ticks * self.tick_ns * 1e-6
-            for name, ticks in self.schedule._asdict().items()
-        }
-        return {**sizes, "cores": [found.document() for found in self.frames]}
 
 
 def _uncounted(rack: RackTiming) -> dict[str, str]:

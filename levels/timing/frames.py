@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby
+from dataclasses import dataclass
 from typing import Any
 
 from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.response_time import job_ns
+from rack.levels.timing.response_time import as_one_part
 from rack.levels.timing.schedule import Span, simulate
-from rack.levels.timing.tasks import Part, TimedTask, Unit
+from rack.levels.timing.tasks import TimedTask
 
 Work = dict[tuple[str, int], list[Span]]
 """The stretches of work of every job, in order, by task and release."""
@@ -30,8 +29,8 @@ class FramePlace:
     `limit_ns`.
 
     `job_ns` is its budget with two context switches. `slack_ns` is the time from its end to the
-    limit; negative: so much of its work is left then. `until` is the board that begins at the
-    limit; empty: the frame ends there.
+    limit; negative: so much of its work is left then, if the limit stops nothing. `until` is the
+    board that begins at the limit; empty: the frame ends there.
     """
 
     board: str
@@ -40,16 +39,6 @@ class FramePlace:
     limit_ns: int
     slack_ns: int
     until: str
-
-    @property
-    def end_ns(self) -> int:
-        """Its end; if it is late, what its end would be if the limit stopped nothing."""
-        return self.limit_ns - self.slack_ns
-
-    @property
-    def limit(self) -> str:
-        """The event that is its limit, as text."""
-        return f"'{self.until}' begins" if self.until else "the frame ends"
 
 
 @dataclass(frozen=True)
@@ -85,11 +74,8 @@ def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
     if rack.schedule is None:
         return ()
     minor, major = (ticks * rack.tick_ns for ticks in rack.schedule)
-    # A job with its switches is one stretch of work.
     tasks = [
-        replace(task, parts=(Part(Unit.PROCESS, job_ns(task, rack.context_switch_ns)),))
-        for task in rack.tasks
-        if task.role != "planner"
+        as_one_part(task, rack.context_switch_ns) for task in rack.tasks if task.role != "planner"
     ]
     work: Work = defaultdict(list)
     for span in simulate(tasks, 2 * major + 2 * minor).spans:
@@ -107,43 +93,28 @@ def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
 
 def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> Iterator[FramePlace]:
     """Yield the places of a frame that begins at `start`, of the tasks of one core."""
-    released = [
-        (start + (task.phase_ns - start) % task.every_ns, -task.priority, task.name, task)
+    frame_end = start + minor
+    released = sorted(
+        (start + (task.phase_ns - start) % task.every_ns, -task.priority, task.name, task.cost_ns)
         for task in tasks
-        if (task.phase_ns - start) % task.every_ns < minor
-    ]
-    groups = [
-        [task for *_, task in group]
-        for _, group in groupby(sorted(released), key=lambda one: one[0])
-    ]
-    times = [*sorted({release for release, *_ in released}), start + minor]
-    for group, release, following, limit in zip(
-        groups, times, [*groups[1:], []], times[1:], strict=False
-    ):
-        begins = release
-        for task, after in zip(group, [*group[1:], *following, None], strict=False):
-            is_last = task is group[-1]
-            end, done = _worked(work[task.name, release], task, limit)
-            slack_ns = 0
-            if end is None:
-                slack_ns = done - task.cost_ns
-            elif is_last:
-                slack_ns = limit - end
-            ends_by = limit if is_last or end is None else end
-            until = "" if after is None else after.name
-            yield FramePlace(
-                board=task.name,
-                offset_ns=begins - start,
-                job_ns=task.cost_ns,
-                limit_ns=ends_by - start,
-                slack_ns=slack_ns,
-                until=until,
-            )
-            begins = limit if end is None else end
-
-
-def _worked(spans: Sequence[Span], task: TimedTask, limit: int) -> tuple[int | None, int]:
-    """Return the end of a job if it is not after `limit`, and its processor time until then."""
-    done = sum(min(span.end_ns, limit) - span.start_ns for span in spans if span.start_ns < limit)
-    end = spans[-1].end_ns if done == task.cost_ns else None
-    return end, done
+    )
+    released = [found for found in released if found[0] < frame_end]
+    begins = start
+    for at, (release, _, board, cost_ns) in enumerate(released, 1):
+        later = released[at:]
+        limit = next((time for time, *_ in later if time > release), frame_end)
+        is_last = not later or later[0][0] > release
+        spans = work[board, release]
+        done = sum(min(s.end_ns, limit) - s.start_ns for s in spans if s.start_ns < limit)
+        # What is not done by the limit ends there.
+        end = spans[-1].end_ns if done == cost_ns else limit
+        begins = max(begins, release)
+        yield FramePlace(
+            board=board,
+            offset_ns=begins - start,
+            job_ns=cost_ns,
+            limit_ns=(limit if is_last else end) - start,
+            slack_ns=done - cost_ns + (limit - end if is_last else 0),
+            until=later[0][2] if later else "",
+        )
+        begins = end

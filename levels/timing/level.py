@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from rack.backplane.layout import TickGrid
-from rack.levels.timing.equations import communication_ns, residual_ns
 from rack.levels.timing.tasks import Budget
 
 Coupling = Literal["tight", "loose", "none"]
@@ -49,10 +48,6 @@ class BoardTiming:
     def releases(self) -> TickGrid:
         """The ticks at which its cycles begin."""
         return TickGrid(self.every, self.phase)
-
-    def reads_from(self, board: str) -> TickGrid:
-        """Return the ticks at which it reads the messages of another board."""
-        return self.reads.get(board, self.releases)
 
     @property
     def is_plan_budgeted(self) -> bool:
@@ -96,7 +91,7 @@ class LevelTiming:
     @property
     def communication_ns(self) -> int:
         """t_comm of eq. 3.5: the executor's communication in every cycle, R, W and C."""
-        return round(communication_ns(self.interlevel_ns, self.exchange_ns))
+        return self.interlevel_ns + self.exchange_ns
 
     @property
     def executor_planner_ns(self) -> int:
@@ -108,7 +103,7 @@ class LevelTiming:
     def residual_ns(self) -> int:
         """t_residual of eq. 3.5, and alpha of eq. 3.6: the budget's times are the longest of all
         cycles."""
-        return round(residual_ns(self.cycle_ns, self.execution_ns, self.communication_ns))
+        return self.cycle_ns - self.execution_ns - self.communication_ns
 
     @property
     def planning_ns(self) -> int | None:

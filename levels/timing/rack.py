@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from math import prod
+from math import gcd, prod
 from typing import Any, NamedTuple
 
+from rack.backplane.layout import TickGrid
 from rack.levels.timing.chains import ParallelChains
-from rack.levels.timing.equations import grid_wait, response_ticks
 from rack.levels.timing.interrupts import InboxTiming
 from rack.levels.timing.level import BoardTiming, LevelTiming
 from rack.levels.timing.response_time import TaskResponse, load_of, task_responses
@@ -100,23 +100,16 @@ class RackTiming:
 
     def response_ticks(self, boards: Sequence[str]) -> int:
         """Return the longest response along boards, in the order in which the information passes,
-        ticks."""
+        ticks: from the release of the first to the end of the cycle of the last that acts on it.
+
+        Each level takes its cycle (eq. 3.3); a message also waits for its next read on the grid.
+        """
         passed = [self.boards[name] for name in boards]
         waits = [
-            grid_wait(one.releases, other.reads_from(one.name)) for one, other in pairwise(passed)
+            grid_wait(one.releases, other.reads.get(one.name, other.releases))
+            for one, other in pairwise(passed)
         ]
-        return response_ticks([board.every for board in passed], waits)
-
-    @cached_property
-    def connected(self) -> tuple[frozenset[str], ...]:
-        """The boards of every hierarchy: all that are connected by chains."""
-        found: list[frozenset[str]] = []
-        for chain in self.chains:
-            joined = [boards for boards in found if not boards.isdisjoint(chain)]
-            found = [boards for boards in found if boards.isdisjoint(chain)] + [
-                frozenset(chain).union(*joined)
-            ]
-        return tuple(found)
+        return sum(waits) + sum(board.every for board in passed)
 
     @cached_property
     def ranks(self) -> tuple[tuple[str, ...], ...]:
@@ -140,10 +133,10 @@ class RackTiming:
         """
         found = {name: float(board.every) for name, board in self.boards.items()}
         if self.response_goal_ns is None:
-            for boards in self.connected:
-                found |= dict.fromkeys(
-                    boards, float(max(self.boards[name].every for name in boards))
-                )
+            # Chains that share a board are of one hierarchy: the longest passes from one to the
+            # next, at least one chain farther in each round.
+            for chain in self.chains * len(self.chains):
+                found |= dict.fromkeys(chain, max(found[name] for name in chain))
         else:
             for chain in sorted(self.chains, key=len):
                 found |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))
@@ -155,7 +148,9 @@ class RackTiming:
         budget = table.budget
         if budget is None:
             raise KeyError(board)
-        executor = LevelTiming(
+        planned = table.is_plan_budgeted
+        plan_ns = budget.plan_ns + self.interrupted_ns(f"{board}.planner")
+        return LevelTiming(
             board=board,
             coupling=table.coupling,
             cycle_ns=table.every * self.tick_ns,
@@ -164,19 +159,10 @@ class RackTiming:
             execution_ns=budget.process_ns,
             write_ns=budget.write_ns,
             exchange_ns=table.exchange_ns,
-            plan_ns=None,
-            update_ns=0,
-            within_cycles=None,
-            plan_within_ns=None,
-        )
-        if not table.is_plan_budgeted:
-            return executor
-        return replace(
-            executor,
-            plan_ns=budget.plan_ns + self.interrupted_ns(f"{board}.planner"),
-            update_ns=budget.update_ns,
-            within_cycles=table.within_cycles,
-            plan_within_ns=table.plan_within_ns,
+            plan_ns=plan_ns if planned else None,
+            update_ns=budget.update_ns if planned else 0,
+            within_cycles=table.within_cycles if planned else None,
+            plan_within_ns=table.plan_within_ns if planned else None,
         )
 
     def interrupted_ns(self, task: str) -> int:
@@ -272,3 +258,10 @@ class RackTiming:
 
 def _nonzero(*parts: Part) -> tuple[Part, ...]:
     return tuple(part for part in parts if part.time_ns)
+
+
+def grid_wait(written: TickGrid, read: TickGrid) -> int:
+    """Return the longest time, ticks, from a message on the grid of its writer to the next read
+    (eq. 3.7)."""
+    common = gcd(written.every, read.every)
+    return read.every - common + (read.phase - written.phase) % common

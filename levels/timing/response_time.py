@@ -2,11 +2,10 @@
 beyond the paper.
 
 The recurrence is M. Joseph and P. Pandya's, *Finding Response Times in a Real-Time System*, The
-Computer Journal 29 (1986); with blocking and release jitter it is N. Audsley et al.'s, *Applying
-New Scheduling Theory to Static Priority Pre-emptive Scheduling*, Software Engineering Journal 8
-(1993):
+Computer Journal 29 (1986); with blocking it is N. Audsley et al.'s, *Applying New Scheduling Theory
+to Static Priority Pre-emptive Scheduling*, Software Engineering Journal 8 (1993):
 
-    R = w + J,  w = B + C + sum over all tasks above of ceil((w + J_j) / T_j) C_j.
+    R = B + C + sum over all tasks above of ceil(R / T_j) C_j.
 
 This is the response of a job released together with all tasks above it. A rack without phases
 releases all tasks together at tick 0, so the bound is attained. Phases may keep tasks apart for
@@ -17,7 +16,7 @@ repeats. Times are integers in one unit; a rack uses ns.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
@@ -27,8 +26,8 @@ from typing import Any
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
-Load = tuple[int, int, int]
-"""Demand of a task on its core: cost C of a job, period T, release jitter J."""
+Load = tuple[int, int]
+"""Demand of a task on its core: cost C of a job, and period T."""
 
 TURN_NS = 4_000_000
 """Longest turn of an ordinary task while another waits: one tick of a 250 Hz kernel (Linux's own
@@ -48,7 +47,6 @@ def response_time(
     cost: int,
     above: Sequence[Load],
     blocking: int,
-    jitter: int,
     *,
     sharing: Sequence[Load],
     horizon: int,
@@ -67,62 +65,27 @@ def response_time(
     Linux does not guarantee.
     """
     # Below full load a bound exists; near full load the search for it may take too long.
-    if cost and sum(Fraction(c, t) for c, t, _ in above) >= 1:
+    if cost and sum(Fraction(*load) for load in above) >= 1:
         return None
 
     def work(until: int) -> int:
         turns = sum(min(_released(until, load), cost + TURN_NS) for load in sharing)
         return blocking + cost + turns + sum(_released(until, load) for load in above)
 
-    end = _fixed_point(work, blocking + cost, horizon)
-    return None if end is None else end + jitter
-
-
-def _fixed_point(work: Callable[[int], int], guess: int, horizon: int) -> int | None:
-    """Return the smallest w >= `guess` at which all work released before w is done; None if there
-    is none."""
+    # The end is the smallest time at which all work released before it is done.
+    end = blocking + cost
     for _ in range(MAX_STEPS):
-        if guess > horizon:
+        if end > horizon:
             break
-        if (needed := work(guess)) <= guess:
-            return guess
-        guess = needed
+        if (needed := work(end)) <= end:
+            return end
+        end = needed
     return None
 
 
 def _released(until: int, load: Load) -> int:
-    cost, period, jitter = load
-    return -(-(until + jitter) // period) * cost
-
-
-def response_times(tasks: Iterable[TimedTask], context_switch_ns: int = 0) -> dict[str, int | None]:
-    """Return the worst-case response time of every task with a cost, ns, by name.
-
-    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both.
-    None: no bound, or none within `HORIZON_DEADLINES` deadlines. Tasks of equal priority delay each
-    other by whole jobs; tasks under ordinary scheduling (priority 0) take turns. The bound is exact
-    for tasks of different priorities without blocking; it does not credit a job for its own parts
-    that cannot be preempted. On a core with phases the schedule itself is exact, if it repeats.
-    """
-    busy = [task for task in tasks if task.cost_ns]
-    found = {}
-    for task in busy:
-        others = [other for other in busy if other.core == task.core and other is not task]
-        shares = [other for other in others if not task.priority and not other.priority]
-        above = [
-            other for other in others if other.priority >= task.priority and other not in shares
-        ]
-        found[task.name] = response_time(
-            job_ns(task, context_switch_ns),
-            [_load(other, context_switch_ns) for other in above],
-            blocking_ns(task, others),
-            task.jitter_ns,
-            sharing=[_load(other, context_switch_ns) for other in shares],
-            horizon=HORIZON_DEADLINES * task.period_ns,
-        )
-    for core in {task.core for task in busy if task.phase_ns}:
-        found |= _scheduled([task for task in busy if task.core == core], context_switch_ns)
-    return found
+    cost, period = load
+    return -(-until // period) * cost
 
 
 def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, int]:
@@ -136,13 +99,10 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
     period = lcm(*(task.period_ns for task in tasks))
     first = max(task.phase_ns for task in tasks)
     until = first + 2 * period
-    is_open = any(task.role == "planner" or task.jitter_ns for task in tasks)
+    is_open = any(task.role == "planner" for task in tasks)
     if is_open or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
         return {}
-    whole = [
-        replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),))
-        for task in tasks
-    ]
+    whole = [as_one_part(task, context_switch_ns) for task in tasks]
     chart = simulate(whole, until + max(task.period_ns for task in tasks))
     priorities = {task.name: task.priority for task in tasks}
     spent = defaultdict[int, list[tuple[int, int]]](list)
@@ -189,27 +149,59 @@ class TaskResponse:
         return asdict(self) | {"holds": self.holds}
 
 
-def task_responses(tasks: Sequence[TimedTask], context_switch_ns: int) -> tuple[TaskResponse, ...]:
-    """Return the worst case of every task with a cost."""
-    found = response_times(tasks, context_switch_ns)
-    return tuple(
-        TaskResponse(
-            task=task.name,
-            core=task.core,
-            priority=task.priority,
-            job_ns=job_ns(task, context_switch_ns),
-            blocking_ns=blocking_ns(task, tasks),
-            response_ns=found[task.name],
-            deadline_ns=task.period_ns,
+def task_responses(
+    tasks: Iterable[TimedTask], context_switch_ns: int = 0
+) -> tuple[TaskResponse, ...]:
+    """Return the worst case of every task with a cost.
+
+    A job takes two context switches, into it and out of it (eq. 3.9); its response includes both.
+    Tasks of equal priority delay each other by whole jobs; tasks under ordinary scheduling
+    (priority 0) take turns. The bound is exact for tasks of different priorities without blocking;
+    it does not credit a job for its own parts that cannot be preempted. On a core with phases the
+    schedule itself is exact, if it repeats.
+    """
+    busy = [task for task in tasks if task.cost_ns]
+    exact: dict[str, int] = {}
+    for core in {task.core for task in busy if task.phase_ns}:
+        exact |= _scheduled([task for task in busy if task.core == core], context_switch_ns)
+    found = []
+    for task in busy:
+        others = [other for other in busy if other.core == task.core and other is not task]
+        shares = [other for other in others if not task.priority and not other.priority]
+        above = [
+            other for other in others if other.priority >= task.priority and other not in shares
+        ]
+        job = job_ns(task, context_switch_ns)
+        blocking = blocking_ns(task, others)
+        bound = response_time(
+            job,
+            [_load(other, context_switch_ns) for other in above],
+            blocking,
+            sharing=[_load(other, context_switch_ns) for other in shares],
+            horizon=HORIZON_DEADLINES * task.period_ns,
         )
-        for task in tasks
-        if task.name in found
-    )
+        found.append(
+            TaskResponse(
+                task=task.name,
+                core=task.core,
+                priority=task.priority,
+                job_ns=job,
+                blocking_ns=blocking,
+                response_ns=exact.get(task.name, bound),
+                deadline_ns=task.period_ns,
+            )
+        )
+    return tuple(found)
 
 
 def job_ns(task: TimedTask, context_switch_ns: int) -> int:
     """Return the processor time of one job with its two context switches."""
     return task.cost_ns + 2 * context_switch_ns
+
+
+def as_one_part(task: TimedTask, context_switch_ns: int) -> TimedTask:
+    """Return a task whose job with its switches is one stretch of work."""
+    return replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),))
 
 
 def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
@@ -220,7 +212,8 @@ def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
     priority (eq. 3.10).
     """
     below = (t for t in tasks if t.core == task.core and t.priority < task.priority <= t.ceiling)
-    return max((other.locked_ns for other in below), default=0)
+    locked = (part.time_ns for t in below for part in t.parts if not part.preemptible)
+    return max(locked, default=0)
 
 
 def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:
@@ -236,4 +229,4 @@ def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, flo
 
 
 def _load(task: TimedTask, context_switch_ns: int) -> Load:
-    return job_ns(task, context_switch_ns), task.period_ns, task.jitter_ns
+    return job_ns(task, context_switch_ns), task.period_ns

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
@@ -54,12 +53,13 @@ class Chart:
 
     def late(self, task: str) -> list[Job]:
         """Return the jobs of a task that missed their deadline, unfinished ones included."""
-        return [job for job in self.jobs if job.task == task and self._is_late(job)]
-
-    def _is_late(self, job: Job) -> bool:
-        return (
-            job.deadline_ns <= self.end_ns if job.end_ns is None else job.deadline_ns < job.end_ns
-        )
+        unfinished = self.end_ns + 1  # on a deadline at the end, too
+        return [
+            job
+            for job in self.jobs
+            if job.task == task
+            and job.deadline_ns < (unfinished if job.end_ns is None else job.end_ns)
+        ]
 
     def window(self, start_ns: int, end_ns: int) -> Chart:
         """Return the chart from `start_ns` to `end_ns`: spans are cut there, jobs kept whole.
@@ -120,14 +120,6 @@ def _run(runners: list[_Runner], until_ns: int) -> None:
         now = first.compute(now, min(coming, until_ns))
 
 
-class _Step(NamedTuple):
-    """A part of a job; a context switch has no unit."""
-
-    unit: Unit | None
-    time_ns: int
-    preemptible: bool = True
-
-
 class _Runner:
     """One task, job by job. `ready_at` is the time at which its job, or the next one, can begin,
     ns."""
@@ -137,10 +129,10 @@ class _Runner:
     ) -> None:
         self.task = task
         self.spans: list[Span] = []
-        self.ready_at = task.phase_ns + task.jitter_ns
-        self._switch = [_Step(None, context_switch_ns)] if context_switch_ns else []
+        self.ready_at = task.phase_ns
+        self._switch = [Part(None, context_switch_ns)] if context_switch_ns else []
         self._variants = variants
-        self._steps: list[_Step] = []  # remaining steps of the job
+        self._steps: list[Part] = []  # remaining steps of the job
         self._spent_ns = 0  # on the first remaining step
         self._release = -1
         # A planner cannot be late for its first plan.
@@ -188,20 +180,19 @@ class _Runner:
     def _take(self, now_ns: int) -> None:
         """Take up the oldest release that has not expired."""
         every = self.task.every_ns
-        expected = self.ready_at - self.task.jitter_ns
         first = self.task.phase_ns
-        newest = first + (now_ns - self.task.jitter_ns - first) // every * every
-        self._release = max(expected, newest - self._slack_ns)
+        newest = first + (now_ns - first) // every * every
+        self._release = max(self.ready_at, newest - self._slack_ns)
         if self.task.role != "planner":
-            self._ends |= dict.fromkeys(range(expected, self._release, every))
+            self._ends |= dict.fromkeys(range(self.ready_at, self._release, every))
         self._slack_ns = self.task.period_ns - every
         parts = self._variants[self._release // every % len(self._variants)]
-        steps = [_Step(part.unit, part.time_ns, part.preemptible) for part in parts if part.time_ns]
+        steps = [part for part in parts if part.time_ns]
         self._steps = [*self._switch, *steps, *self._switch]
 
     def _end(self, now_ns: int) -> None:
         self._ends.setdefault(self._release, now_ns)
-        self.ready_at = self._release + self.task.period_ns + self.task.jitter_ns
+        self.ready_at = self._release + self.task.period_ns
 
     def jobs(self, until_ns: int) -> Iterator[Job]:
         """Yield the jobs released before `until_ns`; call it once the schedule is complete."""

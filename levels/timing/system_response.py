@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.queue import is_position
-from rack.levels.timing.equations import system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import RackTiming
 
 
@@ -33,12 +32,11 @@ def predict(rack: RackTiming) -> Prediction:
     """Return the system's response as it follows from the cycles alone."""
     hierarchy = rack.hierarchy
     tick_ms = rack.clock_ns * 1e-6
-    cycles = hierarchy.cycles
     planned = [board for board in rack.boards.values() if board.has_planner]
     return Prediction(
         levels=hierarchy.levels,
-        bound_eq_3_2_ms=system_response_bound_ns(cycles or [0]) * tick_ms,
-        sum_eq_3_3_ms=system_response_ns((), cycles) * tick_ms,
+        bound_eq_3_2_ms=hierarchy.bound * tick_ms,
+        sum_eq_3_3_ms=sum(hierarchy.cycles) * tick_ms,
         command_ms=rack.command_ticks(hierarchy) * tick_ms,
         status_ms=rack.status_ticks(hierarchy) * tick_ms,
         plan_ms={board.name: board.every * board.within_cycles * tick_ms for board in planned},

@@ -39,10 +39,10 @@ class Unit(StrEnum):
 
 @dataclass(frozen=True)
 class Part:
-    """A stretch of one unit function. A part that is not preemptible runs at its task's
-    `ceiling`."""
+    """A stretch of one unit function; None: a context switch. A part that is not preemptible runs
+    at its task's `ceiling`."""
 
-    unit: Unit
+    unit: Unit | None
     time_ns: int
     preemptible: bool = True
 
@@ -56,7 +56,7 @@ class TimedTask:
     SCHED_FIFO's: a higher one preempts; tasks of equal priority run in the order of their releases,
     then of `name`. Ordinary scheduling is 0, below all. `ceiling` is the priority of parts that are
     not preemptible: a plan update blocks its own executor and every task that is not above the
-    executor (eq. 3.10). `jitter_ns` bounds the delay from a release until the task is ready.
+    executor (eq. 3.10).
     """
 
     name: str
@@ -68,7 +68,6 @@ class TimedTask:
     parts: tuple[Part, ...]
     within_cycles: int = 1
     ceiling: int = 0
-    jitter_ns: int = 0
     phase_ns: int = 0
 
     @property
@@ -80,8 +79,3 @@ class TimedTask:
     def cost_ns(self) -> int:
         """Processor time of one job, without context switches."""
         return sum(part.time_ns for part in self.parts)
-
-    @property
-    def locked_ns(self) -> int:
-        """The longest part of a job that is not preemptible."""
-        return max((part.time_ns for part in self.parts if not part.preemptible), default=0)

@@ -1,24 +1,34 @@
 """Verdicts: every equation of the timing model applied to every level, core and task of a rack.
 
-Equations 3.1 to 3.10 are judged as in the paper, each level as if it had its own processor.
-Response times and core loads account for levels that share a core.
+Equations 3.1 to 3.10 (NISTIR 90-4251, section 3) are judged as in the paper, each level as if it
+had its own processor. Response times and core loads account for levels that share a core.
+
+The paper's symbols: R_i is a level's response time, which is its cycle; R_max the longest cycle of
+all levels; t_exec the executor's processing in a cycle; t_comm its reading and writing, waiting
+included; t_residual the rest of the cycle; t_plan one plan with its update; d the cycles that a
+plan may take; t_cs one context switch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import operator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import chain
 from math import inf, isfinite
-from typing import Any
+from typing import Any, Literal
 
-from rack.levels.timing import equations
 from rack.levels.timing.chains import ParallelChains
-from rack.levels.timing.equations import Relation
 from rack.levels.timing.frames import core_frames
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
 
+Sign = Literal["<", "<=", "="]
+_HOLDS: dict[Sign, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    "=": operator.eq,
+}
 SYSTEM = "system"
 """The subject of the system's response."""
 LOOSE_PLAN = "fig. 4"
@@ -38,7 +48,7 @@ ORDER = (*EQUATIONS, *BEYOND)
 
 @dataclass(frozen=True)
 class EquationVerdict:
-    """Both sides of one equation for one subject, and whether it holds; predicted or measured.
+    """Both sides of one equation for one subject; predicted or measured.
 
     `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task,
     a core or "system". `left` and `right` are ns, or numbers if `unit` is "1". `meaning` names both
@@ -49,25 +59,16 @@ class EquationVerdict:
     equation: str
     subject: str
     left: float
-    sign: str
+    sign: Sign
     right: float
-    holds: bool
     meaning: str
     unit: str = "ns"
     endless: str = ""
 
-    @classmethod
-    def of(
-        cls,
-        equation: str,
-        subject: str,
-        relation: Relation,
-        meaning: str,
-        unit: str = "ns",
-        endless: str = "",
-    ) -> EquationVerdict:
-        """Return the verdict on a relation."""
-        return cls(equation, subject, *relation, relation.holds, meaning, unit, endless)
+    @property
+    def holds(self) -> bool:
+        """Whether the numbers satisfy the equation."""
+        return _HOLDS[self.sign](self.left, self.right)
 
     @property
     def margin(self) -> float:
@@ -82,9 +83,8 @@ class EquationVerdict:
     def document(self) -> dict[str, Any]:
         """Return everything as plain data; an infinite side is None."""
         sides = {"left": self.left, "right": self.right, "margin": self.margin}
-        return asdict(self) | {
-            name: side if isfinite(side) else None for name, side in sides.items()
-        }
+        finite = {name: side if isfinite(side) else None for name, side in sides.items()}
+        return {**asdict(self), "holds": self.holds, **finite}
 
 
 def verdicts(rack: RackTiming) -> list[EquationVerdict]:
@@ -108,15 +108,13 @@ def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on
     every cycle in them."""
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
-    cycles_ns = {name: board.every * rack.tick_ns for name, board in rack.boards.items()}
     for found in rack.parallel:
         yield from _of_chains(rack, found, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
-            relation = Relation(
-                cycles_ns[name], "<=", round(rack.longest_cycles[name] * rack.tick_ns)
-            )
-            yield EquationVerdict.of("3.1", name, relation, "R_i <= R_max = R_s / n")
+            cycle_ns = rack.boards[name].every * rack.tick_ns
+            longest_ns = round(rack.longest_cycles[name] * rack.tick_ns)
+            yield EquationVerdict("3.1", name, cycle_ns, "<=", longest_ns, "R_i <= R_max = R_s / n")
 
 
 def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
@@ -129,42 +127,34 @@ def _of_chains(
     rack: RackTiming, chains: ParallelChains, goal_ns: float | None
 ) -> Iterator[EquationVerdict]:
     subject = response_subject(rack, chains)
-    cycles_ns = [cycle * rack.tick_ns for cycle in chains.cycles]
     bound = goal_ns
     limit = "timing.response_ms"
     if bound is None:
-        bound = equations.system_response_bound_ns(cycles_ns)
+        bound = chains.bound * rack.tick_ns
         limit = "n R_max"
-    total = equations.system_response_ns((), cycles_ns)
-    yield EquationVerdict.of(
-        "3.3", subject, Relation(total, "<=", bound), f"R_s = sum of R_i <= {limit}"
-    )
+    total = sum(chains.cycles) * rack.tick_ns
+    yield EquationVerdict("3.3", subject, total, "<=", bound, f"R_s = sum of R_i <= {limit}")
     for way, ticks in (
         ("command", rack.command_ticks(chains)),
         ("status", rack.status_ticks(chains)),
     ):
-        relation = Relation(ticks * rack.tick_ns, "<=", bound)
-        yield EquationVerdict.of(
-            "3.2", subject, relation, f"R_s of a {way} with its waits for the grid <= {limit}"
-        )
+        meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
+        yield EquationVerdict("3.2", subject, ticks * rack.tick_ns, "<=", bound, meaning)
 
 
 def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
-    executes = level.execution_ns
-    communicates = level.communication_ns
+    board = level.board
     cycle = level.cycle_ns
-    relations = {
-        "3.1": (equations.fits_cycle(executes, communicates, cycle), "t_proc + t_c <= R_i"),
-        "3.4": (equations.executes_in_time(executes, level.longest_cycle_ns), "t_exec < R_max"),
-        "3.5": (
-            equations.parts_make_cycle(executes, communicates, cycle),
-            "t_exec + t_comm + t_residual = R_i",
-        ),
-        "3.6": (equations.residual_is_left(level.residual_ns), "0 < t_residual <= alpha"),
-        "3.7": (equations.cycle_is_on_grid(cycle, tick_ns), "R_i = k c, k whole"),
-    }
-    for equation, (relation, meaning) in relations.items():
-        yield EquationVerdict.of(equation, level.board, relation, meaning)
+    used = level.execution_ns + level.communication_ns
+    yield EquationVerdict("3.1", board, used, "<=", cycle, "t_proc + t_c <= R_i")
+    longest = level.longest_cycle_ns
+    yield EquationVerdict("3.4", board, level.execution_ns, "<", longest, "t_exec < R_max")
+    # A cycle too short for its parts has a residual of 0: they then exceed it.
+    meaning = "t_exec + t_comm + t_residual = R_i"
+    yield EquationVerdict("3.5", board, max(used, cycle), "=", cycle, meaning)
+    yield EquationVerdict("3.6", board, 0, "<", level.residual_ns, "0 < t_residual <= alpha")
+    on_grid = max(round(cycle / tick_ns), 1) * tick_ns
+    yield EquationVerdict("3.7", board, cycle, "=", on_grid, "R_i = k c, k whole")
 
 
 def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
@@ -172,24 +162,27 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
         return
     board = level.board
     cycle = level.cycle_ns
-    if level.plan_within_ns is not None:
-        relation = Relation(level.slice_ns, "<=", level.plan_within_ns)
-        yield EquationVerdict.of(PLAN_WITHIN, board, relation, "d R_i <= budget.plan_within_ms")
+    within_ns = level.plan_within_ns
+    if within_ns is not None:
+        meaning = "d R_i <= budget.plan_within_ms"
+        yield EquationVerdict(PLAN_WITHIN, board, level.slice_ns, "<=", within_ns, meaning)
     if level.coupling == "loose":
-        fits = equations.plan_fits_loose(level.planning_ns, level.within_cycles, cycle)
-        yield EquationVerdict.of(LOOSE_PLAN, board, fits, "t_plan <= d R_i")
+        time_slice = level.slice_ns
+        yield EquationVerdict(
+            LOOSE_PLAN, board, level.planning_ns, "<=", time_slice, "t_plan <= d R_i"
+        )
         return
-    fits = equations.plan_fits_tight(
-        level.planning_ns, level.within_cycles, level.residual_ns, switch_ns
-    )
-    yield EquationVerdict.of("3.8", board, fits, "t_plan / d < t_residual - 2 t_cs")
-    communicates = equations.communication_ns(level.interlevel_ns, level.executor_planner_ns)
-    leaves = equations.leaves_time_to_plan(level.execution_ns, communicates, switch_ns, cycle)
-    yield EquationVerdict.of(
-        "3.9", board, leaves, "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
-    )
-    share = equations.coupling_may_be_tight(level.executor_planner_ns, cycle, small)
-    yield EquationVerdict.of("3.10", board, share, "t_executor-planner / R_i, small", "1")
+    share = level.planning_ns / level.within_cycles
+    left = level.residual_ns - 2 * switch_ns
+    yield EquationVerdict("3.8", board, share, "<", left, "t_plan / d < t_residual - 2 t_cs")
+    # In the worst cycle the plan is updated, too.
+    talks = level.interlevel_ns + level.executor_planner_ns
+    taken = level.execution_ns + talks + 2 * switch_ns
+    meaning = "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
+    yield EquationVerdict("3.9", board, taken, "<", cycle, meaning)
+    update = level.executor_planner_ns / cycle
+    meaning = "t_executor-planner / R_i, small"
+    yield EquationVerdict("3.10", board, update, "<=", small, meaning, "1")
 
 
 def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
@@ -204,17 +197,21 @@ def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
             endless = (
                 f"{role} '{task.task}' never finishes: core {task.core} {what} (load {load:.3g})"
             )
-        relation = Relation(response_ns, "<=", task.deadline_ns)
-        meaning = "worst-case response <= deadline"
-        yield EquationVerdict.of(RESPONSE_TIME, task.task, relation, meaning, endless=endless)
+        yield EquationVerdict(
+            equation=RESPONSE_TIME,
+            subject=task.task,
+            left=response_ns,
+            sign="<=",
+            right=task.deadline_ns,
+            meaning="worst-case response <= deadline",
+            endless=endless,
+        )
 
 
 def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
     for core, load in rack.loads.items():
-        relation = Relation(load, "<=", 1.0)
-        yield EquationVerdict.of(
-            LOAD, f"core {core}", relation, "share of its time that its tasks compute", "1"
-        )
+        meaning = "share of its time that its tasks compute"
+        yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
 
 
 def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
@@ -222,9 +219,10 @@ def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
     the same."""
     for alike in core_frames(rack):
         for place in alike.places:
-            relation = Relation(place.end_ns, "<=", place.limit_ns)
-            meaning = f"done before {place.limit}, in frame {alike.frames[0]}"
-            yield EquationVerdict.of(FRAMES, place.board, relation, meaning)
+            limit = f"'{place.until}' begins" if place.until else "the frame ends"
+            meaning = f"done before {limit}, in frame {alike.frames[0]}"
+            end_ns = place.limit_ns - place.slack_ns
+            yield EquationVerdict(FRAMES, place.board, end_ns, "<=", place.limit_ns, meaning)
 
 
 def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
@@ -235,6 +233,5 @@ def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
         if burst.waiting is not None:
             most = burst.waiting
             endless = ""
-        relation = Relation(most, "<=", inbox.depth)
         meaning = "interrupts that wait after a burst of all senders <= depth"
-        yield EquationVerdict.of(INBOX, name, relation, meaning, "1", endless)
+        yield EquationVerdict(INBOX, name, most, "<=", inbox.depth, meaning, "1", endless)

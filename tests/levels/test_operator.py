@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,13 +83,9 @@ def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(
     )
     # The torque still rests on the one before.
     assert shown.operator == 1
-
-
-def test_an_unknown_number_is_refused() -> None:
-    orders = Orders(TAKES)
-    reading = said(1, Operation.NONE)
-    reading.value.what = 99
-    assert not orders.take(reading)
+    unknown = said(3, Operation.NONE)
+    unknown.value.what = 99
+    assert not orders.take(unknown)
     assert report(orders).objection.startswith("99 is not a command of this level")
 
 
@@ -197,6 +194,7 @@ def test_what_was_answered_late_was_still_taken_up_before() -> None:
 @pytest.mark.parametrize(
     ("joints", "why"),
     [
+        ((-1.0, 2.0), ""),
         ((0.0,), "1 joint positions; the arm has 2 joints"),
         ((0.0, 2.5), "joint 'elbow' at 2.5 rad; permitted: 0 to 2"),
         ((np.nan, 1.0), "joint 'base' at nan rad; permitted: -1 to 1"),
@@ -208,15 +206,11 @@ def test_joints_that_cannot_be_name_the_joint_and_its_range(
     message = said(1, Operation.GOTO, Goal.JOINTS).value
     message.count = len(joints)
     message.joints[: len(joints)] = joints
-    with pytest.raises(ValueError, match=why.replace("(", r"\(")):
-        joints_of(message, ("base", "elbow"), RANGES)
-
-
-def test_joints_at_the_ends_of_their_ranges_can_be() -> None:
-    message = said(1, Operation.GOTO, Goal.JOINTS).value
-    message.count = 2
-    message.joints[:2] = (-1.0, 2.0)
-    assert joints_of(message, ("base", "elbow"), RANGES).tolist() == [-1.0, 2.0]
+    if why:
+        with pytest.raises(ValueError, match=why):
+            joints_of(message, ("base", "elbow"), RANGES)
+    else:
+        assert joints_of(message, ("base", "elbow"), RANGES).tolist() == list(joints)
 
 
 LEVELS = ("task", "elemental_move", "primitive", "servo")
@@ -233,6 +227,14 @@ def is_under_way(rack: WholeRack) -> bool:
     return bool(np.abs(rack.read("servo.status").target_velocity).max() > 0.1)
 
 
+def touring(actions: Sequence[Mapping[str, Any]] = TOUR) -> tuple[WholeRack, Operator]:
+    """Return a rack whose arm is under way, and its operator."""
+    rack = WholeRack(actions=actions)
+    operator = Operator(rack)
+    assert rack.run(10.0, is_under_way)
+    return rack, operator
+
+
 def answers(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bool]:
     def is_it(rack: WholeRack) -> bool:
         found = rack.read(f"{level}.status")
@@ -244,13 +246,14 @@ def answers(level: str, answer: Answer, serial: int) -> Callable[[WholeRack], bo
 @pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> None:
-    rack = WholeRack(actions=[REACH, HOME])
-    operator = Operator(rack)
-    assert rack.run(10.0, is_under_way)
+    rack, operator = touring([REACH, HOME])
     serial = operator.say(level, Operation.HOLD)
     assert rack.run(6.0, answers(level, Answer.DONE, serial))
     held = rack.read("servo.status").position.copy()
-    rack.run(2.0)
+    if level != "servo":  # a restarted board holds on
+        rack.lose(level, 200)
+    rack.run(3.0)
+    assert rack.read(f"{level}.status").standing == Operation.HOLD
     assert np.abs(rack.read("servo.status").position - held).max() < 1e-3
     # It has been passed down to the lowest level, and no level above knows of it.
     above = LEVELS.index(level)
@@ -269,27 +272,8 @@ def test_a_level_held_in_motion_finishes_the_task_after_resume(level: str) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", ["elemental_move", "primitive", "task"])
-def test_a_restarted_board_holds_on(level: str) -> None:
-    rack = WholeRack(actions=[REACH, HOME])
-    operator = Operator(rack)
-    assert rack.run(10.0, is_under_way)
-    serial = operator.say(level, Operation.HOLD)
-    assert rack.run(6.0, answers(level, Answer.DONE, serial))
-    held = rack.read("servo.status").position.copy()
-    rack.lose(level, 200)
-    rack.run(3.0)
-    assert rack.read(f"{level}.status").standing == Operation.HOLD
-    assert np.abs(rack.read("servo.status").position - held).max() < 1e-3
-    operator.say(level, Operation.RESUME)
-    assert rack.run_to_end(30.0).state == State.DONE
-
-
-@pytest.mark.slow
 def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> None:
-    rack = WholeRack(actions=TOUR)
-    operator = Operator(rack)
-    assert rack.run(10.0, is_under_way)
+    rack, operator = touring()
     serial = operator.goto("task", ASIDE, DOWN)
     assert rack.run(20.0, answers("task", Answer.DONE, serial))
     scene = rack.read("servo.scene")
@@ -309,9 +293,7 @@ def test_a_goto_leaves_a_free_motion_and_the_program_continues_afterwards() -> N
 
 @pytest.mark.slow
 def test_a_goto_takes_the_next_one_from_where_it_is() -> None:
-    rack = WholeRack(actions=TOUR)
-    operator = Operator(rack)
-    assert rack.run(10.0, is_under_way)
+    rack, operator = touring()
     first = operator.goto("task", ASIDE, DOWN)
     assert rack.run(20.0, answers("task", Answer.TAKEN, first))
     rack.run(2.0)
@@ -340,9 +322,7 @@ def test_what_is_done_with_an_object_is_done_before_a_goto() -> None:
 
 @pytest.mark.slow
 def test_an_impossible_goto_is_refused_and_the_task_continues() -> None:
-    rack = WholeRack(actions=TOUR)
-    operator = Operator(rack)
-    assert rack.run(10.0, is_under_way)
+    rack, operator = touring()
     serial = operator.goto("task", [3.0, 0.0, 0.5], DOWN)
     assert rack.run(20.0, answers("task", Answer.REFUSED, serial))
     assert "cannot bring the tool to" in rack.task.objection
@@ -353,9 +333,7 @@ def test_an_impossible_goto_is_refused_and_the_task_continues() -> None:
 
 @pytest.mark.slow
 def test_a_goto_continues_after_the_task_board_has_died() -> None:
-    rack = WholeRack(actions=TOUR)
-    operator = Operator(rack)
-    assert rack.run(10.0, is_under_way)
+    rack, operator = touring()
     serial = operator.goto("task", ASIDE, DOWN)
     assert rack.run(20.0, lambda r: r.read("task.status").detour > 0)
     move = rack.task.detour

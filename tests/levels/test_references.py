@@ -55,7 +55,7 @@ def test_a_config_saved_before_is_wired_as_today(name: str) -> None:
     assert wire(saved) == wire(config)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
     config = load("rccl", [f"name={rack_name}", "clock.mode=lockstep"])
     saved, used = as_saved_before(config)
@@ -63,7 +63,7 @@ def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
     digests = []
     for each in (config, saved):
         with Rack(each) as rack:
-            digests.append(rack.run(0.2).digest)
+            digests.append(rack.run(0.05).digest)
     assert digests[0] == digests[1]
 
 
@@ -97,7 +97,7 @@ def test_a_module_neither_ends_nor_holds_the_process_that_checks_a_config(
     (tmp_path / f"it_{name}.py").write_text(source)
     children = children_of(os.getpid())
     before = descriptors()
-    for _ in range(2):
+    for _ in range(1 + (name == "loops")):
         with pytest.raises(LookupError) as error:
             module_and_name(f"it_{name}:Level")
         assert str(error.value) == f"cannot import 'it_{name}': {reason}"

@@ -15,7 +15,6 @@ import numpy as np
 from rack.backplane.layout import MailboxSpec
 from rack.boards.config import rack_timing
 from rack.levels.timing.chains import ParallelChains
-from rack.levels.timing.equations import system_response_bound_ns, system_response_ns
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import mailboxes_along
 from rack.levels.timing.trace_times import counts, distribution
@@ -52,13 +51,12 @@ def system_response(recording: Recording) -> Document | None:
 
 
 def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> Document:
-    cycles = chains.cycles
     tick_ms = rack.clock_ns * 1e-6
     return {
         "subject": response_subject(rack, chains),
         "levels": list(chains.levels),
-        "bound_eq_3_2_ms": system_response_bound_ns(cycles) * tick_ms,
-        "sum_eq_3_3_ms": system_response_ns((), cycles) * tick_ms,
+        "bound_eq_3_2_ms": chains.bound * tick_ms,
+        "sum_eq_3_3_ms": sum(chains.cycles) * tick_ms,
         "command": _way(recording, rack, chains.chains, chains.levels),
         "status": _way(
             recording, rack, [boards[::-1] for boards in chains.chains], chains.levels[::-1]

@@ -74,7 +74,7 @@ def _verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
         yield f"does not fit: {failing} of {count} equations and bounds fail{rest}"
         return
     held = f"all {count} equations and bounds hold; not counted: the recorder"
-    if not forecast.levels:
+    if not forecast.rack.levels:
         yield f"fits, as far as is known: no board has a budget{command}"
     elif left_out:
         yield f"fits, without {left_out}{command}"

@@ -22,24 +22,27 @@ TABLED = {*BEYOND} - {PLAN_WITHIN}
 
 def forecast_lines(forecast: Forecast) -> Iterator[str]:
     """Yield a forecast as text for people."""
+    rack = forecast.rack
     yield from _prediction_lines(forecast.system)
-    if forecast.levels:
+    if rack.levels:
         yield from (
             "",
-            f"worst case by the budgets, ms; t_cs is {ms(forecast.context_switch_ns)} ms:",
+            f"worst case by the budgets, ms; t_cs is {ms(rack.context_switch_ns)} ms:",
             "",
         )
-        yield from level_table(((level.coupling, level) for level in forecast.levels), "coupling")
+        yield from level_table(
+            ((level.coupling, level) for level in rack.levels.values()), "coupling"
+        )
     if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
         yield ""
         yield from verdict_table(("", verdict) for verdict in paper)
-    if forecast.responses:
+    if rack.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
-        yield from _responses(forecast.responses)
+        yield from _responses(rack.responses)
         yield ""
         loads = (
             f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}"
-            for core, load in forecast.loads.items()
+            for core, load in rack.loads.items()
         )
         yield f"load: {', '.join(loads)}"
     if forecast.inboxes:
@@ -51,12 +54,12 @@ def forecast_lines(forecast: Forecast) -> Iterator[str]:
 
 def _schedule_lines(forecast: Forecast) -> Iterator[str]:
     """Yield a line per board of every distinct frame of a static schedule."""
-    if forecast.schedule is None:
+    if forecast.rack.schedule is None:
         return
-    minor, major = forecast.schedule
+    minor, major = forecast.rack.schedule
     count = major // minor
     ticks = "a tick" if minor == 1 else f"{minor} ticks"
-    sizes = f"{count} frames of {ms(minor * forecast.tick_ns)}, {ticks}"
+    sizes = f"{count} frames of {ms(minor * forecast.rack.tick_ns)}, {ticks}"
     yield ""
     yield f"static schedule, ms: {sizes}; every budget with two context switches:"
     yield ""

@@ -372,5 +372,5 @@ class OrderedTaskPlanner(TaskPlanner):
         super()._promise(moves, visible_s, write)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         write.earliest = (
-            finish_times(unhurried, visible_s, self._periods, self._needs)[-1] + self._ahead_s
+            finish_times(unhurried, visible_s, self.context, self._needs)[-1] + self._ahead_s
         )

@@ -117,68 +117,60 @@ def test_nothing_is_handed_down_before_its_path_is_there() -> None:
     assert bench.status.end == pytest.approx(bench.home + 0.1)
 
 
-def test_window_stays_full_and_serials_rise() -> None:
+def test_window_stays_full_until_the_program_is_done() -> None:
     bench = planned_bench()
     assert bench.segments() == [(1, 1), (2, 2)]
+    # Contacts are permitted on approach and depart alone.
+    assert bench.command.segments["touch"].tolist() == [0, 1]
     bench.cycle(2, done=1)
     assert bench.segments() == [(2, 2), (3, 3)]
-    bench.cycle(2, done=2)
-    assert bench.segments() == [(3, 3), (4, 4)]
-    assert bench.status.done == 2
-    assert bench.status.verb == Verb.GRASP
-
-
-def test_gripper_closes_with_force_on_the_object_of_the_move() -> None:
-    bench = planned_bench()
-    bench.cycle(2, done=1)
     gripper, segment = config("puma560")[0].gripper, bench.command.segments[1]
     assert gripper is not None
     assert (segment["kind"], segment["object"]) == (SegmentKind.GRIPPER, BLOCK)
     assert (segment["opening"], segment["force"]) == (gripper.closed, gripper.force)
-
-
-def test_contacts_are_permitted_on_approach_and_depart_alone() -> None:
-    bench = planned_bench()
-    assert bench.command.segments["touch"].tolist() == [0, 1]
-
-
-def test_grasp_that_shuts_on_nothing_stops_everything() -> None:
-    bench = planned_bench()
     bench.cycle(2, done=2)
-    bench.cycle(2, done=3, opening=0.0005)
-    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.GRASP_MISSED)
-    assert bench.segments() == []
-    assert bench.command.hold == 1
-
-
-def test_move_continues_after_a_grasp_that_holds_something() -> None:
-    bench = planned_bench()
-    bench.cycle(2, done=2)
+    assert bench.segments() == [(3, 3), (4, 4)]
+    assert (bench.status.done, bench.status.verb) == (2, Verb.GRASP)
     bench.cycle(2, done=3, opening=0.022, held=BLOCK)
     assert bench.status.state == State.EXECUTING
     assert bench.segments() == [(4, 4), (5, 5)]
-
-
-def test_object_that_is_lost_on_the_way_is_an_error() -> None:
-    bench = planned_bench()
-    bench.cycle(2, done=3, opening=0.022, held=BLOCK)
-    bench.cycle(2, opening=0.0)
-    assert bench.status.error == Error.OBJECT_LOST
-
-
-def test_error_of_the_level_below_goes_up_with_its_reason() -> None:
-    bench = planned_bench()
-    bench.cycle(2, state=State.ERROR, error=Error.FOLLOWING, reason="joint 2 strays")
-    assert (bench.status.error, bench.status.reason) == (Error.FOLLOWING, "joint 2 strays")
-
-
-def test_program_that_is_done_is_reported_done() -> None:
-    bench = planned_bench()
-    for segment in range(1, 6):
-        bench.cycle(2, done=segment, opening=0.022, held=BLOCK)
-    assert bench.status.state == State.DONE
-    assert bench.status.done == 5
+    for segment in (4, 5):
+        bench.cycle(2, done=segment)
+    assert (bench.status.state, bench.status.done) == (State.DONE, 5)
     assert bench.segments() == []
+
+
+@pytest.mark.parametrize(
+    ("below", "error", "reason"),
+    [
+        (
+            {"done": 3, "opening": 0.0005},
+            Error.GRASP_MISSED,
+            "the gripper has closed to 1.2% of its way: it holds nothing",
+        ),
+        (
+            {"done": 3, "opening": 0.022, "held": BLOCK},
+            Error.OBJECT_LOST,
+            "the gripper has closed to 0.0% of its way: the object is lost",
+        ),
+        (
+            {"state": State.ERROR, "error": Error.FOLLOWING, "reason": "joint 2 strays"},
+            Error.FOLLOWING,
+            "joint 2 strays",
+        ),
+    ],
+)
+def test_failure_stops_everything_with_its_reason(
+    below: dict[str, Any], error: Error, reason: str
+) -> None:
+    bench = planned_bench()
+    bench.cycle(2, done=2)
+    bench.cycle(2, **below)
+    bench.cycle(2, opening=0.0)
+    status = bench.status
+    assert (status.state, status.error, status.reason) == (State.ERROR, error, reason)
+    assert bench.segments() == []
+    assert bench.command.hold == 1
 
 
 def test_blocked_arm_holds_and_asks_for_another_path_from_where_it_rests() -> None:
@@ -187,6 +179,18 @@ def test_blocked_arm_holds_and_asks_for_another_path_from_where_it_rests() -> No
     assert bench.command.hold == 1
     assert bench.status.replan > 0
     assert bench.status.start == pytest.approx(bench.home + 0.05)
+
+
+def test_request_is_dropped_when_the_way_is_free_again() -> None:
+    bench = planned_bench()
+    bench.cycle(2, current=1, blocked=1)
+    # The answer to an older request is not taken.
+    bench.plan(1, replan=bench.status.replan - 1)
+    bench.cycle(2)
+    assert bench.segments() == [(1, 1), (2, 2)]
+    bench.cycle(2, blocked=0)
+    assert (bench.command.hold, bench.status.replan) == (0, 0)
+    assert bench.segments() == [(1, 1), (2, 2)]
 
 
 def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> None:
@@ -239,34 +243,12 @@ def test_who_keeps_the_level_below_from_its_work_is_passed_on() -> None:
         state=State.HOLDING,
         reason="waiting for servo: brakes engaged",
     )
-    assert (bench.status.state, bench.status.reason) == (
-        State.HOLDING,
-        "waiting for servo: brakes engaged",
-    )
-    assert (bench.status.progress, bench.status.operated) == (0.25, 1)
+    status = bench.status
+    assert (status.state, status.reason) == (State.HOLDING, "waiting for servo: brakes engaged")
+    assert (status.progress, status.operated) == (0.25, 1)
     bench.cycle(2, operated=0, state=State.EXECUTING, reason="")
-    assert (bench.status.state, bench.status.reason, bench.status.operated) == (
-        State.EXECUTING,
-        "",
-        0,
-    )
-
-
-def test_answer_to_an_older_request_is_not_taken() -> None:
-    bench = planned_bench()
-    bench.cycle(2, current=1, blocked=1)
-    bench.plan(1, replan=bench.status.replan - 1)
-    bench.cycle(2)
-    assert bench.segments() == [(1, 1), (2, 2)]
-
-
-def test_request_is_dropped_when_the_way_is_free_again() -> None:
-    bench = planned_bench()
-    bench.cycle(2, current=1, blocked=1)
-    bench.cycle(2, blocked=0)
-    assert bench.command.hold == 0
-    assert bench.status.replan == 0
-    assert bench.segments() == [(1, 1), (2, 2)]
+    status = bench.status
+    assert (status.state, status.reason, status.operated) == (State.EXECUTING, "", 0)
 
 
 def test_time_is_handed_down_less_what_the_answer_takes() -> None:
@@ -344,25 +326,20 @@ def test_after_a_restart_the_next_path_continues_from_the_one_that_replaced_the_
     assert [move for _, move in bench.segments()] == [1]
 
 
-def test_arm_is_held_while_the_board_above_is_lost() -> None:
+@pytest.mark.parametrize(
+    ("mailbox", "reason", "hold"),
+    [("task.command", ABOVE_LOST, 1), ("primitive.status", BELOW_LOST, 0)],
+)
+def test_loss_of_a_neighbour_is_said_and_ends(mailbox: str, reason: str, hold: int) -> None:
     bench = planned_bench()
-    bench.boxes["task.command"].lost = True
+    bench.boxes[mailbox].lost = True
     bench.cycle(2)
-    assert bench.command.hold == 1
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, ABOVE_LOST)
+    assert bench.command.hold == hold
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, reason)
     assert bench.segments() == [(1, 1), (2, 2)]
-    bench.boxes["task.command"].lost = False
+    bench.boxes[mailbox].lost = False
     bench.cycle(2)
-    assert (bench.command.hold, bench.status.error) == (0, 0)
-
-
-def test_level_says_that_it_waits_for_the_board_below() -> None:
-    bench = planned_bench()
-    bench.boxes["primitive.status"].lost = True
-    bench.cycle(2)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, BELOW_LOST)
-    bench.boxes["primitive.status"].lost = False
-    bench.cycle(2)
+    assert bench.command.hold == 0
     assert (bench.status.state, bench.status.reason) == (State.EXECUTING, "")
 
 

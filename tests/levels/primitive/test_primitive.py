@@ -153,37 +153,30 @@ def test_move_that_cannot_be_done_by_its_time_is_refused_before_anything_moves()
     assert f"the earliest is {refused.earliest:.3f} s" in refused.reason
     rack.run(0.5)
     assert np.ptp(positions(rack), axis=0).max() == 0.0
-
-
-def test_earliest_time_of_a_refusal_is_met_when_it_is_asked_for() -> None:
-    rack = PrimitiveRack()
-    rack.command(path(1, [rack.home, rack.home + TURN], by=0.7))
-    earliest = rack.run_until_error().earliest
     again = PrimitiveRack()
-    again.command(path(1, [again.home, again.home + TURN], by=earliest))
+    again.command(path(1, [again.home, again.home + TURN], by=refused.earliest))
     assert again.run_until_done(1)
-    assert again.seconds <= earliest
+    assert again.seconds <= refused.earliest
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("offset", "fields", "code", "said"),
+    ("offset", "fields", "said"),
     [
-        (0.5, {}, Error.LIMIT, "begins 0.5000 rad"),
-        (0.0, {"waypoints": np.full((2, 6), np.nan)}, Error.LIMIT, "not finite"),
-        (0.0, {"kind": 9}, Error.LIMIT, "kind 9"),
-        (0.0, {"count": 0}, Error.LIMIT, "shape (0, 6)"),
-        (0.0, {"by": np.nan}, Error.LIMIT, "not finite"),
-        (9.0, {}, Error.LIMIT, "begins 9.0000 rad"),
+        (0.5, {}, "begins 0.5000 rad"),
+        (0.0, {"waypoints": np.full((2, 6), np.nan)}, "not finite"),
+        (0.0, {"kind": 9}, "kind 9"),
+        (0.0, {"count": 0}, "shape (0, 6)"),
+        (0.0, {"by": np.nan}, "not finite"),
     ],
 )
 def test_segment_that_cannot_be_is_an_error_and_the_next_command_is_done(
-    offset: float, fields: dict, code: Error, said: str
+    offset: float, fields: dict, said: str
 ) -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home + offset, rack.home + TURN + offset]) | fields)
     status = rack.run_until_error()
-    assert status.error == code
+    assert status.error == Error.LIMIT
     assert said in status.reason
     rack.command(path(2, [rack.home, rack.home + BEND]))
     assert rack.run_until_done(2)
@@ -217,13 +210,6 @@ def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() 
     assert np.abs(rack.servo.position - corner + 0.3).max() < 1e-3
     rack.command(gripper(2, opening=0.0))
     assert rack.run_until_error().reason == "segment 2: the arm has no gripper; valid: paths"
-
-
-def test_two_equal_runs_write_equal_set_points(finished: PrimitiveRack) -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run_until_done(2)
-    assert positions(rack).tobytes() == positions(finished).tobytes()
 
 
 def test_unknown_parameter_is_refused_with_the_valid_ones() -> None:

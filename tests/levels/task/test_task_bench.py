@@ -110,60 +110,47 @@ def test_action_that_is_late_is_an_error() -> None:
     assert bench.status.reason == "action 0, home, was not done by 5 s"
 
 
-def test_task_that_stands_still_ends_with_who_is_in_the_way() -> None:
-    bench, below = (
-        Bench(HOME, stalled_s=5.0),
-        {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"},
-    )
-    bench.plan([0])
-    bench.cycle(current=1, progress=0.1)
-    assert bench.status.state == State.EXECUTING
-    bench.cycle(current=1, progress=0.2, **below)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, below["reason"])
-    for _ in range(2):
-        bench.cycle(current=1, progress=0.2, **below)
-    assert bench.status.state == State.HOLDING
-    bench.cycle(current=1, progress=0.2, **below)
-    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
-    assert bench.status.reason == f"nothing has moved for 5 s: {below['reason']}"
-
-
-def test_task_that_moves_slowly_does_not_stand_still() -> None:
-    bench = Bench(HOME, stalled_s=5.0)
-    bench.plan([0])
-    for k in range(8):
-        bench.cycle(current=1, progress=0.01 * k)
-    assert bench.status.state == State.EXECUTING
-
-
-def test_task_without_a_plan_ends_and_says_so() -> None:
-    bench = Bench(HOME, stalled_s=5.0)
-    for _ in range(4):
-        bench.cycle()
-    assert bench.status.error == Error.STALLED
-    assert "no plan" in bench.status.reason
+HELD = {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
 
 
 @pytest.mark.parametrize(
-    ("current", "why"), [(1, "move 1 is under way"), (0, "no path yet for move 1")]
+    ("plan", "below", "why"),
+    [
+        ([0], {"current": 1, **HELD}, HELD["reason"]),
+        ([0], {"current": 1}, "move 1 is under way"),
+        ([0], {}, "no path yet for move 1"),
+        (
+            [],
+            {},
+            "no plan yet: the objects must be at rest and the position of the arm known",
+        ),
+    ],
 )
-def test_task_that_nobody_holds_says_what_it_waits_for(current: int, why: str) -> None:
+def test_task_that_stands_still_ends_and_says_why(
+    plan: list[int], below: dict[str, Any], why: str
+) -> None:
     bench = Bench(HOME, stalled_s=5.0)
-    bench.plan([0])
-    for _ in range(8):
-        bench.cycle(current=current)
-    assert bench.status.reason == f"nothing has moved for 5 s: {why}"
+    if plan:
+        bench.plan(plan)
+    for k in range(4):  # the arm moves slowly
+        bench.cycle(**below, progress=0.01 * k if plan else 0.0)
+    held = "reason" in below
+    if plan:
+        assert bench.status.state == (State.HOLDING if held else State.EXECUTING)
+        assert bench.status.reason == (why if held else "")
+    for _ in range(4):
+        bench.cycle(**below)
+    status = bench.status
+    assert (status.state, status.error) == (State.ERROR, Error.STALLED)
+    assert status.reason == f"nothing has moved for 5 s: {why}"
 
 
 def test_task_that_an_operator_holds_stands_still_as_long_as_that_lasts() -> None:
-    bench, below = (
-        Bench(HOME, stalled_s=5.0),
-        {"state": State.HOLDING, "reason": "primitive held by the operator"},
-    )
+    bench = Bench(HOME, stalled_s=5.0)
     bench.plan([0])
     for _ in range(10):
-        bench.cycle(current=1, operated=1, **below)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, below["reason"])
+        bench.cycle(current=1, operated=1, **HELD)
+    assert (bench.status.state, bench.status.reason) == (State.HOLDING, HELD["reason"])
     for _ in range(4):
         bench.cycle(current=1)
     assert bench.status.error == Error.STALLED

@@ -14,10 +14,10 @@ from rack.levels.timing.command_path import command_paths
 from rack.levels.timing.forecast import Forecast
 from rack.levels.timing.frames import core_frames
 from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.response_time import load_of, response_times
+from rack.levels.timing.response_time import load_of, task_responses
 from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Budget
-from tests.snapshots import ROOT, Snapshots, each_shipped_rack
+from tests.snapshots import QUICK, ROOT, SHIPPED, Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
 SHARES = (0.02, 0.3)
@@ -53,7 +53,10 @@ def model(rack: RackTiming) -> Iterable[object]:
         Forecast.of(rack, has_cores=False).notes,
         rack.tasks,
         [frames.document() for frames in core_frames(rack)],
-        response_times(rack.tasks, rack.context_switch_ns),
+        {
+            found.task: found.response_ns
+            for found in task_responses(rack.tasks, rack.context_switch_ns)
+        },
         load_of(rack.tasks, rack.context_switch_ns),
         chart,
         chart.window(until_ns // 5, until_ns // 2),
@@ -65,7 +68,10 @@ def model(rack: RackTiming) -> Iterable[object]:
     ]
 
 
-@each_shipped_rack
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in QUICK else pytest.mark.thorough) for name in SHIPPED],
+)
 def test_the_timing_of_a_shipped_rack_is_as_before(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

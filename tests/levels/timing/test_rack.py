@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from rack.levels.timing.forecast import NO_BUDGET, Forecast
 from rack.levels.timing.level import BoardTiming
 from rack.levels.timing.rack import RackTiming
@@ -70,7 +72,8 @@ def test_a_planner_has_the_ceiling_of_its_executor_only_in_a_critical_section() 
     planners = [
         rack(replace(FIGURE_3, is_critical=critical)).tasks[1] for critical in (True, False)
     ]
-    assert [(planner.ceiling, planner.locked_ns) for planner in planners] == [(80, MS), (0, 0)]
+    found = [(planner.ceiling, planner.parts[-1].preemptible) for planner in planners]
+    assert found == [(80, False), (0, True)]
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
@@ -82,10 +85,26 @@ def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
     assert timing.longest_cycles == {"top": 60, "a": 60, "b": 60, "alone": 7}
 
 
+@pytest.mark.parametrize(
+    ("cycles", "ticks"),
+    [
+        ([8], 8),
+        ([400, 100, 8, 1], 509 + 4),  # 100 and 8 meet every 4 ticks only
+        ([1, 8, 100, 400], 509 + 7 + 96 + 300),
+    ],
+)
+def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(
+    cycles: list[int], ticks: int
+) -> None:
+    names = [f"b{cycle}" for cycle in cycles]
+    boards = [board(name, cycle) for name, cycle in zip(names, cycles, strict=True)]
+    assert rack(*boards).response_ticks(names) == ticks
+
+
 JOINTS = tuple(f"joint{k}" for k in range(1, 7))
 
 
-def arm_of(*joints: str, every: int = 4, goal_ns: float | None = None) -> RackTiming:
+def arm_of(*joints: str) -> RackTiming:
     """A board a joint between a trajectory level, which has a planner's board above it, and the
     board of the arm."""
     names = " ".join(joints)
@@ -94,12 +113,7 @@ def arm_of(*joints: str, every: int = 4, goal_ns: float | None = None) -> RackTi
         board("path", 20, "plan", names),
         board("arm", 2, names),
     ]
-    return rack(
-        *boards,
-        *(board(name, every, "path", "arm") for name in joints),
-        board("alone", 500),
-        goal_ns=goal_ns,
-    )
+    return rack(*boards, *(board(name, 4, "path", "arm") for name in joints), board("alone", 500))
 
 
 def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
@@ -129,10 +143,11 @@ def test_a_joint_that_is_slower_than_the_others_is_judged_by_itself() -> None:
 def test_chains_of_equal_cycles_are_one_only_if_they_are_every_combination() -> None:
     pairs = [board("a", 40), board("b", 4, "a"), board("c", 40), board("d", 4, "c")]
     assert [chains.text for chains in rack(*pairs).parallel] == ["a > b", "c > d"]
-    assert [sorted(boards) for boards in rack(*pairs).connected] == [["a", "b"], ["c", "d"]]
+    slower = rack(*pairs).changed("c", every=80).longest_cycles
+    assert slower == {"a": 40, "b": 40, "c": 80, "d": 80}
     crossed = rack(*pairs[:3], board("d", 4, "a c"))
     assert [chains.text for chains in crossed.parallel] == ["a > b", "a > d", "c > d"]
-    assert [sorted(boards) for boards in crossed.connected] == [["a", "b", "c", "d"]]
+    assert set(crossed.changed("c", every=80).longest_cycles.values()) == {80}
 
 
 def test_a_response_through_a_queue_is_said_to_be_that_of_an_empty_one() -> None:
@@ -143,15 +158,8 @@ def test_a_response_through_a_queue_is_said_to_be_that_of_an_empty_one() -> None
 
 def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
-    found = rack(*boards, goal_ns=60 * 2.0 * MS).longest_cycles
-    assert found == {"top": 20, "middle": 20, "low": 20}
-
-
-def test_a_goal_for_the_response_is_divided_among_the_levels() -> None:
-    timing = rack(
-        board("top", 40, below="a"), board("a", 4, "top"), board("alone", 7), goal_ns=30 * 2.0 * MS
-    )
-    assert timing.longest_cycles == {"top": 15, "a": 15, "alone": 7}
+    found = rack(*boards, board("alone", 7), goal_ns=60 * 2.0 * MS).longest_cycles
+    assert found == {"top": 20, "middle": 20, "low": 20, "alone": 7}
 
 
 def test_boards_without_a_budget_are_named_and_not_judged() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from dataclasses import replace
 
 import pytest
 
@@ -104,35 +103,11 @@ def test_a_late_plan_is_followed_at_once_by_the_one_whose_slice_has_begun() -> N
     assert ends(chart, "level.planner") == [(0, 23), (18, 42), (36, None)]
 
 
-def test_a_planner_that_is_done_early_waits_for_the_end_of_its_slice() -> None:
-    assert row(simulate([planner("P1", 2, 3)], 13)) == "P-----P-----P"
-
-
-def test_a_planner_that_lost_more_than_its_slice_skips_to_the_oldest_release_still_ahead() -> None:
-    # One unit of five is left to it: a plan of seven lasts 35, far beyond its slice of 10.
-    chart = simulate((executor("X4", 5), planner("P7", 5, 2)), 110)
-    assert ends(chart, "level.planner") == [(0, 35), (30, 70), (65, 105), (100, None)]
-
-
 def test_the_plan_update_blocks_its_executor_but_no_task_above_it() -> None:
     tasks = executor("R1 X1", 4), planner("P2 U3", 4, 3)
     assert row(simulate(tasks, 12)) == "RXPPRXUUURX-"
     above = TimedTask("clock", "clock", "clock", 1, 90, 8, parts("X1"))
     assert row(simulate((*tasks, above), 13)) == "XRXPRXPUXUURX"
-
-
-def test_a_plan_update_without_a_ceiling_is_preempted() -> None:
-    tasks = executor("R1 X1", 4), planner("P2 U3", 4, 3, ceiling=0)
-    assert row(simulate(tasks, 12)) == "RXPPRXUURXU-"
-
-
-def test_a_release_at_the_very_moment_the_update_could_begin_comes_first() -> None:
-    assert row(simulate((executor("X2", 4), planner("P2 U1", 4, 2)), 8)) == "XXPPXXU-"
-
-
-def test_equal_priorities_take_their_turns_by_release_then_by_name() -> None:
-    tasks = executor("X3", 6, name="b"), executor("W2", 6, name="a"), executor("R1", 4, name="c")
-    assert row(simulate(tasks, 12)) == "WWXXXRWWXXXR"
 
 
 def test_every_job_costs_two_context_switches() -> None:
@@ -142,13 +117,6 @@ def test_every_job_costs_two_context_switches() -> None:
     assert row(chart) == "-RXXW--P-RXXW-PP"
     assert ends(chart, "level") == [(0, 5), (8, 13)]
     assert [job.end_ns for job in chart.late("level.planner")] == [None]
-
-
-def test_a_release_that_is_known_late_delays_its_job() -> None:
-    late = replace(executor("X2", 5), jitter_ns=2)
-    chart = simulate([late], 10)
-    assert row(chart) == "--XX---XX-"
-    assert ends(chart, "level") == [(0, 4), (5, 9)]
 
 
 def test_what_is_not_done_when_the_schedule_ends_has_no_end() -> None:
@@ -224,7 +192,7 @@ def place(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(30))
 def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
     for number in range(10):
         tasks, until = random_tasks(1000 * seed + number), 300
@@ -255,22 +223,14 @@ def test_a_job_is_late_if_it_ended_after_its_deadline_or_did_not_end_by_then() -
     assert CHART.late("a") == [JOBS[1]]
     # The second one still has time when the chart ends.
     assert CHART.late("b") == [JOBS[2]]
+    # In a window too, a job that is not due within it is not late.
+    assert [CHART.window(0, end).late("b") for end in (25, 30)] == [[], [JOBS[2]]]
 
 
-def test_a_window_cuts_spans_and_leaves_out_what_lies_outside() -> None:
+def test_a_window_cuts_spans_and_keeps_jobs_whole() -> None:
     window = CHART.window(4, 12)
-    assert [(span.unit, span.start_ns, span.end_ns) for span in window.spans] == [
-        ("X", 4, 10),
-        ("W", 10, 12),
-    ]
+    spans = [(span.unit, span.start_ns, span.end_ns) for span in window.spans]
+    assert spans == [("X", 4, 10), ("W", 10, 12)]
     assert (window.start_ns, window.end_ns) == (4, 12)
-
-
-def test_a_window_keeps_the_jobs_that_it_has_to_do_with_whole() -> None:
     assert CHART.window(42, 50).jobs == (JOBS[1], JOBS[3])
     assert CHART.window(20, 25).jobs == (JOBS[1], JOBS[2])
-
-
-def test_a_job_that_is_not_due_within_the_window_is_not_late_in_it() -> None:
-    assert CHART.window(0, 25).late("b") == []
-    assert CHART.window(0, 30).late("b") == [JOBS[2]]

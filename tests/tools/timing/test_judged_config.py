@@ -216,6 +216,4 @@ def test_the_papers_figures_are_predicted_as_the_paper_has_them(
 
 
 def test_a_margin_is_what_the_right_side_has_left() -> None:
-    assert (
-        EquationVerdict("3.1", "servo", 3.0, "<=", 2.5, False, "t_proc + t_c <= R_i").margin == -0.5
-    )
+    assert EquationVerdict("3.1", "servo", 3.0, "<=", 2.5, "t_proc + t_c <= R_i").margin == -0.5

@@ -14,7 +14,6 @@ from rack.backplane.layout import TaskSpec
 from rack.boards.config import RackConfig, rack_timing
 from rack.boards.config.timing import without_interrupts
 from rack.levels.timing import trace_times
-from rack.levels.timing.equations import Relation
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, verdicts
 from rack.tools.console.answer import Failure
@@ -165,13 +164,9 @@ def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[Eq
         longest_ns = times["max"] * wall_ns
         bound_ns = found[way]["bound_ms"] * wall_ns
         meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
-        yield EquationVerdict.of(
-            "3.2", found["subject"], Relation(longest_ns, "<=", bound), meaning
-        )
+        yield EquationVerdict("3.2", found["subject"], longest_ns, "<=", bound, meaning)
         meaning = f"R_s of a {way} <= sum of R_i and of the waits for the grid"
-        yield EquationVerdict.of(
-            "3.3", found["subject"], Relation(longest_ns, "<=", bound_ns), meaning
-        )
+        yield EquationVerdict("3.3", found["subject"], longest_ns, "<=", bound_ns, meaning)
 
 
 def _tasks(
@@ -180,18 +175,19 @@ def _tasks(
     for name, cycles in found.items():
         if cycles.task.role == "executor":
             step = worst_of(_steps_ns(cycles, rack)[cycles.is_judged], percentile)
-            relation = Relation(step, "=", cycle_ns(rack, cycles.task))
-            yield EquationVerdict.of("3.7", name, relation, "t_(k+1) - t_k = R_i")
+            every_ns = cycle_ns(rack, cycles.task)
+            yield EquationVerdict("3.7", name, step, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
             worst = worst_of(_response_ns(cycles, rack)[cycles.is_judged], percentile)
-            relation = Relation(worst, "<=", slice_ns(rack, cycles.task))
-            yield EquationVerdict.of(RESPONSE_TIME, name, relation, "measured response <= deadline")
+            deadline_ns = slice_ns(rack, cycles.task)
+            meaning = "measured response <= deadline"
+            yield EquationVerdict(RESPONSE_TIME, name, worst, "<=", deadline_ns, meaning)
 
 
 def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
     for core, load in loads.items():
-        relation = Relation(load, "<=", 1.0)
-        yield EquationVerdict.of(LOAD, f"core {core}", relation, "time used by its tasks", "1")
+        meaning = "time used by its tasks"
+        yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
 
 
 def core_loads(

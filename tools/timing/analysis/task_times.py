@@ -4,11 +4,11 @@ show."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import pstdev
 
 import numpy as np
 
 from rack.backplane.layout import TaskSpec
-from rack.levels.timing.equations import residual_bound_ns, residual_deviation_ns
 from rack.levels.timing.trace_times import (
     communication_ns,
     distribution,
@@ -89,9 +89,13 @@ def task_times(
         "deviation_ms": None,
     }
     if len(cycles):
-        times = execution.tolist(), communication.tolist()
-        by_the_clock["alpha_ms"] = round(residual_bound_ns(slice_ns, *times) * MS, 6)
-        by_the_clock["deviation_ms"] = round(residual_deviation_ns(*times) * MS, 6)
+        # Eq. 3.6: alpha is the residual guaranteed in the worst cycle, though the longest execution
+        # and the longest communication may fall into different ones; smooth motion needs a small
+        # deviation.
+        alpha_ns = slice_ns - max(execution.tolist()) - max(communication.tolist())
+        by_the_clock["alpha_ms"] = round(alpha_ns * MS, 6)
+        deviation_ns = pstdev((execution + communication).tolist())
+        by_the_clock["deviation_ms"] = round(deviation_ns * MS, 6)
     return {
         "traced": len(cycles),
         "slice_ms": slice_ns * MS,

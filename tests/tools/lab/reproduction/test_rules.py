@@ -163,7 +163,7 @@ def partitions(slow: int, fast: int, plans: int) -> Partitions:
 def equation(holds: bool, mostly: bool) -> NasremRun:
     """Return a run with equation 3.1 measured for one level."""
     left = 1e6 if holds else 3e6
-    measured = EquationVerdict("3.1", "servo", left, "<=", 2.5e6, holds, "")
+    measured = EquationVerdict("3.1", "servo", left, "<=", 2.5e6, "")
     return replace(RUN, verdicts=(MeasuredVerdict(measured, mostly),))
 
 

@@ -17,7 +17,6 @@ from rack.boards.config import load
 from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
 from rack.levels.systems.hand.messages import HAND_STATUS
 from rack.levels.systems.joint_boards.messages import DRIVING
-from rack.levels.timing.equations import response_ticks
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.live.verdict import ACROSS_RACKS, judge_run
@@ -72,20 +71,6 @@ def test_a_task_that_never_ran_has_no_times() -> None:
     times = task_times(TASK, np.empty(0, RECORD), 10 * MS, False, stretches=np.zeros(0))
     assert times["execution_ms"] is None
     assert times["alpha_ms"] is None
-
-
-@pytest.mark.parametrize(
-    ("cycles", "ticks"),
-    [
-        ([8], 8),
-        ([400, 100, 8, 1], 509 + 4),  # 100 and 8 meet every 4 ticks only
-        ([1, 8, 100, 400], 509 + 7 + 96 + 300),
-    ],
-)
-def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(
-    cycles: list[int], ticks: int
-) -> None:
-    assert response_ticks(cycles) == ticks
 
 
 @pytest.fixture(scope="module")
