@@ -13,7 +13,6 @@ from rack.levels.level import Finding, Input, LevelContext, Ports
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Reaction
-from rack.levels.systems.force import contact_wrench
 from rack.levels.systems.force.contact import HALVES
 from rack.levels.systems.force.contact_wrench import ContactWrench
 from rack.levels.systems.force.messages import WRENCH
@@ -53,7 +52,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
     outputs = {**ArmExecutor.outputs, "wrench": WRENCH}
     params = ForceArmParams
-    preloads = (*ArmExecutor.preloads, wrist, contact_wrench)
+    preloads = (wrist,)
 
     def __init__(self, context: LevelContext) -> None:
         params = read_params(ForceArmParams, context.params)

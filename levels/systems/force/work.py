@@ -13,7 +13,7 @@ from rack.levels.systems.force.contact import AXIS_NAMES, UNITS, Contact, Wanted
 from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
-from rack.levels.systems.trajectory.requests import Agenda, MotionRequest
+from rack.levels.systems.trajectory.requests import Agenda
 from rack.levels.systems.trajectory.work import MotionTools, RequestWork, TrajectoryParams
 from rack.levels.tables import Positive
 
@@ -139,7 +139,7 @@ class ServerWork(RequestWork):
         self.boards.leave(why)
         self.interrupt()
 
-    def _misfit(self, request: MotionRequest) -> str:
+    def _misfit(self, request: Message) -> str:
         wanted = Wanted.of(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
@@ -149,7 +149,7 @@ class ServerWork(RequestWork):
             return reason or self.contact.objection(frame, wanted.guard)
         return super()._misfit(request)
 
-    def _start(self, request: MotionRequest) -> None:
+    def _start(self, request: Message) -> None:
         wanted = Wanted.of(request.record)
         if request.kind == MotionKind.GUARD:
             self.contact.watch(wanted.frame, wanted.guard)
@@ -164,14 +164,14 @@ class ServerWork(RequestWork):
         else:
             super()._start(request)
 
-    def _is_done(self, current: MotionRequest) -> bool:
+    def _is_done(self, current: Message) -> bool:
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
         return self.motion.settled and (
             not self.contact.complies or self.passed_s >= self._params.settle
         )
 
-    def _lasts_s(self, request: MotionRequest) -> float:
+    def _lasts_s(self, request: Message) -> float:
         if request.kind == MotionKind.COMPLY and self.contact.complies:
             return self._params.settle
         return super()._lasts_s(request)

@@ -4,7 +4,6 @@ them."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -68,7 +67,6 @@ class HandExecutor(Executor):
         self._waiting = ""  # why the boards above do not drive the hand; empty: they do
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
         self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
-        self._shown: tuple[Any, ...] = ()  # what seldom changes, in the last status
 
     @classmethod
     def misfits(
@@ -158,7 +156,7 @@ class HandExecutor(Executor):
             self.hand.pull(self.tensions.tension)
 
     def _report(self, status: Message, sample: HandSample, tick: int) -> None:
-        """Fill the status; the fields that seldom change only when they do."""
+        """Fill the status."""
         hand = self.hand
         status.tick = tick
         status.position = sample.position
@@ -167,11 +165,6 @@ class HandExecutor(Executor):
         status.tension = sample.tension
         status.force = sample.force
         status.wanted = hand.wanted
-        counts = hand.clipped, hand.touches, hand.violations, hand.pushed
-        shown = self._waiting, self._opened, self.demand, counts, hand.fault, self._slack.note
-        if shown == self._shown:
-            return
-        self._shown = shown
         closed = bool(self._waiting)
         status.holding = closed
         status.stopped = closed and self._opened
@@ -212,17 +205,13 @@ class SlackMonitor:
         self._least = hand.least
         self._slack = SLACK_PART * hand.least
         self._cycles = np.zeros((2, len(joints)), dtype=int)  # for which each tendon has been slack
-        self._any = False  # one was, in the last cycle
         self.note = ""  # which tendons are slack, readable; empty: none
 
     def look(self, tension: Array, wanted: Array) -> list[Finding]:
         """Return new findings of a cycle; tensions as sensed, and as wanted of the valves, are (2,
         joints), N."""
-        if tension.min() >= self._slack and not self._any:
-            return []
         slack = (tension < self._slack) & (wanted >= self._least)
         self._cycles = np.where(slack, self._cycles + 1, 0)
-        self._any = bool(slack.any())
         torn = np.argwhere(self._cycles >= SLACK_CYCLES).tolist()
         named = ", ".join(f"{TENDONS[row]} of '{self._joints[joint]}'" for row, joint in torn)
         self.note = f"slack: {named}" if named else ""

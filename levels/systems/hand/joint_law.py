@@ -50,29 +50,22 @@ class JointLaw:
         self._constants = np.array((self._dynamics.dry, viscous, cell.bounds.torque, driven))
         self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
         self._ahead = gains.ahead
-        self._state: Array  # numbers of a status of the hand
-        self._wanted: Array  # numbers of a target
-        self._spring: Array  # likewise
         self._set = set_joint_torques.load()
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
-    def start(self, hand: Message, target: Message) -> None:
-        """Read the `HAND_STATUS` and the `FINGER_TARGET` from these messages from now on."""
-        self._state = numbers(hand, "position", "velocity").reshape(2, -1)
-        self._wanted = numbers(target, "position", "torque").reshape(4, -1)
-        self._spring = target.spring
-
-    def torques(self, age_s: float, ahead_s: float, out: Array) -> None:
-        """Set `out`, (joints,), N m, for when the sample is `age_s` old; the target is taken on by
-        `ahead_s`."""
-        terms = self._dynamics.terms(self._state[0], self._still)
+    def torques(
+        self, hand: Message, target: Message, age_s: float, ahead_s: float, out: Array
+    ) -> None:
+        """Set `out`, (joints,), N m, for when the sample in a `HAND_STATUS` is `age_s` old; the
+        `FINGER_TARGET` is taken on by `ahead_s`."""
+        terms = self._dynamics.terms(hand.position, self._still)
         is_cut = self._set(
             self._gains,
             (age_s + self._ahead, ahead_s),
             self._constants,
-            self._state,
-            self._wanted,
-            self._spring,
+            numbers(hand, "position", "velocity").reshape(2, -1),
+            numbers(target, "position", "torque").reshape(4, -1),
+            target.spring,
             terms.inertia,
             terms.bias,
             out,

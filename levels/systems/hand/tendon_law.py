@@ -70,34 +70,28 @@ class TendonLaw:
         self._tick_s = context.tick_s
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
         self._set = set_tensions.load()
-        self._status: Message  # of the hand
-        self._sensed: Array  # its numbers
         self._sampled = 0  # tick of the last sample
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
     def start(self, status: Message) -> None:
-        """Begin with the tensions of a `HAND_STATUS`, whose later contents are read from the same
-        place."""
+        """Begin with the tensions of a `HAND_STATUS`."""
         self._valves[0] = status.wanted
         self._valves[1] = status.tension
         self._valves[2] = 0.0
-        self._status = status
         self._sampled = status.tick
-        self._sensed = numbers(status, "tension", "wanted")
 
-    def tensions(self, torque: Array, out: Array) -> None:
-        """Set `out`, (2, joints), N, for `torque`, (joints,), N m."""
+    def tensions(self, status: Message, torque: Array, out: Array) -> None:
+        """Set `out`, (2, joints), N, for `torque`, (joints,), N m, at a `HAND_STATUS`."""
         # Valves that are closed do not follow their commands: nothing is to be learned from them.
-        elapsed = 0 if self._status.holding else self._status.tick - self._sampled
-        self._sampled = self._status.tick
+        elapsed = 0 if status.holding else status.tick - self._sampled
+        self._sampled = status.tick
         elapsed_s = elapsed * self._tick_s
         shares = (
             1.0 - math.exp(-elapsed_s / self._lag),
             min(self._trim * elapsed_s, MOST_LEARNED),
         )
-        if self._set(
-            self._numbers, shares, self._constants, self._valves, self._sensed, torque, out
-        ):
+        sensed = numbers(status, "tension", "wanted")
+        if self._set(self._numbers, shares, self._constants, self._valves, sensed, torque, out):
             self.clipped += 1
 
 

@@ -4,7 +4,6 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
@@ -21,7 +20,6 @@ from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
-from rack.levels.systems.joint_boards import joint_torques
 from rack.levels.systems.joint_boards.joint_torques import JointTorques
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_TORQUE
 from rack.levels.tables import read_params
@@ -46,7 +44,6 @@ class ArmExecutor(ArmDriver):
     outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
     commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
-    preloads: ClassVar[tuple[ModuleType, ...]] = (joint_torques,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context, read_params(self.params, context.params))
@@ -114,7 +111,7 @@ class ArmExecutor(ArmDriver):
         self._waiting = self.joints.missing(self._torques, tick, self._braked_at or 0)
         if self._waiting:
             return None
-        self.joints.add_up()
+        self.joints.add_up(self._torques)
         self.rests_on = self.joints.rests_on
         if self.abandoned and self._is_astray():
             return None

@@ -34,7 +34,7 @@ def flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | None) ->
     # Cases can be counted only once every condition and value is known, and every row is readable.
     if not table.flaws and not any(_conditions(row, vocabulary) for row in table.configs.values()):
         for state in table.rows:
-            found += _cases(state, _rows_of(state, table), vocabulary)
+            found += _cases(state, table.rows[state], vocabulary)
     return found
 
 
@@ -42,24 +42,20 @@ def _named(number: int, row: RowConfig) -> str:
     return f"row {number} '{row.name}'"
 
 
-def _rows_of(state: str, table: StateTable) -> dict[int, RowConfig]:
-    return {row.number: table.configs[row.number] for row in table.rows[state]}
-
-
 def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> Iterator[str]:
     """Yield unknown words of a row, and outputs that it lacks."""
     yield from _conditions(row, vocabulary)
-    for phrase in row.do or ():
+    for phrase in row.do:
         if lexicon is not None and (why := objection(phrase, vocabulary.actions, lexicon)):
             yield f"do: {why}"
     for key in ("next", "do", "status"):
-        if getattr(row, key) is None:
+        if key not in row.model_fields_set:
             yield f"{key}: missing; {keys_of(RowConfig)[key].description}"
-    if row.status is not None and row.status not in STATES:
+    if row.status not in STATES:
         yield f"status: unknown '{row.status}'; known: {', '.join(STATES)}"
-    if row.status in REASONED and row.reason is None:
+    if row.status in REASONED and not row.reason and "status" in row.model_fields_set:
         yield f"reason: missing; status {row.status} needs one, a line for the user"
-    if row.status not in REASONED and row.reason is not None:
+    if row.status not in REASONED and row.reason:
         yield f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}"
 
 
@@ -89,17 +85,17 @@ def _states(table: StateTable) -> Iterator[str]:
     if table.start not in names:
         yield f"start: no row has the state '{table.start}'; states: {known}"
     for number, row in table.configs.items():
-        if row.next is not None and row.next not in (*names, SAME):
+        if row.next not in (*names, SAME):
             yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
     if table.start not in names:
         return
     reached = [table.start]
     for state in reached:  # grows on the way
-        nexts = {row.next for row in _rows_of(state, table).values()} - {SAME}
+        nexts = {row.next for row in table.rows[state].values()}
         reached += [name for name in names if name in nexts and name not in reached]
     for state in names:
         if state not in reached:
-            numbers = ", ".join(map(str, _rows_of(state, table)))
+            numbers = ", ".join(map(str, table.rows[state]))
             yield (
                 f"row {numbers}: unreachable: no row leads from '{table.start}' to the state"
                 f" '{state}'"
@@ -133,7 +129,6 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
             yield f"{here}: never fires in '{state}': the rows above it take every case of it"
         left = rest
         boxes[number] = box
-    left = joined(left)
     for box in left[:MAX_HOLES]:
         yield f"hole: no row of '{state}' takes {_described(box, vocabulary)}"
     if len(left) > MAX_HOLES:
@@ -154,19 +149,6 @@ def without(box: Box, taken: Box) -> Sequence[Box]:
             pieces.append({**rest, condition: outside})
         rest[condition] = inside
     return pieces
-
-
-def joined(boxes: Sequence[Box]) -> list[Box]:
-    """Return fewer boxes with the same cases: those that differ in one condition become one."""
-    left: list[Box] = []
-    for count, box in enumerate(boxes, 1):
-        for at, other in enumerate(left):
-            differing = [condition for condition in box if box[condition] != other[condition]]
-            if len(differing) == 1:
-                both = {**box, differing[0]: box[differing[0]] | other[differing[0]]}
-                return joined([*left[:at], both, *left[at + 1 :], *boxes[count:]])
-        left.append(box)
-    return left
 
 
 def _described(box: Box, vocabulary: Vocabulary) -> str:

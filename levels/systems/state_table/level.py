@@ -35,8 +35,9 @@ from rack.levels.systems.state_table.table import (
     LATE,
     ROW_NAME_BYTES,
     SAME,
+    STATES,
     Name,
-    Row,
+    RowConfig,
     StateTable,
     TableError,
     read_table,
@@ -263,14 +264,15 @@ class StateTableExecutor(Executor):
             command = self._newest if is_new else self._taken
             values["command"] = command.words.partition(" ")[0] or "none"
             values["new"] = YES_NO[is_new]
-        row = self.table.decide(self.state, values)
-        for verb, *parameters in row.do:
+        number, row = self.table.decide(self.state, values)
+        for phrase in row.do:
+            verb, *parameters = phrase.split()
             getattr(self, f"do_{verb}")(*parameters)
         if row.next not in (SAME, self.state):
             self.state = row.next
             self._since = tick
         self.give(write, tick)
-        self._report(write, row)
+        self._report(write, number, row)
 
     @abstractmethod
     def look(self, read: Ports, tick: int) -> dict[str, str]:
@@ -357,11 +359,11 @@ class StateTableExecutor(Executor):
             else:
                 self._newest = WordCommand(True, order.id, order.name)
 
-    def _report(self, write: Ports, row: Row) -> None:
+    def _report(self, write: Ports, number: int, row: RowConfig) -> None:
         """Fill the fields of `STATUS_HEAD`, and the operator's in the command."""
         shown: Message = write.status
         orders = self.orders
-        state = row.status
+        state = STATES[row.status]
         reason = row.reason
         if self._kept and state is State.EXECUTING:
             state = State.HOLDING
@@ -385,7 +387,7 @@ class StateTableExecutor(Executor):
         shown.table = self.table_name
         shown.checksum = self.table.checksum
         shown.in_state = self.state
-        shown.row = row.number
+        shown.row = number
         shown.fired = row.name
         shown.words = words
         shown.done = self._done

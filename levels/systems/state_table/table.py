@@ -80,14 +80,18 @@ class RowConfig(Table):
     """value, or a list of values, by condition"""
     otherwise: bool = Field(False, alias="else")
     """takes what the rows of the state above this one leave"""
-    # Missing ones are reported with what else is wrong with the table.
-    next: Name | None = None
+    # Those of the next three that are missing are reported with what else is wrong with the table.
+    next: Name = SAME
     """next state, or same"""
-    do: Words | None = None
+    do: Words = ()
     """actions with their parameters, in order; may be an empty list"""
-    status: str | None = Field(None, description="state shown upwards: " + ", ".join(STATES))
-    reason: Reason | None = None
+    status: str = Field("error", description="state shown upwards: " + ", ".join(STATES))
+    reason: Reason = ""
     """shown with status error or holding"""
+
+    def matches(self, values: Mapping[str, str]) -> bool:
+        """Return whether the row fires on these values of the conditions."""
+        return all(values[condition] in permitted for condition, permitted in self.when.items())
 
 
 class TableConfig(Table):
@@ -112,24 +116,6 @@ class TableError(LevelError):
 
 
 @dataclass(frozen=True)
-class Row:
-    """One row. `number` counts from 1, in the order of the file."""
-
-    number: int
-    name: str
-    # Values permitted, by condition; one left out may have any value.
-    when: Mapping[str, frozenset[str]]
-    next: str
-    do: tuple[tuple[str, ...], ...]  # actions: verb and parameters
-    status: State
-    reason: str
-
-    def matches(self, values: Mapping[str, str]) -> bool:
-        """Return whether the row fires on these values of the conditions."""
-        return all(values[condition] in permitted for condition, permitted in self.when.items())
-
-
-@dataclass(frozen=True)
 class StateTable:
     """A state table as read. `flaws` are the mistakes in the form of the file.
 
@@ -144,33 +130,23 @@ class StateTable:
     flaws: tuple[str, ...]
 
     @cached_property
-    def rows(self) -> Mapping[str, tuple[Row, ...]]:
-        """The rows by state, each state's in their order."""
-        rows: dict[str, tuple[Row, ...]] = {}
-        for number, config in self.configs.items():
-            # A row may lack these, until its check says so.
-            row = Row(
-                number=number,
-                name=config.name,
-                when={condition: frozenset(values) for condition, values in config.when.items()},
-                next=config.next or SAME,
-                do=tuple(tuple(phrase.split()) for phrase in config.do or ()),
-                status=STATES.get(config.status or "", State.ERROR),
-                reason=config.reason or "",
-            )
-            for state in config.state:
-                rows[state] = (*rows.get(state, ()), row)
+    def rows(self) -> Mapping[str, Mapping[int, RowConfig]]:
+        """The rows by state and number, each state's in their order."""
+        rows: dict[str, dict[int, RowConfig]] = {}
+        for number, row in self.configs.items():
+            for state in row.state:
+                rows.setdefault(state, {})[number] = row
         return rows
 
-    def decide(self, state: str, values: Mapping[str, str]) -> Row:
-        """Return the row that fires; number 0, an error: no row takes the case, which cannot happen
-        in a table that was checked."""
-        for row in self.rows.get(state, ()):
+    def decide(self, state: str, values: Mapping[str, str]) -> tuple[int, RowConfig]:
+        """Return the row that fires, after its number; number 0, an error: no row takes the case,
+        which cannot happen in a table that was checked."""
+        for number, row in self.rows.get(state, {}).items():
             if row.matches(values):
-                return row
+                return number, row
         case = ", ".join(f"{name} = {value}" for name, value in values.items())
         reason = f"no row of '{state}' takes {case}"
-        return Row(0, "", {}, state, (), State.ERROR, reason)
+        return 0, RowConfig.model_construct(name="", next=state, reason=reason)
 
 
 def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:

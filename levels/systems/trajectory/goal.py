@@ -15,7 +15,6 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
 from rack.levels.level import Reading
 from rack.levels.planning.pose import Pose, pose
-from rack.levels.systems.trajectory.requests import MotionRequest
 
 
 class Unfit(Exception):
@@ -66,18 +65,18 @@ class WorldSight:
 class ToolGoal:
     """The goal of one request."""
 
-    def __init__(self, request: MotionRequest, sight: WorldSight, follow_s: float) -> None:
+    def __init__(self, request: Message, sight: WorldSight, follow_s: float) -> None:
         """Follow a live goal with the time constant `follow_s`."""
-        self._goal = request.goal  # in the frame of the body
+        self._goal = pose(request.position, request.quaternion)  # in the frame of the body
         self._body = request.body  # row in the world model; -1: the world
-        self.live = request.live and request.body >= 0
+        self.live = request.live > 0 and request.body >= 0
         self._sight = sight
         self._follow_s = follow_s
         self._stamp_s = -1.0  # of the sample for which `pose` was evaluated
         self._frame: Pose | None = None
         self._velocity = np.zeros(3)
         self._turning = np.zeros(3)
-        self.pose = request.goal  # of the tool, for that sample
+        self.pose = self._goal  # of the tool, for that sample
 
     def update(self, time_s: float) -> None:
         """Evaluate the goal for the sample at `time_s`; again for the same one does nothing. Raises

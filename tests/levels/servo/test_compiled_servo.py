@@ -19,7 +19,7 @@ from rack.levels.servo import (
     reference,
     sensor_monitor,
 )
-from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control, joint_torques
+from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control
 from tests.levels.arms import config
 from tests.levels.servo.joint_rig import APART, JointRig
 from tests.levels.servo.rig import Course, ServoRig
@@ -33,7 +33,6 @@ MODULES = (
     control,
     driver,
     joint_control,
-    joint_torques,
 )
 FUNCTIONS = {
     name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)
@@ -141,15 +140,6 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
     ],
     "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
     "servo_joints": [joints_of(k) for k in range(4)],
-    "add_up": [
-        (
-            noise(k, 3 * JOINTS + 5),
-            noise(k + 1, 3, JOINTS),
-            size * noise(k + 2, 90),
-            np.array([0, 30, 60]),
-        )
-        for k, size in ((1, 1.0), (2, 0.0))
-    ],
     "show": [
         (
             noise(1, 5 * JOINTS + 3),
@@ -163,7 +153,7 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         )
     ],
 }
-VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2, "add_up": 2}
+VERDICTS = {"is_within": 2, "admit": 3, "check": 3, "left_over": 3, "set_torque": 2}
 """Kinds of verdicts that the cases reach; else: None."""
 
 

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rack.backplane.message import State
 from rack.levels.systems.state_table.checks import flaws, without
 from rack.levels.systems.state_table.table import RowConfig, StateTable, TableError, read_table
 from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, found, table, written
@@ -183,7 +182,7 @@ def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
     door = table(tmp_path)
     case = {"command": "open", "new": "yes", "lock": "free", "place": "shut", "late": "no"}
     names = [
-        door.decide(state, case | change)
+        door.decide(state, case | change)[1]
         for state, change in [
             ("shut", {}),
             ("shut", {"new": "no"}),
@@ -197,8 +196,8 @@ def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
         "locked",
         "arrived",
     ]
-    none = door.decide("nowhere", case)
-    assert (none.number, none.name, none.status) == (0, "", State.ERROR)
+    number, none = door.decide("nowhere", case)
+    assert (number, none.name, none.status) == (0, "", "error")
     assert none.reason.startswith("no row of 'nowhere' takes command = open, new = yes")
 
 
@@ -239,13 +238,14 @@ def test_a_table_passes_exactly_if_one_row_fires_in_every_case(
         dict(zip(NAMES, values, strict=True))
         for values in product(*(DOORS.conditions[name].values for name in NAMES))
     ]
-    fires = [[row for row in table.rows["on"] if row.matches(case)] for case in cases]
+    on = table.rows["on"]
+    fires = [[row for row in on.values() if row.matches(case)] for case in cases]
     assert any("hole" in line for line in complaints) == any(not rows for rows in fires)
     assert any("overlaps" in line for line in complaints) == any(
-        not configs[row.number].otherwise for rows in fires for row in rows[1:]
+        not row.otherwise for rows in fires for row in rows[1:]
     )
     if not complaints:
-        assert all(table.decide("on", case).number for case in cases)
+        assert all(table.decide("on", case)[0] for case in cases)
 
 
 BOXES = st.fixed_dictionaries(
