@@ -184,7 +184,7 @@ def disturb(play: Play, events: list[frozenset[str] | str]) -> None:
 
 
 @given(EVENTS)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_program_is_done_once_by_all_whatever_is_lost_and_restarted(
     events: list[frozenset[str] | str],
 ) -> None:
@@ -196,7 +196,7 @@ def test_program_is_done_once_by_all_whatever_is_lost_and_restarted(
 
 
 @given(EVENTS, SOME_STEPS, SOME_STEPS)
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_step_that_one_arm_refuses_is_begun_by_none(
     events: list[frozenset[str] | str], puma: frozenset[int], third: frozenset[int]
 ) -> None:
@@ -214,7 +214,7 @@ def test_step_that_one_arm_refuses_is_begun_by_none(
 
 
 @given(EVENTS, st.integers(0, len(STEPS) - 1))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_arm_that_fails_ends_the_program_and_leaves_no_arm_moving(
     events: list[frozenset[str] | str], step: int
 ) -> None:
@@ -226,7 +226,7 @@ def test_arm_that_fails_ends_the_program_and_leaves_no_arm_moving(
 
 
 @given(STEADY, st.floats(2.0, 12.0))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_promise_that_expires_is_asked_for_again_before_anything_begins(
     events: list[frozenset[str] | str], keeps_s: float
 ) -> None:
@@ -238,7 +238,7 @@ def test_promise_that_expires_is_asked_for_again_before_anything_begins(
 
 
 @given(STEADY, st.sampled_from(ARMS), st.integers(0, 40))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_arm_launched_anew_ends_the_program_or_has_lost_nothing(
     events: list[frozenset[str] | str], arm: str, when: int
 ) -> None:
