@@ -205,13 +205,17 @@ class SlackMonitor:
         self._least = hand.least
         self._slack = SLACK_PART * hand.least
         self._cycles = np.zeros((2, len(joints)), dtype=int)  # for which each tendon has been slack
+        self._any = False  # one was, in the last cycle
         self.note = ""  # which tendons are slack, readable; empty: none
 
     def look(self, tension: Array, wanted: Array) -> list[Finding]:
         """Return new findings of a cycle; tensions as sensed, and as wanted of the valves, are (2,
         joints), N."""
+        if tension.min() >= self._slack and not self._any:
+            return []
         slack = (tension < self._slack) & (wanted >= self._least)
         self._cycles = np.where(slack, self._cycles + 1, 0)
+        self._any = bool(slack.any())
         torn = np.argwhere(self._cycles >= SLACK_CYCLES).tolist()
         named = ", ".join(f"{TENDONS[row]} of '{self._joints[joint]}'" for row, joint in torn)
         self.note = f"slack: {named}" if named else ""

@@ -9,9 +9,17 @@ most as many boxes as it has conditions.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 
-from rack.levels.systems.state_table.table import SAME, STATES, RowConfig, StateTable
-from rack.levels.systems.state_table.vocabulary import Lexicon, Vocabulary, objection
+from rack.levels.systems.state_table.table import (
+    SAME,
+    STATES,
+    Lexicon,
+    RowConfig,
+    StateTable,
+    Vocabulary,
+    objection,
+)
 from rack.levels.tables import keys_of
 
 Box = dict[str, frozenset[str]]
@@ -67,7 +75,7 @@ def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
             known = ", ".join(vocabulary.conditions)
             found.append(f"when: unknown condition '{condition}'; known: {known}")
             continue
-        permitted = vocabulary.conditions[condition].values
+        permitted = vocabulary.conditions[condition]
         unknown = [f"is never '{value}'" for value in values if value not in permitted]
         if not values:
             unknown = ["has an empty list"]
@@ -108,7 +116,7 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
     named = [
         name for name in vocabulary.conditions if any(name in row.when for row in rows.values())
     ]
-    every: Box = {name: frozenset(vocabulary.conditions[name].values) for name in named}
+    every: Box = {name: frozenset(vocabulary.conditions[name]) for name in named}
     boxes: dict[int, Box] = {}  # of the rows above, by number
     left = [every]
     for number, row in rows.items():
@@ -129,6 +137,7 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
             yield f"{here}: never fires in '{state}': the rows above it take every case of it"
         left = rest
         boxes[number] = box
+    left = joined(left)
     for box in left[:MAX_HOLES]:
         yield f"hole: no row of '{state}' takes {_described(box, vocabulary)}"
     if len(left) > MAX_HOLES:
@@ -151,11 +160,23 @@ def without(box: Box, taken: Box) -> Sequence[Box]:
     return pieces
 
 
+def joined(boxes: Sequence[Box]) -> list[Box]:
+    """Return fewer boxes with the same cases: two that differ in one condition become one."""
+    left = [*boxes]
+    while pair := next((p for p in combinations(left, 2) if _differ_once(*p)), None):
+        one, other = pair
+        left[left.index(one)] = {name: one[name] | other[name] for name in one}
+        left.remove(other)
+    return left
+
+
+def _differ_once(one: Box, other: Box) -> bool:
+    return sum(one[name] != other[name] for name in one) == 1
+
+
 def _described(box: Box, vocabulary: Vocabulary) -> str:
     """Return the cases of a box as text, without the conditions that may have any value."""
-    narrow = {
-        n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n].values)
-    }
+    narrow = {n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n])}
     return _listed(narrow)
 
 

@@ -33,26 +33,24 @@ from rack.levels.operator import (
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.table import (
     LATE,
+    NAME_BYTES,
+    PHRASE_BYTES,
     ROW_NAME_BYTES,
     SAME,
     STATES,
+    TAKE,
+    Lexicon,
     Name,
+    NoPlan,
+    Phrases,
     RowConfig,
     StateTable,
     TableError,
-    read_table,
-)
-from rack.levels.systems.state_table.vocabulary import (
-    NAME_BYTES,
-    PHRASE_BYTES,
-    TAKE,
-    Condition,
-    Lexicon,
-    NoPlan,
-    Phrase,
+    Values,
     Vocabulary,
     objection,
     phrases,
+    read_table,
 )
 from rack.levels.tables import SceneConfig, Table, read_params
 
@@ -82,10 +80,10 @@ WORD_COMMAND = command("word_command", 1, *COMMAND_HEAD)
 TABLE_STATUS = status("table_status", 1, *STATUS_HEAD)
 YES_NO = ("no", "yes")
 UNKNOWN = "unknown"
-BELOW = Condition(
-    ("waiting", "executing", "done", "error", "lost"),
-    "the level below: waiting: it has not answered the newest command; lost: its board is",
-)
+"""A command whose words the level does not know."""
+BELOW = ("waiting", "executing", "done", "error", "lost")
+"""Condition of the level below: waiting: it has not answered the newest command; lost: its board
+is."""
 
 
 class StateTableParams(Table):
@@ -96,29 +94,19 @@ class StateTableParams(Table):
 
 
 def vocabulary(
-    conditions: Mapping[str, Condition],
-    actions: Mapping[str, Phrase],
-    commands: Mapping[str, Phrase] | None = None,
+    conditions: Mapping[str, Values],
+    actions: Phrases,
+    commands: Phrases | None = None,
     plan: type[Table] = NoPlan,
 ) -> Vocabulary:
     """Return the vocabulary of a level: its own words and, if it accepts commands, those that come
     with them."""
-    late = Condition(YES_NO, "whether the state has lasted longer than the table's patience")
-    known = {**conditions, LATE: late}
-    possible = dict(actions)
-    if commands:
-        known["command"] = Condition(
-            ("none", UNKNOWN, *commands),
-            f"the newest command, of an operator or the level above; {UNKNOWN}: the level does not"
-            " know its words",
-        )
-        known["new"] = Condition(
-            YES_NO, f"whether no row has done '{TAKE}' since that command came"
-        )
-        possible[TAKE] = Phrase(
-            (), "let the newest command be the one in force: the status answers it from now on"
-        )
-    return Vocabulary(known, commands or {}, possible, plan)
+    known = {**conditions, LATE: YES_NO}
+    if not commands:
+        return Vocabulary(known, {}, actions, plan)
+    # The newest command, of an operator or the level above; whether no row has taken it yet.
+    known |= {"command": ("none", UNKNOWN, *commands), "new": YES_NO}
+    return Vocabulary(known, commands, {**actions, TAKE: ()}, plan)
 
 
 class WordCommand(NamedTuple):

@@ -1,4 +1,7 @@
-"""A state table: the rows of a TOML file, and the one that fires.
+"""A state table: the rows of a TOML file, the words that they combine, and the row that fires.
+
+A level's class declares the words: conditions, commands that it accepts, actions. Every set of
+words is finite, so whether two rows overlap, and which case no row takes, can be decided exactly.
 
     start = "idle"
 
@@ -26,9 +29,10 @@ Rows of a state exclude each other, unless the later one says `else`; together t
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,8 +42,68 @@ from rack.backplane.bounded_toml import load_toml
 from rack.backplane.message import REASON_BYTES, State
 from rack.backplane.regular_file import read_regular_file
 from rack.levels.errors import LevelError
-from rack.levels.systems.state_table.vocabulary import NAME_BYTES, Vocabulary
 from rack.levels.tables import Positive, Table, Vector
+
+NAME_BYTES = 24
+"""Longest word, name of a state, or name of a table."""
+PHRASE_BYTES = 64
+"""Longest command or action, with its parameters."""
+TAKE = "take"
+"""The action of every level: from now on the newest command is the one in force, and the status
+answers it."""
+
+
+Values = tuple[str, ...]
+"""What a condition may be: it always has exactly one of these."""
+Phrases = Mapping[str, tuple[str | Values, ...]]
+"""Commands that a level accepts, or actions, by their word: one set of words for each word that
+follows it; a name stands for a set of `Lexicon`."""
+Lexicon = Mapping[str, Sequence[str]]
+"""Sets of words that depend on scene and plan, by name: "object" -> the objects of the scene."""
+
+
+class NoPlan(Table):
+    """The `[plan]` of a level that has none."""
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file
+    of a table."""
+
+    conditions: Mapping[str, Values]
+    commands: Phrases
+    actions: Phrases
+    plan: type[Table] = NoPlan
+
+
+def phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
+    """Yield every command or action with its parameters: "pick block1"."""
+    for word, parameters in verbs.items():
+        for given in product(*(_words(parameter, lexicon) for parameter in parameters)):
+            yield " ".join((word, *given))
+
+
+def _words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
+    return lexicon[parameter] if isinstance(parameter, str) else parameter
+
+
+def objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
+    """Return why `phrase` is none of the commands or actions; empty: it is one."""
+    if len(phrase) > PHRASE_BYTES:
+        return f"'{phrase}' has {len(phrase)} characters; permitted: {PHRASE_BYTES}"
+    word, *given = phrase.split() or [""]
+    if word not in verbs:
+        return f"unknown '{word}'; known: {', '.join(verbs) or 'none'}"
+    wanted = verbs[word]
+    if len(given) != len(wanted):
+        return f"'{phrase}' has {len(given)} parameters; '{word}' takes {len(wanted)}"
+    for value, parameter in zip(given, wanted, strict=True):
+        permitted = _words(parameter, lexicon)
+        if value not in permitted:
+            return f"'{value}' of '{phrase}' is unknown; known: {', '.join(permitted) or 'none'}"
+    return ""
+
 
 MAX_FILE_BYTES = 200_000
 ROW_NAME_BYTES = 48

@@ -14,8 +14,8 @@ from rack.backplane.message import Message
 from rack.levels.level import LevelContext, Pace
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.systems.joint_boards.arm_executor import JointTorques
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads
-from rack.levels.systems.joint_boards.joint_torques import JointTorques
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_TORQUE
 from tests.levels.arms import cell, config
 from tests.levels.servo.joint_rig import CLOCK_NS, JOINTS, JointRig

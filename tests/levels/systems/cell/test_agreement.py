@@ -13,9 +13,14 @@ from hypothesis import strategies as st
 from rack.backplane.message import Message
 from rack.levels.level import Reading, Verdict
 from rack.levels.messages import Error
-from rack.levels.systems.cell.agreement import ATTEMPTS, BEGUN, MAX_ATTEMPTS, Agreement
+from rack.levels.systems.cell.agreement import (
+    ATTEMPTS,
+    BEGUN,
+    MAX_ATTEMPTS,
+    Agreement,
+    TakenOrder,
+)
 from rack.levels.systems.cell.messages import CELL_PROGRESS, CELL_REPORT, OrderVerb, Phase, Response
-from rack.levels.systems.cell.taken import TakenOrder
 
 PROGRAM, ARMS = 7, ("puma", "k1607", "third")
 STEPS = (("puma", "k1607"), ("third",), ("k1607", "puma", "third"))
