@@ -159,11 +159,8 @@ class HandExecutor(Executor):
         """Fill the status."""
         hand = self.hand
         status.tick = tick
-        status.position = sample.position
-        status.velocity = sample.velocity
-        status.torque = sample.torque
-        status.tension = sample.tension
-        status.force = sample.force
+        for name, value in sample._asdict().items():
+            setattr(status, name, value)
         status.wanted = hand.wanted
         closed = bool(self._waiting)
         status.holding = closed

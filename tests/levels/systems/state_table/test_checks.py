@@ -15,62 +15,63 @@ from rack.levels.systems.state_table.checks import flaws, without
 from rack.levels.systems.state_table.table import RowConfig, StateTable, TableError, read_table
 from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, found, table, written
 
+MOVES = 'when = { place = "between", late = "no" }'
+ARRIVED = 'when = { place = ["open", "shut"] }'
+JAMS = 'when = { place = "between", late = "yes" }'
+DRIVE = 'do = ["take", "drive slowly"]'
+TAKE = 'next = "moving"\ndo = ["take"'
+STATES = "idle, executing, done, error, holding"
 MISTAKES = {
     "unknown condition": (
-        'when = { place = "between", late = "no" }',
-        'when = { plaice = "between", late = "no" }',
+        MOVES,
+        MOVES.replace("place", "plaice"),
         "row 4 'moves': when: unknown condition 'plaice'; known: lock, place, late, command, new",
     ),
     "unknown value": (
-        'when = { place = "between", late = "no" }',
-        'when = { place = "ajar", late = "no" }',
+        MOVES,
+        MOVES.replace("between", "ajar"),
         "row 4 'moves': when: place is never 'ajar'; its values: open, between, shut",
     ),
     "no value": (
-        'when = { place = "between", late = "no" }',
-        'when = { place = [], late = "no" }',
+        MOVES,
+        MOVES.replace('"between"', "[]"),
         "row 4 'moves': when: place has an empty list; its values: open, between, shut",
     ),
     "unknown action": (
-        'do = ["take", "drive slowly"]',
+        DRIVE,
         'do = ["take", "fly"]',
         "row 1 'open it': do: unknown 'fly'; known: drive, take",
     ),
     "unknown parameter": (
-        'do = ["take", "drive slowly"]',
+        DRIVE,
         'do = ["drive gently"]',
         "row 1 'open it': do: 'gently' of 'drive gently' is unknown; known: slowly, fast, stop",
     ),
     "missing parameter": (
-        'do = ["take", "drive slowly"]',
+        DRIVE,
         'do = ["drive"]',
         "row 1 'open it': do: 'drive' has 0 parameters; 'drive' takes 1",
     ),
     "missing next": (
-        'next = "moving"\ndo = ["take"',
+        TAKE,
         'do = ["take"',
         "row 1 'open it': next: missing; next state, or same",
     ),
     "missing do": (
-        'do = ["take", "drive slowly"]\n',
+        DRIVE + "\n",
         "",
-        (
-            "row 1 'open it': do: missing; actions with their parameters, in order; may be an empty"
-            " list"
-        ),
+        "row 1 'open it': do: missing; actions with their parameters, in order; may be an empty"
+        " list",
     ),
     "missing status": (
-        'do = ["take", "drive slowly"]\nstatus = "executing"\n',
-        'do = ["take", "drive slowly"]\n',
-        (
-            "row 1 'open it': status: missing; state shown upwards: idle, executing, done, error,"
-            " holding"
-        ),
+        f'{DRIVE}\nstatus = "executing"\n',
+        DRIVE + "\n",
+        f"row 1 'open it': status: missing; state shown upwards: {STATES}",
     ),
     "unknown status": (
         'status = "done"',
         'status = "finished"',
-        "row 5 'arrived': status: unknown 'finished'; known: idle, executing, done, error, holding",
+        f"row 5 'arrived': status: unknown 'finished'; known: {STATES}",
     ),
     "missing reason": (
         'reason = "the door jams"\n',
@@ -83,13 +84,13 @@ MISTAKES = {
         "row 5 'arrived': reason: status done shows none; statuses that do: error, holding",
     ),
     "unknown next state": (
-        'next = "moving"\ndo = ["take"',
-        'next = "ajar"\ndo = ["take"',
+        TAKE,
+        TAKE.replace("moving", "ajar"),
         "row 1 'open it': next: no row has the state 'ajar'; states: shut, moving",
     ),
     "unreachable state": (
-        'next = "moving"\ndo = ["take"',
-        'next = "shut"\ndo = ["take"',
+        TAKE,
+        TAKE.replace("moving", "shut"),
         "row 4, 5, 6: unreachable: no row leads from 'shut' to the state 'moving'",
     ),
     "unknown start": (
@@ -98,20 +99,18 @@ MISTAKES = {
         "start: no row has the state 'ajar'; states: shut, moving",
     ),
     "overlap": (
-        'when = { place = ["open", "shut"] }',
+        ARRIVED,
         "when = { }",
-        (
-            "row 5 'arrived': overlaps row 4 'moves' in 'moving' when place = between, late = no; "
-            "let them exclude each other, or give the later one else = true"
-        ),
+        "row 5 'arrived': overlaps row 4 'moves' in 'moving' when place = between, late = no; let"
+        " them exclude each other, or give the later one else = true",
     ),
     "hole": (
-        'when = { place = "between", late = "yes" }',
-        'when = { place = "between", late = "yes", lock = "free" }',
+        JAMS,
+        JAMS.replace('"yes"', '"yes", lock = "free"'),
         "hole: no row of 'moving' takes lock = locked|stuck, place = between, late = yes",
     ),
     "row that never fires": (
-        'when = { place = ["open", "shut"] }',
+        ARRIVED,
         'when = { place = ["between"], late = "no" }\nelse = true',
         "row 5 'arrived': never fires in 'moving': the rows above it take every case of it",
     ),
@@ -120,16 +119,8 @@ MISTAKES = {
         'status = "idle"\nspeed = 3',
         "row 3: speed: unknown key; known: name, state",
     ),
-    "unknown key of the plan": (
-        "width = 0.9",
-        "height = 0.9",
-        "plan: height: unknown key; known: width",
-    ),
-    "value of the plan": (
-        "width = 0.9",
-        "width = -1.0",
-        "plan: width: '-1.0': input should be greater than 0",
-    ),
+    "unknown key of the plan": ("width", "height", "plan: height: unknown key; known: width"),
+    "value of the plan": ("0.9", "-1.0", "plan: width: '-1.0': input should be greater than 0"),
 }
 
 
