@@ -19,10 +19,10 @@ from rack.levels.operator import BELOW_LOST, HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
-from rack.levels.systems.hand import joint_law, tendon_law
+from rack.levels.systems.hand import laws
 from rack.levels.systems.hand.fingertip_law import FingertipGains, FingertipLaw
-from rack.levels.systems.hand.joint_law import JointGains, JointLaw
 from rack.levels.systems.hand.kinematics import FingerKinematics
+from rack.levels.systems.hand.laws import JointGains, JointLaw, TendonGains, TendonLaw
 from rack.levels.systems.hand.messages import (
     FINGER_STATUS,
     FINGER_TARGET,
@@ -32,7 +32,6 @@ from rack.levels.systems.hand.messages import (
     TENDON_TORQUE,
     TENSION_COMMAND,
 )
-from rack.levels.systems.hand.tendon_law import TendonGains, TendonLaw
 from rack.levels.tables import read_params
 
 NO_HAND_YET = "no status of the hand yet: waiting for its board"
@@ -236,7 +235,7 @@ class JointLoop(HandLoop):
     }
     outputs = {"command": TENDON_TORQUE, "status": LOOP_STATUS}
     params = JointGains
-    preloads = (dynamics, joint_law)
+    preloads = (dynamics, laws)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -271,7 +270,7 @@ class TendonLoop(HandLoop):
     }
     outputs = {"command": TENSION_COMMAND, "status": LOOP_STATUS}
     params = TendonGains
-    preloads = (tendon_law,)
+    preloads = (laws,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -315,7 +314,7 @@ class FingerExecutor(HandLoop):
     }
     outputs = {"command": TENSION_COMMAND, "status": FINGER_STATUS}
     params = FingerParams
-    preloads = (dynamics, joint_law, tendon_law)
+    preloads = (dynamics, laws)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

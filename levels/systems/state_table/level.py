@@ -41,7 +41,6 @@ from rack.levels.systems.state_table.table import (
     TAKE,
     Lexicon,
     Name,
-    NoPlan,
     Phrases,
     RowConfig,
     StateTable,
@@ -97,7 +96,7 @@ def vocabulary(
     conditions: Mapping[str, Values],
     actions: Phrases,
     commands: Phrases | None = None,
-    plan: type[Table] = NoPlan,
+    plan: type[Table] = Table,
 ) -> Vocabulary:
     """Return the vocabulary of a level: its own words and, if it accepts commands, those that come
     with them."""

@@ -62,10 +62,6 @@ Lexicon = Mapping[str, Sequence[str]]
 """Sets of words that depend on scene and plan, by name: "object" -> the objects of the scene."""
 
 
-class NoPlan(Table):
-    """The `[plan]` of a level that has none."""
-
-
 @dataclass(frozen=True)
 class Vocabulary:
     """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file
@@ -74,7 +70,7 @@ class Vocabulary:
     conditions: Mapping[str, Values]
     commands: Phrases
     actions: Phrases
-    plan: type[Table] = NoPlan
+    plan: type[Table] = Table
 
 
 def phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
@@ -210,7 +206,7 @@ class StateTable:
                 return number, row
         case = ", ".join(f"{name} = {value}" for name, value in values.items())
         reason = f"no row of '{state}' takes {case}"
-        return 0, RowConfig.model_construct(name="", next=state, reason=reason)
+        return 0, RowConfig.model_construct(name="", state=(state,), next=state, reason=reason)
 
 
 def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:

@@ -153,7 +153,7 @@ class RequestWork:
     def _lasts_s(self, request: Message) -> float:
         if request.kind == MotionKind.GRIP and not request.segment:
             return self._tools.params.gripping
-        return request.segment
+        return float(request.segment)
 
     def _consider(self, request: Message) -> None:
         """Begin `request` if its time has come: nothing is under way, or the leg under way is to be

@@ -9,8 +9,8 @@ import pytest
 
 from rack.levels.algebra import Array, mat_vec
 from rack.levels.errors import LevelError
-from rack.levels.systems.hand.grasp_planner import GraspPlanner, GraspRules, PlannedGrasp
 from rack.levels.systems.hand.kinematics import FingerKinematics
+from rack.levels.systems.hand.workstation import GraspPlanner, GraspRules, PlannedGrasp
 from tests.levels.arms import cell
 
 HAND = cell("utah_mit")

@@ -12,8 +12,8 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
+from rack.levels.systems.hand.laws import TendonGains, TendonLaw
 from rack.levels.systems.hand.messages import HAND_STATUS
-from rack.levels.systems.hand.tendon_law import TendonGains, TendonLaw
 from tests.levels.arms import cell, config
 
 EVERY, TICK_NS, LAG_S, SUBSTEPS = 4, 500_000, 0.008, 8

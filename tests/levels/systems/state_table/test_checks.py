@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rack.levels.systems.state_table.checks import flaws, without
@@ -216,6 +216,7 @@ def row_config(number: int, when: dict[str, set[str]], otherwise: bool) -> RowCo
 
 
 @pytest.mark.slow
+@settings(deadline=None)
 @given(st.lists(st.tuples(CONDITIONS, st.booleans()), min_size=1, max_size=7))
 def test_a_table_passes_exactly_if_one_row_fires_in_every_case(
     rows: list[tuple[dict[str, set[str]], bool]],
@@ -242,6 +243,7 @@ BOXES = st.fixed_dictionaries(
 )
 
 
+@settings(deadline=None)
 @given(BOXES, BOXES)
 def test_what_is_left_of_a_box_is_all_that_is_not_taken(
     box: dict[str, frozenset[str]], taken: dict[str, frozenset[str]]
