@@ -272,18 +272,12 @@ def test_promise_that_expires_is_asked_for_so_many_times(
     assert not any(arm.stopped for arm in play.arms.values())
 
 
-def test_order_that_was_never_promised_fails() -> None:
-    arm = PlayedArm()
-    answer = arm.cycle((3000, OrderVerb.DO, ""), 1.0)
-    assert (answer.value.response, answer.value.reason) == (
-        Response.FAILED,
-        "told to do what it has not promised: its rack was launched anew",
-    )
-
-
-def test_order_that_is_to_be_done_before_it_was_promised_fails() -> None:
+@pytest.mark.parametrize(
+    "said", [[OrderVerb.DO], [OrderVerb.ASK, OrderVerb.DO]], ids=["never", "not yet"]
+)
+def test_order_that_was_not_promised_fails(said: list[OrderVerb]) -> None:
     taken = TakenOrder()
-    taken.hear(PROGRAM, 3000, OrderVerb.ASK)
-    taken.hear(PROGRAM, 3000, OrderVerb.DO)
+    for what in said:
+        taken.hear(PROGRAM, 3000, what)
     assert (taken.response, taken.error) == (Response.FAILED, Error.GIVEN_UP)
-    assert taken.reason.startswith("told to do what it has not promised")
+    assert taken.reason == "told to do what it has not promised: its rack was launched anew"
