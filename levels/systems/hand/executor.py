@@ -78,7 +78,7 @@ class HandExecutor(Executor):
         if hand is None:
             yield (
                 "executor",
-                f"{cls.__module__}:{cls.__name__}",
+                cls.__name__,
                 "this board drives a hand; [robot.hand] is missing",
             )
             return

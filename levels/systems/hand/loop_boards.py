@@ -20,9 +20,15 @@ from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand import laws
-from rack.levels.systems.hand.fingertip_law import FingertipGains, FingertipLaw
 from rack.levels.systems.hand.kinematics import FingerKinematics
-from rack.levels.systems.hand.laws import JointGains, JointLaw, TendonGains, TendonLaw
+from rack.levels.systems.hand.laws import (
+    FingertipGains,
+    FingertipLaw,
+    JointGains,
+    JointLaw,
+    TendonGains,
+    TendonLaw,
+)
 from rack.levels.systems.hand.messages import (
     FINGER_STATUS,
     FINGER_TARGET,
