@@ -13,10 +13,9 @@ from rack.levels.level import Finding, Input, LevelContext, Ports
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Reaction
-from rack.levels.systems.force.contact import HALVES
+from rack.levels.systems.force.contact import HALVES, WristLevel
 from rack.levels.systems.force.contact_wrench import ContactWrench
 from rack.levels.systems.force.messages import WRENCH
-from rack.levels.systems.force.wrist_level import WristLevel
 from rack.levels.systems.joint_boards import ArmExecutor
 from rack.levels.tables import read_params
 

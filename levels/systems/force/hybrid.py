@@ -15,10 +15,9 @@ from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import curves, reference
 from rack.levels.servo.reference import Reference
-from rack.levels.systems.force.contact import AXIS_NAMES, HALVES
+from rack.levels.systems.force.contact import AXIS_NAMES, HALVES, WristLevel
 from rack.levels.systems.force.hybrid_law import ForceTask, HybridGains, HybridLaw, turned
 from rack.levels.systems.force.messages import AXES, COMPLIANCE, FORCE_STATUS, WRENCH
-from rack.levels.systems.force.wrist_level import WristLevel
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.tables import read_params

@@ -10,7 +10,14 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.level import Input, LevelContext, Output, Ports
 from rack.levels.messages import Error
-from rack.levels.systems.force.contact import AXIS_NAMES, UNITS, Contact, Wanted, misfit
+from rack.levels.systems.force.contact import (
+    AXIS_NAMES,
+    UNITS,
+    Contact,
+    Wanted,
+    WristLevel,
+    misfit,
+)
 from rack.levels.systems.force.messages import (
     COMPLIANCE,
     FORCE_STATUS,
@@ -19,7 +26,6 @@ from rack.levels.systems.force.messages import (
     SERVER_STATUS,
     Mode,
 )
-from rack.levels.systems.force.wrist_level import WristLevel
 from rack.levels.systems.trajectory import TrajectoryExecutor
 from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd

@@ -20,7 +20,7 @@ from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
-from rack.levels.systems.trajectory.goal import WorldSight
+from rack.levels.systems.trajectory.legs import WorldSight
 from rack.levels.systems.trajectory.messages import (
     MOTION_REQUEST,
     MOTION_STATE,

@@ -12,8 +12,15 @@ from rack.levels.messages import Error
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES
-from rack.levels.systems.trajectory.goal import ToolGoal, Unfit, WorldSight
-from rack.levels.systems.trajectory.legs import JointLeg, Leg, Times, ToolLeg
+from rack.levels.systems.trajectory.legs import (
+    JointLeg,
+    Leg,
+    Times,
+    ToolGoal,
+    ToolLeg,
+    Unfit,
+    WorldSight,
+)
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import MOTIONS, Agenda, misfit_of
