@@ -57,6 +57,7 @@ def test_both_arms_reach_the_place_between_them(arm: str) -> None:
     assert ik.solutions(pose(HAND_OVER, pointing(DOWN, 0.0)).raised(0.1), found.home, free)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_the_k1607_with_its_hand_transfers_the_part() -> None:
     actions: list[dict[str, Any]] = [{"do": "transfer", "object": "part", "to": list(HAND_OVER)}]

@@ -57,28 +57,30 @@ at = {KILLED_S}
 """
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Recording]:
-    """Two runs of the rack."""
-    folder = tmp_path_factory.mktemp("hand")
+def ran(folder: Path) -> Recording:
     (folder / "hand.toml").write_text(RACK)
-    for run in ("first", "second"):
-        result = run_rack(load(folder / "hand.toml"), SECONDS, folder / run, Display())
-        assert result.recording == "complete"
-    return [Recording(folder / run) for run in ("first", "second")]
+    result = run_rack(load(folder / "hand.toml"), SECONDS, folder / "run", Display())
+    assert result.recording == "complete"
+    return Recording(folder / "run")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return ran(tmp_path_factory.mktemp("hand"))
+
+
+@pytest.mark.thorough
+@pytest.mark.slow
+def test_two_runs_have_one_digest(run: Recording, tmp_path: Path) -> None:
+    digest = report_of(run)["digest"]
+    assert digest is not None
+    assert report_of(ran(tmp_path))["digest"] == digest
 
 
 @pytest.mark.slow
-def test_two_runs_have_one_digest(runs: list[Recording]) -> None:
-    digests = {report_of(run)["digest"] for run in runs}
-    assert len(digests) == 1
-    assert None not in digests
-
-
-@pytest.mark.slow
-def test_restarted_board_goes_on_with_the_hand_as_it_was(runs: list[Recording]) -> None:
+def test_restarted_board_goes_on_with_the_hand_as_it_was(run: Recording) -> None:
     tick, position, stopped = (
-        runs[0].signal("hand.status", name) for name in ("tick", "position", "stopped")
+        run.signal("hand.status", name) for name in ("tick", "position", "stopped")
     )
     gap = int(np.diff(tick).argmax())
     assert tick[gap] * 5e-4 == pytest.approx(KILLED_S, abs=0.005)
@@ -91,8 +93,8 @@ def test_restarted_board_goes_on_with_the_hand_as_it_was(runs: list[Recording]) 
 
 
 @pytest.mark.slow
-def test_report_says_what_the_tendons_did(runs: list[Recording]) -> None:
-    hand = report_of(runs[0])["hand"]
+def test_report_says_what_the_tendons_did(run: Recording) -> None:
+    hand = report_of(run)["hand"]
     assert hand["violations"] == hand["touches"] == 0
     assert 2.0 <= hand["least_tension_n"] < 15.0 < hand["largest_tension_n"] <= 100.0
     assert hand["largest_force_n"].keys() == {"index", "middle", "ring", "thumb"}
@@ -100,8 +102,8 @@ def test_report_says_what_the_tendons_did(runs: list[Recording]) -> None:
 
 
 @pytest.mark.slow
-def test_recording_shows_tensions_and_joints_by_finger(runs: list[Recording]) -> None:
-    run, file = runs[0], runs[0].folder / "run.rrd"
+def test_recording_shows_tensions_and_joints_by_finger(run: Recording) -> None:
+    file = run.folder / "run.rrd"
     tension, wanted = run.signal("hand.status", "tension"), run.signal("hand.status", "wanted")
     rows = read(file, "/hand/ring/tensions")
     own = slice(8, 12)
@@ -113,8 +115,8 @@ def test_recording_shows_tensions_and_joints_by_finger(runs: list[Recording]) ->
 
 
 @pytest.mark.slow
-def test_recording_shows_a_push_as_an_arrow(runs: list[Recording]) -> None:
-    file = runs[0].folder / "run.rrd"
+def test_recording_shows_a_push_as_an_arrow(run: Recording) -> None:
+    file = run.folder / "run.rrd"
     vectors = read(file, "/cell/pushes", "Arrows3D:vectors")
     shown = [row for row in vectors.values if row is not None and len(row)]
     assert np.array(shown[0][0]) / PUSH_M == pytest.approx([0.3, 0.0, 0.5], abs=1e-3)

@@ -11,7 +11,6 @@ from rack.levels.systems.state_table.level import (
     StateTableExecutor,
     vocabulary,
 )
-from rack.levels.systems.state_table.vocabulary import Condition, Phrase
 
 COUNTER_STATUS = status(
     "counter_status", 1, *STATUS_HEAD, Field("count", "i8", "1", "where the counter is")
@@ -28,11 +27,11 @@ class Counter(StateTableExecutor):
     }
     outputs = {"status": COUNTER_STATUS}
     vocabulary = vocabulary(
-        conditions={"count": Condition(("low", "between", "high"), "where the counter is")},
-        commands={"reset": Phrase((("low", "high"),), "start from one end")},
+        conditions={"count": ("low", "between", "high")},
+        commands={"reset": (("low", "high"),)},
         actions={
-            "count": Phrase((("up", "down"),), "count one"),
-            "set": Phrase((), "go to the end that the command in force names"),
+            "count": (("up", "down"),),
+            "set": (),
         },
     )
     count = 0

@@ -2,15 +2,10 @@
 that gives them."""
 
 from rack.levels.systems.cell.coordinator import Coordinator
-from rack.levels.systems.cell.messages import CELL_ORDER, CELL_REPORT
 from rack.levels.systems.cell.ordered_task import OrderedTaskExecutor, OrderedTaskPlanner
-from rack.levels.systems.cell.program import CellProgram
 from rack.levels.systems.cell.sharing_executor import SharingServoExecutor
 
 __all__ = [
-    "CELL_ORDER",
-    "CELL_REPORT",
-    "CellProgram",
     "Coordinator",
     "OrderedTaskExecutor",
     "OrderedTaskPlanner",

@@ -18,6 +18,7 @@ from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
 from rack.levels.messages import TASK_PLAN, WORLD_MODEL, Error
 from rack.levels.peer import PEER, peer_port
 from rack.levels.systems.cell.actions import copy_action, read_action
+from rack.levels.systems.cell.agreement import TakenOrder
 from rack.levels.systems.cell.messages import (
     CELL_ORDER,
     CELL_REPORT,
@@ -25,7 +26,6 @@ from rack.levels.systems.cell.messages import (
     MailboxName,
     Response,
 )
-from rack.levels.systems.cell.taken import TakenOrder
 from rack.levels.tables import Positive, read_params
 from rack.levels.task.executor import TaskExecutor
 from rack.levels.task.planner import TaskPlanner

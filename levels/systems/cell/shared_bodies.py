@@ -16,7 +16,8 @@ that is launched anew takes over what the others know, its own claims of before 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -61,12 +62,14 @@ SHARED_BODIES = MessageType(
 )
 
 
-@dataclass(order=True)
-class Claim:
+class Claim(NamedTuple):
     """The claim to a body that stands: of two, the greater one."""
 
     number: int = 0
     owner: bytes = b""
+
+
+UNCLAIMED = Claim()
 
 
 @dataclass
@@ -75,7 +78,7 @@ class SharedBody:
 
     name: bytes
     rack: bytes
-    claim: Claim = field(default_factory=Claim)
+    claim: Claim = UNCLAIMED
     is_touched: bool = False
 
     @property

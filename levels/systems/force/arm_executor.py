@@ -13,11 +13,9 @@ from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Cause, Reaction
-from rack.levels.systems.force import contact_wrench
-from rack.levels.systems.force.contact import HALVES
+from rack.levels.systems.force.contact import HALVES, WristLevel
 from rack.levels.systems.force.contact_wrench import ContactWrench
 from rack.levels.systems.force.messages import WRENCH
-from rack.levels.systems.force.wrist_level import WristLevel
 from rack.levels.systems.joint_boards import ArmExecutor
 from rack.levels.tables import read_params
 
@@ -53,7 +51,6 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
     outputs = {**ArmExecutor.outputs, "wrench": WRENCH}
     params = ForceArmParams
-    preloads = (*ArmExecutor.preloads, contact_wrench)
 
     def __init__(self, context: LevelContext) -> None:
         params = read_params(ForceArmParams, context.params)

@@ -140,8 +140,6 @@ class ForceMotions(Motions):
     """Requests for forces and motions as calls. A call raises `LevelError` at once for a contact
     that is impossible."""
 
-    calls = (*Motions.calls, "comply", "guard", "free", "wrench", "mode")
-
     def __init__(self, bus: Bus, context: LevelContext) -> None:
         self._program = ForceProgram.model_validate(dict(context.task))
         self._sign_ticks = round(SIGN_S / context.tick_s)

@@ -1,5 +1,5 @@
 """The contact that requests have asked for: which axes of a task frame are of force, and what ends
-a motion."""
+a motion; and the base of the levels that need a wrist sensor for it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, Mask, norm
+from rack.levels.level import Executor, LevelContext, Misfits
 from rack.levels.systems.force.messages import AXES
 
 Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
@@ -135,3 +136,20 @@ def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) ->
                     f" {limit:g}"
                 )
     return ""
+
+
+class WristLevel(Executor):
+    """An executor for arms with a wrist sensor."""
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Misfits:
+        """Yield an arm without a wrist sensor, besides what any level of the kind finds."""
+        yield from super().misfits(context, above, below)
+        if context.robot.wrist is None:
+            yield (
+                "executor",
+                cls.__name__,
+                "it needs a wrist sensor: give the arm a table [robot.wrist]",
+            )

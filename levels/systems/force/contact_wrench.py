@@ -7,16 +7,18 @@ contact. So no mass is entered twice, and a tool with joints of its own needs no
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from rack.levels.algebra import Array
-from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.robot.engine import mj_jac, mj_rne_post_constraint, one_view
 from rack.levels.robot.wrist import Wrist
+from rack.levels.systems.force.hybrid_law import turned
 from rack.levels.systems.force.messages import AXES
+
+BY_AXIS = [0, 3, 1, 4, 2, 5]
+"""Components of a wrench in the order in which their torques are added up."""
 
 
 class ContactWrench:
@@ -24,35 +26,18 @@ class ContactWrench:
 
     def __init__(self, cell: Cell, wrist: Wrist, dynamics: Dynamics) -> None:
         """Use `dynamics` of the cell, the arm's: an evaluation at the same state costs nothing."""
+        self._cell = cell
+        self._site = wrist.site
         self._dynamics = dynamics
         self._range = np.repeat(wrist.range, 3)
-        joints = len(cell.dof)
-        self.raw = np.zeros(AXES)  # (6,), N, N m: as sensed, in the sensor's frame
-        self.wrench = np.zeros(
-            AXES
-        )  # (6,), N, N m: of the contact on the tool, at the tool, in the world's frame
-        self.torque = np.zeros(joints)  # (joints,), N m: of the contact on the joints
-        self.saturated = (
-            True  # the sample is at the end of the range, or NaN: the contact may be any stronger
-        )
-        model, data = dynamics.evaluated
-        body = int(model.site_bodyid[wrist.site])
-        root = int(model.body_rootid[model.site_bodyid[wrist.site]])
-        memory, begins = one_view(
-            data.qacc, data.cfrc_int, data.site_xpos, data.site_xmat, data.subtree_com
-        )
-        first = (0, AXES * body, 3 * wrist.site, 9 * wrist.site, 3 * root)
-        tool = int(begins[2]) + 3 * cell.tool
-        self._places = np.array((*(begins + first), tool, model.site_bodyid[cell.tool]))
-        self._fixed = (
-            model._address,
-            data._address,
-            self._places,
-            memory,
-            cell.dof,
-            np.zeros((2, 3, model.nv)),
-        )
-        self._set = set_contact.load()
+        self._jacobian = np.zeros((AXES, cell.model.nv))
+        # (6,), N, N m: as sensed, in the sensor's frame.
+        self.raw = np.zeros(AXES)
+        # (6,), N, N m: of the contact on the tool, at the tool, in the world's frame.
+        self.wrench = np.zeros(AXES)
+        self.torque = np.zeros(len(cell.dof))  # (joints,), N m: of the contact on the joints
+        # The sample is at the end of the range, or NaN: the contact may be any stronger.
+        self.saturated = True
 
     def take(self, raw: Array, state: Array, acceleration: Array) -> None:
         """Take a sample (6,), N, N m, at the state (2, joints), rad, rad/s, and the accelerations
@@ -62,60 +47,21 @@ class ContactWrench:
         if not np.isfinite(raw).all():
             return
         self._dynamics.terms(*state)
-        self._set(*self._fixed, raw, acceleration, self.wrench, self.torque)
-
-
-@compiled_for("i8, i8, i8[::1], f8[::1], i8[::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1], f8[::1]")
-def set_contact(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
-    model: int,
-    data: int,  # evaluated at the state
-    places: NDArray[
-        np.int64
-    ],  # in `memory`: accelerations, interaction force; sensor's place, frame; reference; tool
-    memory: Array,
-    dof: NDArray[np.int64],
-    jacobians: Array,  # (2, 3, nv)
-    raw: Array,
-    acceleration: Array,
-    wrench: Array,  # set
-    torque: Array,  # set
-) -> None:
-    """Set the wrench of a contact on the tool, and its torque on the joints."""
-    qacc, force, site, frame, centre, tool, body = places
-    for joint in range(len(dof)):
-        memory[qacc + dof[joint]] = acceleration[joint]
-    mj_rne_post_constraint(model, data)
-    # MuJoCo keeps torque before force, about the centre of the tree that the body belongs to.
-    for axis in range(3):
-        sensed = turning = 0.0
-        for k in range(3):
-            sensed += memory[frame + 3 * axis + k] * raw[k]
-            turning += memory[frame + 3 * axis + k] * raw[3 + k]
-        wrench[axis] = memory[force + 3 + axis] - sensed
-        one = (axis + 1) % 3
-        other = (axis + 2) % 3
-        arm_one = memory[site + one] - memory[centre + one]
-        arm_other = memory[site + other] - memory[centre + other]
-        expected = memory[force + axis] - (
-            arm_one * memory[force + 3 + other] - arm_other * memory[force + 3 + one]
-        )
-        wrench[3 + axis] = expected - turning
-    for axis in range(3):
-        one = (axis + 1) % 3
-        other = (axis + 2) % 3
-        arm_one = memory[site + one] - memory[tool + one]
-        arm_other = memory[site + other] - memory[tool + other]
-        wrench[3 + axis] += arm_one * wrench[other] - arm_other * wrench[one]
-    mj_jac(
-        model,
-        data,
-        jacobians[0].ctypes.data,
-        jacobians[1].ctypes.data,
-        memory[tool:].ctypes.data,
-        body,
-    )
-    for joint in range(len(dof)):
-        torque[joint] = 0.0
-        for axis in range(3):
-            torque[joint] += jacobians[0, axis, dof[joint]] * wrench[axis]
-            torque[joint] += jacobians[1, axis, dof[joint]] * wrench[3 + axis]
+        model, data = self._dynamics.evaluated
+        data.qacc[self._cell.dof] = acceleration
+        mujoco.mj_rnePostConstraint(model, data)
+        body = model.site_bodyid[self._site]
+        place = data.site_xpos[self._site]
+        # MuJoCo keeps torque before force, about the centre of the tree that the body belongs to.
+        inner = data.cfrc_int[body]
+        expected = np.concatenate((inner[3:], inner[:3]))
+        moment = np.zeros(3)
+        mujoco.mju_cross(moment, place - data.subtree_com[model.body_rootid[body]], expected[:3])
+        expected[3:] -= moment
+        self.wrench[:] = expected - turned(data.site_xmat[self._site].reshape(3, 3), raw)
+        mujoco.mju_cross(moment, place - data.site_xpos[self._cell.tool], self.wrench[:3])
+        self.wrench[3:] += moment
+        jacobian = self._jacobian
+        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], self._cell.tool)
+        torques = jacobian[:, self._cell.dof] * self.wrench[:, None]
+        self.torque[:] = torques[BY_AXIS].sum(axis=0)

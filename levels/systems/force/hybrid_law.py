@@ -111,23 +111,18 @@ class HybridLaw:
         self._smoothing_s = gains.smoothing
         self._there = ToolKinematics(cell)
         self._here = ToolKinematics(cell)
-        self._away = np.zeros(joints)  # dq
-        self._speed = np.zeros(joints)  # its velocity
-        self._base = np.zeros(joints)  # dq of a motion without force
-        self._forward = np.zeros(AXES)  # N, N m: fed forward, in the world's frame
-        self._forced = np.zeros(AXES)  # m/s, rad/s: on the axes of force, in the task frame
+        self._by_joint = np.zeros((3, joints))
+        # dq, its velocity, and dq of a motion without force.
+        self._away, self._speed, self._base = self._by_joint
+        self._by_axis = np.zeros((2, AXES))
+        # N, N m: fed forward, in the world's frame; m/s, rad/s: on the axes of force, in the task
+        # frame.
+        self._forward, self._forced = self._by_axis
         self.offset = np.zeros(3)  # (3,), m: from where the motion alone would have the tool
 
     def begin(self) -> None:
         """Begin without a difference from the motion, at rest."""
-        for numbers in (
-            self._away,
-            self._speed,
-            self._base,
-            self._forward,
-            self._forced,
-            self.offset,
-        ):
+        for numbers in (self._by_joint, self._by_axis, self.offset):
             numbers[:] = 0.0
 
     @property

@@ -4,7 +4,6 @@ them."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -68,7 +67,6 @@ class HandExecutor(Executor):
         self._waiting = ""  # why the boards above do not drive the hand; empty: they do
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
         self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
-        self._shown: tuple[Any, ...] = ()  # what seldom changes, in the last status
 
     @classmethod
     def misfits(
@@ -80,7 +78,7 @@ class HandExecutor(Executor):
         if hand is None:
             yield (
                 "executor",
-                f"{cls.__module__}:{cls.__name__}",
+                cls.__name__,
                 "this board drives a hand; [robot.hand] is missing",
             )
             return
@@ -158,20 +156,12 @@ class HandExecutor(Executor):
             self.hand.pull(self.tensions.tension)
 
     def _report(self, status: Message, sample: HandSample, tick: int) -> None:
-        """Fill the status; the fields that seldom change only when they do."""
+        """Fill the status."""
         hand = self.hand
         status.tick = tick
-        status.position = sample.position
-        status.velocity = sample.velocity
-        status.torque = sample.torque
-        status.tension = sample.tension
-        status.force = sample.force
+        for name, value in sample._asdict().items():
+            setattr(status, name, value)
         status.wanted = hand.wanted
-        counts = hand.clipped, hand.touches, hand.violations, hand.pushed
-        shown = self._waiting, self._opened, self.demand, counts, hand.fault, self._slack.note
-        if shown == self._shown:
-            return
-        self._shown = shown
         closed = bool(self._waiting)
         status.holding = closed
         status.stopped = closed and self._opened

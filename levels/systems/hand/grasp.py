@@ -16,7 +16,6 @@ from rack.levels.messages import WORLD_MODEL, Error
 from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import cell_of
-from rack.levels.systems.hand.fingers_below import FingersBelow
 from rack.levels.systems.hand.grasp_program import (
     CloseStep,
     GraspProgram,
@@ -26,7 +25,7 @@ from rack.levels.systems.hand.grasp_program import (
     SqueezeStep,
     Step,
 )
-from rack.levels.systems.hand.grasp_steps import WORKS, Grasp, GraspParams, StepWork
+from rack.levels.systems.hand.grasp_steps import WORKS, FingersBelow, Grasp, GraspParams, StepWork
 from rack.levels.systems.hand.grip import HandGrip
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import (

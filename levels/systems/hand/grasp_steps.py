@@ -9,17 +9,18 @@ failed.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.levels.algebra import Array, Mask, norm
+from rack.levels.algebra import Array, Ints, Mask, norm
 from rack.levels.errors import Refused
+from rack.levels.level import LevelContext, Reading
 from rack.levels.messages import Error
 from rack.levels.planning.pose import Pose
-from rack.levels.systems.hand.fingers_below import FingersBelow
 from rack.levels.systems.hand.grasp_program import (
     CloseStep,
     HoldStep,
@@ -34,6 +35,44 @@ from rack.levels.tables import Positive, Table
 
 SLIPPED_PART = 0.2
 """Part of the force at which a tip touched, below which it touches no more."""
+
+
+class FingersBelow:
+    """Merges `FINGER_STATUS`es; each board fills what is its own. Points and forces are in the
+    frame of the palm."""
+
+    def __init__(self, context: LevelContext, fingers: Sequence[Ints]) -> None:
+        """`fingers` are the joints of each finger, as indices of `robot.joints`."""
+        self._joints = fingers
+        joints = context.sizes["joints"]
+        count = len(fingers)
+        self.position = np.zeros(joints)  # (joints,), rad: as sensed
+        self.target = np.zeros(joints)  # (joints,), rad: wanted by the loops below
+        self.tip = np.zeros((count, 3))  # m
+        self.force = np.zeros((count, 3))  # N: of the surroundings on the tips
+        self.awaited = ""  # why the fingers do not follow; empty: they do
+        self.error = Error.NONE  # of the hand
+        self.rests_on = 0  # newest command of an operator that all boards rest on
+
+    def look(self, statuses: Mapping[str, Reading]) -> None:
+        """Read the statuses of all boards."""
+        self.awaited = ""
+        self.error = Error.NONE
+        for board, reading in statuses.items():
+            status = reading.value
+            if reading.is_lost or not reading.is_there:
+                self.awaited = f"no status from '{board}': waiting for its board"
+                continue
+            if status.stopped and not self.awaited:
+                self.awaited = f"{board}: {status.reason or 'it does not follow'}"
+            self.error = self.error or Error(status.error)
+            for finger in np.flatnonzero(status.driven).tolist():
+                own = self._joints[finger]
+                self.position[own] = status.position[own]
+                self.target[own] = status.target[own]
+                self.tip[finger] = status.tip[finger]
+                self.force[finger] = status.force[finger]
+        self.rests_on = min(reading.value.operator for reading in statuses.values())
 
 
 class GraspParams(GripGains):

@@ -7,19 +7,28 @@ the joint loop these into torques, and the tendon loop these into tensions.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
 
-from rack.backplane.message import Message
-from rack.levels.level import Input, LevelContext, Misfits, Ports
-from rack.levels.operator import OPERATOR_COMMAND
+from rack.backplane.message import Message, State
+from rack.levels.algebra import Mask
+from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
+from rack.levels.operator import BELOW_LOST, HOLDABLE, OPERATOR_COMMAND, Orders
 from rack.levels.robot import dynamics
-from rack.levels.systems.hand import joint_law, tendon_law
-from rack.levels.systems.hand.fingertip_law import FingertipGains, FingertipLaw
-from rack.levels.systems.hand.joint_law import JointGains, JointLaw
+from rack.levels.robot.cell import cell_of
+from rack.levels.robot.hand import Hand
+from rack.levels.systems.hand import laws
 from rack.levels.systems.hand.kinematics import FingerKinematics
-from rack.levels.systems.hand.loop import HandLoop
+from rack.levels.systems.hand.laws import (
+    FingertipGains,
+    FingertipLaw,
+    JointGains,
+    JointLaw,
+    TendonGains,
+    TendonLaw,
+)
 from rack.levels.systems.hand.messages import (
     FINGER_STATUS,
     FINGER_TARGET,
@@ -29,8 +38,158 @@ from rack.levels.systems.hand.messages import (
     TENDON_TORQUE,
     TENSION_COMMAND,
 )
-from rack.levels.systems.hand.tendon_law import TendonGains, TendonLaw
 from rack.levels.tables import read_params
+
+NO_HAND_YET = "no status of the hand yet: waiting for its board"
+HAND_LOST = "no status of the hand: what was commanded last is kept"
+
+
+class HandLoop(Executor):
+    """A loop between the level above and the hand: follows the newest command, at the state that
+    the hand has sensed.
+
+    Without a fresh command it keeps what was commanded last, at rest: what the hand holds, it goes
+    on holding. So it does on an operator's hold. A command that is not finite is not taken. A
+    subclass has the ports "command", "hand", "operator" and, unless the hand is below it, "below".
+    """
+
+    commands = HOLDABLE
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self.cell = cell_of(context)
+        assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
+        self.hand: Hand = self.cell.hand
+        self.orders = Orders(self.commands)
+        command = self.inputs["command"].type
+        self.command = Message(command.dtype(context.sizes))  # that is followed
+        # Names of its fields that must be finite.
+        self._numbers = [field.name for field in command.fields if field.kind == "f8"]
+        self.commanded = False  # there was one
+        # (joints,) or (fingers,), as in the status: those of this board.
+        self.driven: Mask
+        self._above = ", ".join(context.above)
+        self._period = max(pace.every for pace in context.above.values())
+        slowest = max(context.every, *(pace.every for pace in context.below.values()))
+        # Ticks, of a status of the hand.
+        self._oldest = slowest + self.cell.patience.ticks(slowest, context.tick_s)
+        self._taken = 0  # tick at which `command` came
+        self._rejected = ""  # why the newest command is not followed
+        self._held = False  # by an operator, in the last cycle
+        self._met = False  # a status of the hand has come
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Misfits:
+        """Yield a robot that has no hand, and a lack of neighbours."""
+        if context.robot.hand is None:
+            yield "executor", cls.__name__, "it drives a hand; there is no [robot.hand]"
+        for place, boards in (("above", above), ("below", below)):
+            if not boards:
+                yield place, [], "it needs a board there"
+
+    @abstractmethod
+    def meet(self, read: Ports, hand: Message) -> None:
+        """Begin with the first `HAND_STATUS`, or continue from the level's own last messages."""
+
+    @abstractmethod
+    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+        """Write the level's command for `self.command`, and what its status says of fingers or
+        joints."""
+
+    def process(self, read: Ports, write: Ports, tick: int) -> None:
+        """Follow the newest command, and report."""
+        hand: Reading = read.hand
+        self.orders.take(read.operator)
+        if not self._met:
+            if not hand.is_there:
+                status = write.status
+                status.driven = self.driven
+                status.sensed = -1
+                status.holding = True
+                status.stopped = True
+                status.reason = NO_HAND_YET
+                return
+            self._met = True
+            self.meet(read, hand.value)
+        self._take(read.command, tick)
+        kept = self._kept(read, tick)
+        self.follow(hand.value, write, tick)
+        write.command.id += 1
+        write.command.operator = self.orders.rests_on(self.command.operator)
+        self._report(read, write.status, kept)
+        self.orders.report(write.status, self.command.operator)
+
+    def age_s(self, hand: Message, tick: int) -> float:
+        """Return how old the sample of a `HAND_STATUS` is when what this cycle commands acts, s."""
+        return float(
+            (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
+        )
+
+    def ahead_s(self, tick: int) -> float:
+        """Return the time by which the command is to be taken on at its velocities, s: a cycle of
+        the level above."""
+        return min(tick - self._taken, self._period) * self.context.tick_s
+
+    def _take(self, command: Reading, tick: int) -> None:
+        """Follow what is new, unless an operator holds the loop."""
+        released = self._held
+        self._held = self.orders.holds
+        if self._held:
+            for name in self._numbers:
+                if name.endswith("velocity"):  # what is commanded is kept at rest
+                    setattr(self.command, name, 0.0)
+            self.orders.done()
+        elif command.is_new or (released and command.is_there):
+            wrong = [
+                name
+                for name in self._numbers
+                if not np.isfinite(getattr(command.value, name)).all()
+            ]
+            self._rejected = (
+                f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""
+            )
+            if not wrong:
+                self.command.copy_from(command.value)
+                self.commanded = True
+                self._taken = tick
+
+    def _kept(self, read: Ports, tick: int) -> str:
+        """Return why the hand does not follow the level above; empty: it does."""
+        hand = read.hand.value
+        if read.hand.is_lost or tick - hand.tick > self._oldest:
+            return HAND_LOST
+        if hand.stopped:
+            return f"hand: {hand.reason}"
+        if "below" in self.inputs:
+            below = read.below
+            if below.is_lost or not below.is_there:
+                return BELOW_LOST
+            if below.value.stopped:
+                return str(below.value.reason)
+        return self.orders.keeps(self.context.board)
+
+    def _report(self, read: Ports, status: Message, kept: str) -> None:
+        """Fill the status."""
+        hand = read.hand.value
+        lost = self.commanded and read.command.is_lost
+        status.sensed = hand.tick
+        status.echo = self.command.id
+        note = kept or self._rejected
+        if lost and not note:
+            note = f"no command from '{self._above}': its last one is kept"
+        status.driven = self.driven
+        status.stopped = bool(kept)
+        status.holding = lost or not self.commanded
+        status.reason = note
+        status.error = hand.error
+        if hand.error:
+            status.state = State.ERROR
+        elif note and self.commanded:
+            status.state = State.HOLDING
+        else:
+            status.state = State.EXECUTING if self.commanded else State.IDLE
 
 
 class FingertipLoop(HandLoop):
@@ -82,7 +241,7 @@ class JointLoop(HandLoop):
     }
     outputs = {"command": TENDON_TORQUE, "status": LOOP_STATUS}
     params = JointGains
-    preloads = (dynamics, joint_law)
+    preloads = (dynamics, laws)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -93,11 +252,12 @@ class JointLoop(HandLoop):
         """Hold the joints where they are, until there are targets."""
         self.command.position = hand.position
         self.command.stiff = 1.0
-        self._law.start(hand, self.command)
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
         """Write the torques for the newest targets."""
-        self._law.torques(self.age_s(hand, tick), self.ahead_s(tick), write.command.torque)
+        self._law.torques(
+            hand, self.command, self.age_s(hand, tick), self.ahead_s(tick), write.command.torque
+        )
         write.command.sampled = hand.tick
         write.status.clipped = self._law.clipped
 
@@ -116,7 +276,7 @@ class TendonLoop(HandLoop):
     }
     outputs = {"command": TENSION_COMMAND, "status": LOOP_STATUS}
     params = TendonGains
-    preloads = (tendon_law,)
+    preloads = (laws,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -134,7 +294,7 @@ class TendonLoop(HandLoop):
         command.driven = self.driven
         command.sampled = min(hand.tick, self.command.sampled) if self.commanded else -1
         if command.sampled >= 0:
-            self._law.tensions(self.command.torque, command.tension)
+            self._law.tensions(hand, self.command.torque, command.tension)
         write.status.clipped = self._law.clipped
 
 
@@ -160,7 +320,7 @@ class FingerExecutor(HandLoop):
     }
     outputs = {"command": TENSION_COMMAND, "status": FINGER_STATUS}
     params = FingerParams
-    preloads = (dynamics, joint_law, tendon_law)
+    preloads = (dynamics, laws)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -195,13 +355,12 @@ class FingerExecutor(HandLoop):
         self._tendons.start(hand)
         self._target.position = hand.position
         self._target.stiff = 1.0
-        self._servo.start(hand, self._target)
 
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
         """Write the tensions of the finger's tendons."""
         follow_grasp(self, self._tip, hand, self._target, write.status, tick)
-        self._servo.torques(self.age_s(hand, tick), 0.0, self._torque)
-        self._tendons.tensions(self._torque, write.command.tension)
+        self._servo.torques(hand, self._target, self.age_s(hand, tick), 0.0, self._torque)
+        self._tendons.tensions(hand, self._torque, write.command.tension)
         write.command.driven = self._joints
         write.command.sampled = hand.tick
 

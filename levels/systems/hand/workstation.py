@@ -3,26 +3,199 @@
 It reads messages and sends plans through the bus adapter. No message carries the boards' cycle
 counts, so a prompt reads these from the crate's memory, word by word at their bus addresses. Boards
 may be writing them at that time, in lockstep too.
+
+A grasp: the tips of the hand take hold of the object, one finger opposed to all others.
+The fingers press along one line, from one side, the opposing finger from the other. Lines in all
+directions across the fingers' knuckles are tried. Rays give contacts on the object's surface,
+inverse kinematics the joints. A line is possible if all tips reach their contacts, and if the hand
+touches nothing before; of those the one counts whose joints are farthest from the ends of their
+ranges.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
+from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.backplane.words import Block
-from rack.levels.algebra import norm
+from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext
 from rack.levels.messages import WORLD_MODEL
-from rack.levels.robot.cell import cell_of
-from rack.levels.systems.hand.grasp_planner import GraspPlanner, GraspRules, PlannedGrasp
+from rack.levels.robot.cell import Cell, cell_of
+from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import GRASP_PLAN, GRASP_STATUS, GraspKind
-from rack.levels.tables import Positive, Table, read_params
+from rack.levels.tables import NotNegative, Positive, Table, read_params
+
+LINES = 72
+"""Directions tried."""
+STEPS = 60
+"""Most steps of inverse kinematics to a point."""
+STEP_M = 0.02
+"""Longest way of a tip in such a step."""
+REACHED_M = 0.001
+OUTSIDE_M = 0.2
+"""Distance from the object at which rays begin."""
+
+
+class GraspRules(Table):
+    """What a planned grasp is to be."""
+
+    pad: Positive = 0.009
+    """distance of a tip's site from the surface that the tip touches, m"""
+    clear: Positive = 0.02
+    """distance from the object at which tips begin to close, m"""
+    pull: NotNegative = 2.0
+    """force on the object, in addition to its weight, that friction must bear, N"""
+    reserve: Positive = Field(1.5, ge=1.0)
+    """by how much more it could bear"""
+
+
+@dataclass(frozen=True)
+class PlannedGrasp:
+    """A grasp. Points and directions are in the object's frame, a row for each finger."""
+
+    contact: Array  # (fingers, 3), m, on the surface
+    normal: Array  # (fingers, 3), directions of the tips' forces
+    posture: Array  # (joints,), rad, from which the fingers close
+    grip: float  # N, force of each finger but the opposing one
+    margin: float  # least distance of a joint from the ends of its range, in parts of the range
+
+
+class GraspPlanner:
+    """Plans for one hand; `opposing` is the finger that opposes all others. Raises `LevelError`
+    without one."""
+
+    def __init__(self, cell: Cell, opposing: str, rules: GraspRules) -> None:
+        assert cell.hand is not None, "a cell with a hand"
+        names = cell.hand.names
+        if opposing not in names:
+            raise LevelError(
+                f"params.opposing = {opposing}: the hand has no such finger; fingers:"
+                f" {', '.join(names)}"
+            )
+        self._cell = cell
+        self._rules = rules
+        self._kinematics = FingerKinematics(cell, cell.hand)
+        self._data = cell.start()
+        self._opposing = names.index(opposing)
+        first = [own[0] for own in self._kinematics.joints]
+        # (fingers, 3), m.
+        self._bases = self._data.xanchor[cell.model.dof_jntid[cell.dof[first]]].copy()
+
+    def plan(self, row: int, position: Array, quaternion: Array) -> PlannedGrasp | None:
+        """Return a grasp of the object in a row of the scene at a pose in the world; None if no
+        line is possible."""
+        address = self._cell.object_qpos[row]
+        self._data.qpos[address : address + 7] = *position, *quaternion
+        self._data.qpos[self._cell.qpos] = self._cell.home
+        mujoco.mj_kinematics(self._cell.model, self._data)
+        lines = (self._along(row, 2.0 * math.pi * number / LINES) for number in range(LINES))
+        grasps = [grasp for grasp in lines if grasp is not None]
+        return max(grasps, key=lambda grasp: grasp.margin, default=None)
+
+    def _along(self, row: int, angle: float) -> PlannedGrasp | None:
+        """Return the grasp along one line across the palm, if it is possible."""
+        across, _, out = self._kinematics.rotation.T
+        line = math.cos(angle) * across + math.sin(angle) * out
+        contact, normal = np.zeros((2, len(self._bases), 3))
+        for finger, base in enumerate(self._bases):
+            way = -line if finger != self._opposing else line
+            touched = self._touched(row, base, way)
+            if touched is None:
+                return None
+            contact[finger] = touched
+            normal[finger] = way
+        closed = self._reach(contact - self._rules.pad * normal, self._cell.home)
+        if closed is None:
+            return None
+        posture = self._reach(contact - self._rules.clear * normal, closed)
+        if posture is None or self._touches(posture):
+            return None
+        low, high = self._cell.limits.position.T
+        margin = float((np.minimum(closed - low, high - closed) / (high - low)).min())
+        body = self._cell.bodies[row]
+        turned = self._data.xmat[body].reshape(3, 3)
+        origin = self._data.xpos[body]
+        return PlannedGrasp(
+            contact=np.array([transposed_mat_vec(turned, point - origin) for point in contact]),
+            normal=np.array([transposed_mat_vec(turned, way) for way in normal]),
+            posture=posture,
+            grip=self._grip(row),
+            margin=margin,
+        )
+
+    def _touched(self, row: int, base: Array, way: Array) -> Array | None:
+        """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it
+        does not."""
+        model = self._cell.model
+        data = self._data
+        body = self._cell.bodies[row]
+        along = self._kinematics.rotation[:, 1]  # the knuckles' line
+        centre = data.xipos[body]
+        centre = centre + float(((base - centre) * along).sum()) * along
+        start = centre - OUTSIDE_M * way
+        nearest = math.inf
+        for geom in self._geoms(row):
+            if not model.geom_contype[geom]:
+                continue
+            size = model.geom_size[geom]
+            kind = int(model.geom_type[geom])
+            distance = mujoco.mju_rayGeom(
+                data.geom_xpos[geom], data.geom_xmat[geom], size, start, way, kind, None
+            )
+            if 0.0 <= distance < nearest:
+                nearest = distance
+        return None if nearest > OUTSIDE_M else start + nearest * way
+
+    def _geoms(self, row: int) -> Ints:
+        """Return the geoms of the object."""
+        return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
+
+    def _reach(self, tips: Array, start: Array) -> Array | None:
+        """Return joint positions, (joints,), rad, at which the tips are at points of the world,
+        (fingers, 3), m; sought from `start` on. None: there are none."""
+        kinematics = self._kinematics
+        position = start.copy()
+        wanted = [kinematics.from_world(point) for point in tips]
+        for _ in range(STEPS):
+            kinematics.look(position)
+            ways = [point - kinematics.tip(finger) for finger, point in enumerate(wanted)]
+            lengths = [norm(way) for way in ways]
+            if max(lengths) < REACHED_M:
+                return position
+            for finger, (way, length) in enumerate(zip(ways, lengths, strict=True)):
+                homing = np.zeros(len(kinematics.joints[finger]))
+                kinematics.step(finger, position, way * (STEP_M / max(length, STEP_M)), homing)
+        return None
+
+    def _touches(self, position: Array) -> bool:
+        """Return whether the hand touches anything at joint positions, also itself."""
+        model = self._cell.model
+        data = self._data
+        data.qpos[self._cell.qpos] = position
+        mujoco.mj_fwdPosition(model, data)
+        hand = np.isin(data.contact.geom, self._cell.gripper_geoms).any(axis=1)
+        return bool((hand & (data.contact.dist < 0.0)).any())
+
+    def _grip(self, row: int) -> float:
+        """Return the force of each finger, N, with which friction on both sides bears weight and
+        pull."""
+        model = self._cell.model
+        body = self._cell.bodies[row]
+        friction = float(model.geom_friction[self._geoms(row), 0].max())
+        weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)
+        load = self._rules.reserve * (weight + self._rules.pull)
+        return load / (2.0 * friction * (len(self._bases) - 1))
+
 
 MOVED_M = 0.003
 """Distance by which an object may move before a new plan is made."""

@@ -2,13 +2,12 @@
 to a level above."""
 
 from rack.levels.systems.joint_boards.arm_executor import ArmExecutor
-from rack.levels.systems.joint_boards.gateway import JointGateway
+from rack.levels.systems.joint_boards.gateway import JointGateway, NetworkGateway
 from rack.levels.systems.joint_boards.joint_servo import JointServo
 from rack.levels.systems.joint_boards.modified_from_afar import (
     ModificationSender,
     ModifiedFromAfar,
 )
-from rack.levels.systems.joint_boards.network_gateway import NetworkGateway
 
 __all__ = [
     "ArmExecutor",

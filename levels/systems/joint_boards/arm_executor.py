@@ -4,7 +4,6 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
@@ -12,21 +11,58 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
+from rack.levels.arm.above import CommandsAbove
 from rack.levels.level import Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import ARM_STATE
 from rack.levels.operator import DRIVES, HOLDABLE, OPERATOR_COMMAND, Orders
-from rack.levels.robot.dynamics import Terms
+from rack.levels.robot.cell import Cell
+from rack.levels.robot.dynamics import Payload, Terms
 from rack.levels.servo.control import ArmParams
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.driver import SCENES, ArmDriver, Course
+from rack.levels.servo.driver import SCENES, ArmDriver, Course, numbers
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
-from rack.levels.systems.joint_boards import joint_torques
-from rack.levels.systems.joint_boards.joint_torques import JointTorques
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_TORQUE
 from rack.levels.tables import read_params
 
 HELD = "held by the operator; `resume` releases it"
+
+
+class JointTorques(CommandsAbove):
+    """Adds up the `JOINT_TORQUE`s of the boards above; each is 0 for the joints of other boards."""
+
+    def __init__(self, context: LevelContext, cell: Cell) -> None:
+        super().__init__(context, cell.patience, 1, "torque", "braked")
+        joints = len(cell.home)
+        # The fields of a `JOINT_TORQUE` from `torque` to `payload_offset`.
+        self._sum = np.zeros(3 * joints + 5)
+        self.torque = self._sum[:joints]  # (joints,), N m
+        # Where the boards want the joints; accelerations are not known.
+        self.wanted = Motion(np.zeros((3, joints)))
+        self.moves = False  # a joint is wanted to move
+        self.rests_on = 0  # serial of the newest command of an operator that the torques rest on
+
+    @property
+    def grip_force(self) -> float:
+        """The gripper's force, N."""
+        return float(self._sum[-5])
+
+    @property
+    def payload(self) -> Payload:
+        """The mass in the gripper, as the boards know it."""
+        return Payload(float(self._sum[-4]), self._sum[-3:])
+
+    def add_up(self, commands: Mapping[str, Reading]) -> None:
+        """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""
+        self.rests_on = 0
+        self._sum[:] = 0.0
+        for board in self.oldest:
+            value = commands[board].value
+            self.rests_on = max(self.rests_on, value.operator)
+            self._sum += numbers(value, "torque", "payload_offset")
+        joints = len(self.torque)
+        self.wanted.table[:2] = self._sum[joints : 3 * joints].reshape(2, joints)
+        self.moves = bool(self.wanted.velocity.any())
 
 
 class ArmExecutor(ArmDriver):
@@ -46,7 +82,6 @@ class ArmExecutor(ArmDriver):
     outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
     commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
-    preloads: ClassVar[tuple[ModuleType, ...]] = (joint_torques,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context, read_params(self.params, context.params))
@@ -114,7 +149,7 @@ class ArmExecutor(ArmDriver):
         self._waiting = self.joints.missing(self._torques, tick, self._braked_at or 0)
         if self._waiting:
             return None
-        self.joints.add_up()
+        self.joints.add_up(self._torques)
         self.rests_on = self.joints.rests_on
         if self.abandoned and self._is_astray():
             return None

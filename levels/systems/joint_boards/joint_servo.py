@@ -102,7 +102,6 @@ class JointServo(Executor):
         self._offered: Message | None = None  # reference whose loads are not yet taken
         self._command = self._rests_on = self._due = 0
         self._refused = ""  # why the newest reference was not taken
-        self._shown: tuple[Any, ...] = ()  # in the last status
         self._met = False  # a status of the arm has come
 
     @classmethod
@@ -243,7 +242,7 @@ class JointServo(Executor):
                 write.command.payload_offset = command.payload_offset
 
     def _report(self, status: Message, arm: Message, away: bool, stopped: bool) -> None:
-        """Fill the steady fields of the status when they change."""
+        """Fill what the law has not set in the status."""
         operator = self.operator
         holding = self.reference.holding
         kept = operator.reason
@@ -254,13 +253,13 @@ class JointServo(Executor):
             kept = f"arm: {arm.reason}"
             if arm.state == State.ERROR:
                 error = Error(arm.error)
-        note = kept or self._refused or self._modified.reason
-        shown = self._command, holding, stopped or operator.stands, self._due, note, error
-        if shown == self._shown:
-            return
-        self._shown = shown
         status.driven = self._driven
-        status.echo, status.holding, status.stopped, status.due, status.reason, status.error = shown
+        status.echo = self._command
+        status.holding = holding
+        status.stopped = stopped or operator.stands
+        status.due = self._due
+        status.reason = kept or self._refused or self._modified.reason
+        status.error = error
         if error:
             status.state = State.ERROR
         else:

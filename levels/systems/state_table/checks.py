@@ -9,9 +9,17 @@ most as many boxes as it has conditions.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 
-from rack.levels.systems.state_table.table import SAME, STATES, RowConfig, StateTable
-from rack.levels.systems.state_table.vocabulary import Lexicon, Vocabulary, objection
+from rack.levels.systems.state_table.table import (
+    SAME,
+    STATES,
+    Lexicon,
+    RowConfig,
+    StateTable,
+    Vocabulary,
+    objection,
+)
 from rack.levels.tables import keys_of
 
 Box = dict[str, frozenset[str]]
@@ -34,7 +42,7 @@ def flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | None) ->
     # Cases can be counted only once every condition and value is known, and every row is readable.
     if not table.flaws and not any(_conditions(row, vocabulary) for row in table.configs.values()):
         for state in table.rows:
-            found += _cases(state, _rows_of(state, table), vocabulary)
+            found += _cases(state, table.rows[state], vocabulary)
     return found
 
 
@@ -42,24 +50,20 @@ def _named(number: int, row: RowConfig) -> str:
     return f"row {number} '{row.name}'"
 
 
-def _rows_of(state: str, table: StateTable) -> dict[int, RowConfig]:
-    return {row.number: table.configs[row.number] for row in table.rows[state]}
-
-
 def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> Iterator[str]:
     """Yield unknown words of a row, and outputs that it lacks."""
     yield from _conditions(row, vocabulary)
-    for phrase in row.do or ():
+    for phrase in row.do:
         if lexicon is not None and (why := objection(phrase, vocabulary.actions, lexicon)):
             yield f"do: {why}"
     for key in ("next", "do", "status"):
-        if getattr(row, key) is None:
+        if key not in row.model_fields_set:
             yield f"{key}: missing; {keys_of(RowConfig)[key].description}"
-    if row.status is not None and row.status not in STATES:
+    if row.status not in STATES:
         yield f"status: unknown '{row.status}'; known: {', '.join(STATES)}"
-    if row.status in REASONED and row.reason is None:
+    if row.status in REASONED and not row.reason and "status" in row.model_fields_set:
         yield f"reason: missing; status {row.status} needs one, a line for the user"
-    if row.status not in REASONED and row.reason is not None:
+    if row.status not in REASONED and row.reason:
         yield f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}"
 
 
@@ -71,7 +75,7 @@ def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
             known = ", ".join(vocabulary.conditions)
             found.append(f"when: unknown condition '{condition}'; known: {known}")
             continue
-        permitted = vocabulary.conditions[condition].values
+        permitted = vocabulary.conditions[condition]
         unknown = [f"is never '{value}'" for value in values if value not in permitted]
         if not values:
             unknown = ["has an empty list"]
@@ -89,17 +93,17 @@ def _states(table: StateTable) -> Iterator[str]:
     if table.start not in names:
         yield f"start: no row has the state '{table.start}'; states: {known}"
     for number, row in table.configs.items():
-        if row.next is not None and row.next not in (*names, SAME):
+        if row.next not in (*names, SAME):
             yield f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
     if table.start not in names:
         return
     reached = [table.start]
     for state in reached:  # grows on the way
-        nexts = {row.next for row in _rows_of(state, table).values()} - {SAME}
+        nexts = {row.next for row in table.rows[state].values()}
         reached += [name for name in names if name in nexts and name not in reached]
     for state in names:
         if state not in reached:
-            numbers = ", ".join(map(str, _rows_of(state, table)))
+            numbers = ", ".join(map(str, table.rows[state]))
             yield (
                 f"row {numbers}: unreachable: no row leads from '{table.start}' to the state"
                 f" '{state}'"
@@ -112,7 +116,7 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
     named = [
         name for name in vocabulary.conditions if any(name in row.when for row in rows.values())
     ]
-    every: Box = {name: frozenset(vocabulary.conditions[name].values) for name in named}
+    every: Box = {name: frozenset(vocabulary.conditions[name]) for name in named}
     boxes: dict[int, Box] = {}  # of the rows above, by number
     left = [every]
     for number, row in rows.items():
@@ -157,23 +161,22 @@ def without(box: Box, taken: Box) -> Sequence[Box]:
 
 
 def joined(boxes: Sequence[Box]) -> list[Box]:
-    """Return fewer boxes with the same cases: those that differ in one condition become one."""
-    left: list[Box] = []
-    for count, box in enumerate(boxes, 1):
-        for at, other in enumerate(left):
-            differing = [condition for condition in box if box[condition] != other[condition]]
-            if len(differing) == 1:
-                both = {**box, differing[0]: box[differing[0]] | other[differing[0]]}
-                return joined([*left[:at], both, *left[at + 1 :], *boxes[count:]])
-        left.append(box)
+    """Return fewer boxes with the same cases: two that differ in one condition become one."""
+    left = [*boxes]
+    while pair := next((p for p in combinations(left, 2) if _differ_once(*p)), None):
+        one, other = pair
+        left[left.index(one)] = {name: one[name] | other[name] for name in one}
+        left.remove(other)
     return left
+
+
+def _differ_once(one: Box, other: Box) -> bool:
+    return sum(one[name] != other[name] for name in one) == 1
 
 
 def _described(box: Box, vocabulary: Vocabulary) -> str:
     """Return the cases of a box as text, without the conditions that may have any value."""
-    narrow = {
-        n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n].values)
-    }
+    narrow = {n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n])}
     return _listed(narrow)
 
 

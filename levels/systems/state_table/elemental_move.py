@@ -31,8 +31,7 @@ from rack.levels.systems.state_table.level import (
     vocabulary,
 )
 from rack.levels.systems.state_table.primitive import JOINT_MOVE, JOINT_MOVE_STATUS
-from rack.levels.systems.state_table.table import Name, Place
-from rack.levels.systems.state_table.vocabulary import Condition, Lexicon, Phrase
+from rack.levels.systems.state_table.table import Lexicon, Name, Place
 from rack.levels.tables import Finite, NotNegative, Positive, SceneConfig, Table
 
 DOWN = (0.0, 0.0, -1.0)
@@ -88,29 +87,29 @@ class MoveTable(StateTableExecutor):
     vocabulary = vocabulary(
         conditions={
             "below": BELOW,
-            "world": Condition(("seen", "unseen"), "whether the objects are sensed"),
-            "target": Condition(
-                ("there", "displaced", "moving"),
-                "the object to pick: there: where it was sensed for the newest `move`; a place is"
-                " always there",
-            ),
-            "support": Condition(
-                ("there", "elsewhere"), "where the object put down last rests: at its place, or not"
-            ),
-            "gripper": Condition(("free", "holds"), "whether the gripper holds something"),
-            "reach": Condition(YES_NO, "whether the newest pose has joint positions"),
+            # Whether the objects are sensed.
+            "world": ("seen", "unseen"),
+            # The object to pick: there: where it was sensed for the newest `move`; a place is
+            # always there.
+            "target": ("there", "displaced", "moving"),
+            # Where the object put down last rests: at its place, or not.
+            "support": ("there", "elsewhere"),
+            # Whether the gripper holds something.
+            "gripper": ("free", "holds"),
+            # Whether the newest pose has joint positions.
+            "reach": YES_NO,
         },
         commands={
-            "pick": Phrase(("object",), "take an object"),
-            "place": Phrase(("place",), "put what the gripper holds at a place"),
-            HOME: Phrase((), "go where the arm starts"),
+            "pick": ("object",),
+            # What the gripper holds, at a place.
+            "place": ("place",),
+            HOME: (),
         },
         actions={
-            "move": Phrase(
-                ("pose",), "go to a pose, relative to the object or place of the command in force"
-            ),
-            "open": Phrase((), "open the gripper"),
-            "close": Phrase((), "close the gripper"),
+            # To a pose, relative to the object or place of the command in force.
+            "move": ("pose",),
+            "open": (),
+            "close": (),
         },
         plan=MovePlanConfig,
     )

@@ -33,25 +33,23 @@ from rack.levels.operator import (
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.table import (
     LATE,
-    ROW_NAME_BYTES,
-    SAME,
-    Name,
-    Row,
-    StateTable,
-    TableError,
-    read_table,
-)
-from rack.levels.systems.state_table.vocabulary import (
     NAME_BYTES,
     PHRASE_BYTES,
+    ROW_NAME_BYTES,
+    SAME,
+    STATES,
     TAKE,
-    Condition,
     Lexicon,
-    NoPlan,
-    Phrase,
+    Name,
+    Phrases,
+    RowConfig,
+    StateTable,
+    TableError,
+    Values,
     Vocabulary,
     objection,
     phrases,
+    read_table,
 )
 from rack.levels.tables import SceneConfig, Table, read_params
 
@@ -81,10 +79,10 @@ WORD_COMMAND = command("word_command", 1, *COMMAND_HEAD)
 TABLE_STATUS = status("table_status", 1, *STATUS_HEAD)
 YES_NO = ("no", "yes")
 UNKNOWN = "unknown"
-BELOW = Condition(
-    ("waiting", "executing", "done", "error", "lost"),
-    "the level below: waiting: it has not answered the newest command; lost: its board is",
-)
+"""A command whose words the level does not know."""
+BELOW = ("waiting", "executing", "done", "error", "lost")
+"""Condition of the level below: waiting: it has not answered the newest command; lost: its board
+is."""
 
 
 class StateTableParams(Table):
@@ -95,29 +93,19 @@ class StateTableParams(Table):
 
 
 def vocabulary(
-    conditions: Mapping[str, Condition],
-    actions: Mapping[str, Phrase],
-    commands: Mapping[str, Phrase] | None = None,
-    plan: type[Table] = NoPlan,
+    conditions: Mapping[str, Values],
+    actions: Phrases,
+    commands: Phrases | None = None,
+    plan: type[Table] = Table,
 ) -> Vocabulary:
     """Return the vocabulary of a level: its own words and, if it accepts commands, those that come
     with them."""
-    late = Condition(YES_NO, "whether the state has lasted longer than the table's patience")
-    known = {**conditions, LATE: late}
-    possible = dict(actions)
-    if commands:
-        known["command"] = Condition(
-            ("none", UNKNOWN, *commands),
-            f"the newest command, of an operator or the level above; {UNKNOWN}: the level does not"
-            " know its words",
-        )
-        known["new"] = Condition(
-            YES_NO, f"whether no row has done '{TAKE}' since that command came"
-        )
-        possible[TAKE] = Phrase(
-            (), "let the newest command be the one in force: the status answers it from now on"
-        )
-    return Vocabulary(known, commands or {}, possible, plan)
+    known = {**conditions, LATE: YES_NO}
+    if not commands:
+        return Vocabulary(known, {}, actions, plan)
+    # The newest command, of an operator or the level above; whether no row has taken it yet.
+    known |= {"command": ("none", UNKNOWN, *commands), "new": YES_NO}
+    return Vocabulary(known, commands, {**actions, TAKE: ()}, plan)
 
 
 class WordCommand(NamedTuple):
@@ -263,14 +251,15 @@ class StateTableExecutor(Executor):
             command = self._newest if is_new else self._taken
             values["command"] = command.words.partition(" ")[0] or "none"
             values["new"] = YES_NO[is_new]
-        row = self.table.decide(self.state, values)
-        for verb, *parameters in row.do:
+        number, row = self.table.decide(self.state, values)
+        for phrase in row.do:
+            verb, *parameters = phrase.split()
             getattr(self, f"do_{verb}")(*parameters)
         if row.next not in (SAME, self.state):
             self.state = row.next
             self._since = tick
         self.give(write, tick)
-        self._report(write, row)
+        self._report(write, number, row)
 
     @abstractmethod
     def look(self, read: Ports, tick: int) -> dict[str, str]:
@@ -357,11 +346,11 @@ class StateTableExecutor(Executor):
             else:
                 self._newest = WordCommand(True, order.id, order.name)
 
-    def _report(self, write: Ports, row: Row) -> None:
+    def _report(self, write: Ports, number: int, row: RowConfig) -> None:
         """Fill the fields of `STATUS_HEAD`, and the operator's in the command."""
         shown: Message = write.status
         orders = self.orders
-        state = row.status
+        state = STATES[row.status]
         reason = row.reason
         if self._kept and state is State.EXECUTING:
             state = State.HOLDING
@@ -385,7 +374,7 @@ class StateTableExecutor(Executor):
         shown.table = self.table_name
         shown.checksum = self.table.checksum
         shown.in_state = self.state
-        shown.row = row.number
+        shown.row = number
         shown.fired = row.name
         shown.words = words
         shown.done = self._done

@@ -28,7 +28,6 @@ from rack.levels.systems.state_table.level import (
     StateTableExecutor,
     vocabulary,
 )
-from rack.levels.systems.state_table.vocabulary import Condition, Phrase
 from rack.levels.tables import Positive, Table
 
 LEAD_CYCLES = 2
@@ -91,31 +90,17 @@ class PrimitiveTable(StateTableExecutor):
     preloads = (curves,)
     vocabulary = vocabulary(
         conditions={
-            "hold": Condition(
-                YES_NO,
-                "whether an operator or the level above holds this one, or its board is lost",
-            ),
-            "arm": Condition(
-                ("arrived", "resting", "moving", "away"),
-                "arrived: at rest where the newest motion ends; resting: elsewhere; away: the"
-                " joints do not follow",
-            ),
-            "gripper": Condition(("moving", "open", "empty", "holds"), "empty: closed on nothing"),
+            # Whether an operator or the level above holds this one, or its board is lost.
+            "hold": YES_NO,
+            # Arrived: at rest where the newest motion ends; resting: elsewhere; away: the joints do
+            # not follow.
+            "arm": ("arrived", "resting", "moving", "away"),
+            # Empty: closed on nothing.
+            "gripper": ("moving", "open", "empty", "holds"),
         },
-        commands={
-            "move": Phrase((), "move the joints straight to the command's"),
-            "open": Phrase((), "open the gripper"),
-            "close": Phrase((), "close the gripper"),
-        },
-        actions={
-            "begin": Phrase(
-                (),
-                "begin the motion to the joints of the command in force; while the arm moves, halt",
-            ),
-            "halt": Phrase((), "ramp to rest"),
-            "open": Phrase((), "open the gripper"),
-            "close": Phrase((), "close the gripper"),
-        },
+        # Move the joints straight to the command's; work the gripper.
+        commands={"move": (), "open": (), "close": ()},
+        actions={"begin": (), "halt": (), "open": (), "close": ()},
         plan=PrimitivePlanConfig,
     )
 
@@ -218,7 +203,8 @@ class PrimitiveTable(StateTableExecutor):
         return "holds" if self._held else "empty"
 
     def do_begin(self) -> None:
-        """Begin the motion to the joints of the command in force, from rest."""
+        """Begin the motion to the joints of the command in force, from rest; while the arm moves,
+        halt."""
         if self._curve is not None:
             self.do_halt()
             return

@@ -1,4 +1,7 @@
-"""A state table: the rows of a TOML file, and the one that fires.
+"""A state table: the rows of a TOML file, the words that they combine, and the row that fires.
+
+A level's class declares the words: conditions, commands that it accepts, actions. Every set of
+words is finite, so whether two rows overlap, and which case no row takes, can be decided exactly.
 
     start = "idle"
 
@@ -26,9 +29,10 @@ Rows of a state exclude each other, unless the later one says `else`; together t
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,8 +42,64 @@ from rack.backplane.bounded_toml import load_toml
 from rack.backplane.message import REASON_BYTES, State
 from rack.backplane.regular_file import read_regular_file
 from rack.levels.errors import LevelError
-from rack.levels.systems.state_table.vocabulary import NAME_BYTES, Vocabulary
 from rack.levels.tables import Positive, Table, Vector
+
+NAME_BYTES = 24
+"""Longest word, name of a state, or name of a table."""
+PHRASE_BYTES = 64
+"""Longest command or action, with its parameters."""
+TAKE = "take"
+"""The action of every level: from now on the newest command is the one in force, and the status
+answers it."""
+
+
+Values = tuple[str, ...]
+"""What a condition may be: it always has exactly one of these."""
+Phrases = Mapping[str, tuple[str | Values, ...]]
+"""Commands that a level accepts, or actions, by their word: one set of words for each word that
+follows it; a name stands for a set of `Lexicon`."""
+Lexicon = Mapping[str, Sequence[str]]
+"""Sets of words that depend on scene and plan, by name: "object" -> the objects of the scene."""
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """All words of one kind of level. `plan` is the record of `[plan]`, the static plan in the file
+    of a table."""
+
+    conditions: Mapping[str, Values]
+    commands: Phrases
+    actions: Phrases
+    plan: type[Table] = Table
+
+
+def phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
+    """Yield every command or action with its parameters: "pick block1"."""
+    for word, parameters in verbs.items():
+        for given in product(*(_words(parameter, lexicon) for parameter in parameters)):
+            yield " ".join((word, *given))
+
+
+def _words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
+    return lexicon[parameter] if isinstance(parameter, str) else parameter
+
+
+def objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
+    """Return why `phrase` is none of the commands or actions; empty: it is one."""
+    if len(phrase) > PHRASE_BYTES:
+        return f"'{phrase}' has {len(phrase)} characters; permitted: {PHRASE_BYTES}"
+    word, *given = phrase.split() or [""]
+    if word not in verbs:
+        return f"unknown '{word}'; known: {', '.join(verbs) or 'none'}"
+    wanted = verbs[word]
+    if len(given) != len(wanted):
+        return f"'{phrase}' has {len(given)} parameters; '{word}' takes {len(wanted)}"
+    for value, parameter in zip(given, wanted, strict=True):
+        permitted = _words(parameter, lexicon)
+        if value not in permitted:
+            return f"'{value}' of '{phrase}' is unknown; known: {', '.join(permitted) or 'none'}"
+    return ""
+
 
 MAX_FILE_BYTES = 200_000
 ROW_NAME_BYTES = 48
@@ -80,14 +140,18 @@ class RowConfig(Table):
     """value, or a list of values, by condition"""
     otherwise: bool = Field(False, alias="else")
     """takes what the rows of the state above this one leave"""
-    # Missing ones are reported with what else is wrong with the table.
-    next: Name | None = None
+    # Those of the next three that are missing are reported with what else is wrong with the table.
+    next: Name = SAME
     """next state, or same"""
-    do: Words | None = None
+    do: Words = ()
     """actions with their parameters, in order; may be an empty list"""
-    status: str | None = Field(None, description="state shown upwards: " + ", ".join(STATES))
-    reason: Reason | None = None
+    status: str = Field("error", description="state shown upwards: " + ", ".join(STATES))
+    reason: Reason = ""
     """shown with status error or holding"""
+
+    def matches(self, values: Mapping[str, str]) -> bool:
+        """Return whether the row fires on these values of the conditions."""
+        return all(values[condition] in permitted for condition, permitted in self.when.items())
 
 
 class TableConfig(Table):
@@ -112,24 +176,6 @@ class TableError(LevelError):
 
 
 @dataclass(frozen=True)
-class Row:
-    """One row. `number` counts from 1, in the order of the file."""
-
-    number: int
-    name: str
-    # Values permitted, by condition; one left out may have any value.
-    when: Mapping[str, frozenset[str]]
-    next: str
-    do: tuple[tuple[str, ...], ...]  # actions: verb and parameters
-    status: State
-    reason: str
-
-    def matches(self, values: Mapping[str, str]) -> bool:
-        """Return whether the row fires on these values of the conditions."""
-        return all(values[condition] in permitted for condition, permitted in self.when.items())
-
-
-@dataclass(frozen=True)
 class StateTable:
     """A state table as read. `flaws` are the mistakes in the form of the file.
 
@@ -144,33 +190,23 @@ class StateTable:
     flaws: tuple[str, ...]
 
     @cached_property
-    def rows(self) -> Mapping[str, tuple[Row, ...]]:
-        """The rows by state, each state's in their order."""
-        rows: dict[str, tuple[Row, ...]] = {}
-        for number, config in self.configs.items():
-            # A row may lack these, until its check says so.
-            row = Row(
-                number=number,
-                name=config.name,
-                when={condition: frozenset(values) for condition, values in config.when.items()},
-                next=config.next or SAME,
-                do=tuple(tuple(phrase.split()) for phrase in config.do or ()),
-                status=STATES.get(config.status or "", State.ERROR),
-                reason=config.reason or "",
-            )
-            for state in config.state:
-                rows[state] = (*rows.get(state, ()), row)
+    def rows(self) -> Mapping[str, Mapping[int, RowConfig]]:
+        """The rows by state and number, each state's in their order."""
+        rows: dict[str, dict[int, RowConfig]] = {}
+        for number, row in self.configs.items():
+            for state in row.state:
+                rows.setdefault(state, {})[number] = row
         return rows
 
-    def decide(self, state: str, values: Mapping[str, str]) -> Row:
-        """Return the row that fires; number 0, an error: no row takes the case, which cannot happen
-        in a table that was checked."""
-        for row in self.rows.get(state, ()):
+    def decide(self, state: str, values: Mapping[str, str]) -> tuple[int, RowConfig]:
+        """Return the row that fires, after its number; number 0, an error: no row takes the case,
+        which cannot happen in a table that was checked."""
+        for number, row in self.rows.get(state, {}).items():
             if row.matches(values):
-                return row
+                return number, row
         case = ", ".join(f"{name} = {value}" for name, value in values.items())
         reason = f"no row of '{state}' takes {case}"
-        return Row(0, "", {}, state, (), State.ERROR, reason)
+        return 0, RowConfig.model_construct(name="", state=(state,), next=state, reason=reason)
 
 
 def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:

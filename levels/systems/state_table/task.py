@@ -24,7 +24,6 @@ from rack.levels.systems.state_table.level import (
     vocabulary,
 )
 from rack.levels.systems.state_table.table import Name
-from rack.levels.systems.state_table.vocabulary import Condition, Phrase
 from rack.levels.tables import SceneConfig, Table, read_params
 
 COMMANDS_A_STEP = 2
@@ -72,14 +71,13 @@ class TaskTable(StateTableExecutor):
     vocabulary = vocabulary(
         conditions={
             "below": BELOW,
-            "step": Condition(("more", "none"), "whether a step of the plan is left"),
+            # Whether a step of the plan is left.
+            "step": ("more", "none"),
         },
         actions={
-            "send": Phrase(
-                (("pick", "place", "home"),),
-                "command the level below, for the object or place of the step",
-            ),
-            "next": Phrase((), "go on to the next step"),
+            # To the level below, for the object or place of the step.
+            "send": (("pick", "place", "home"),),
+            "next": (),
         },
         plan=TaskPlanConfig,
     )

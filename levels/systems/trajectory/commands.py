@@ -18,7 +18,7 @@ import runpy
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
@@ -41,24 +41,11 @@ WORLD = -1
 
 
 class Motions:
-    """Motion requests as calls. Every call returns the number of its request.
+    """Motion requests as calls: scripts and prompts have its public methods by name. A request
+    returns its number.
 
     What a former process of the board has left in the queue is cancelled first.
     """
-
-    calls: ClassVar[tuple[str, ...]] = (
-        "move",
-        "line",
-        "stay",
-        "grip",
-        "release",
-        "cancel",
-        "done",
-        "wait",
-        "end_of",
-        "where",
-    )
-    """Those that scripts and prompts have by name."""
 
     def __init__(self, bus: Bus, robot: RobotConfig, scene: SceneConfig) -> None:
         self._bus = bus
@@ -221,7 +208,8 @@ class CommandEnvironment(HostProgram):
     def names(self, bus: Bus) -> Mapping[str, Any]:
         """Return the calls, by name."""
         motions = self.motions(bus)
-        return {"motions": motions, **{name: getattr(motions, name) for name in motions.calls}}
+        calls = {name: getattr(motions, name) for name in dir(motions) if name[0] != "_"}
+        return {"motions": motions, **calls}
 
     def motions(self, bus: Bus) -> Motions:
         """Return what makes requests of calls."""

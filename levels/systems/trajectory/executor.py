@@ -20,8 +20,13 @@ from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
-from rack.levels.systems.trajectory.goal import WorldSight
-from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATE, MOTION_STATUS
+from rack.levels.systems.trajectory.legs import WorldSight
+from rack.levels.systems.trajectory.messages import (
+    MOTION_REQUEST,
+    MOTION_STATE,
+    MOTION_STATUS,
+    MotionKind,
+)
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import Agenda
 from rack.levels.systems.trajectory.work import MotionTools, RequestWork, TrajectoryParams
@@ -148,7 +153,7 @@ class TrajectoryExecutor(Executor):
         leg = self._motion.leg
         # At half its speed the arm has long broken away from rest, where friction changes torques.
         steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
-        if current is None or not current.is_guarded or not steady:
+        if current is None or current.kind != MotionKind.POSE or not current.touch or not steady:
             self._guard.begin_anew()
         elif self._guard.is_struck(read.boards, current.touch):
             self._work.end_guarded()

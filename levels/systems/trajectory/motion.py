@@ -13,8 +13,7 @@ import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.robot.limits import Limits
-from rack.levels.systems.trajectory.goal import Unfit
-from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling
+from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling, Unfit
 
 STOP_PART = 0.85
 """Part of the acceleration limits that a stop takes: states are known by differences of samples

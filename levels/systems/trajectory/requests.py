@@ -3,97 +3,55 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message
+from rack.backplane.message import Message, copied
 from rack.levels.algebra import Array
 from rack.levels.level import Reading
 from rack.levels.messages import Error
-from rack.levels.planning.pose import Pose, pose
 from rack.levels.systems.trajectory.messages import ENDED, HELD, MotionKind, RequestEnd
 
 MOTIONS = (MotionKind.JOINTS, MotionKind.POSE)
 """Kinds that may be blended into each other."""
 KINDS = range(MotionKind.JOINTS, MotionKind.GRIP + 1)
 """Kinds that any trajectory level can do."""
-NUMBERS = (
-    "id",
-    "kind",
-    "body",
-    "acceleration",
-    "segment",
-    "opening",
-    "force",
-    "touch",
-    "operator",
-)
-"""Fields of a request that are one number each."""
 
 
-class MotionRequest(NamedTuple):
-    """A copy of one `MOTION_REQUEST`; see there for units."""
+def copy_request(record: Any) -> Message:
+    """Return a copy of the record of a request."""
+    request = Message(record.dtype)
+    request.record[...] = record
+    return request
 
-    id: int
-    kind: int
-    joints: Array
-    goal: Pose
-    body: int
-    live: bool
-    acceleration: float
-    segment: float
-    opening: float
-    force: float
-    touch: float
-    operator: int
-    record: np.ndarray  # the whole
 
-    @classmethod
-    def of(cls, record: np.ndarray) -> MotionRequest:
-        """Return a copy of a request's record."""
-        own = record.copy()
-        goal = pose(own["position"], own["quaternion"])
-        numbers = {name: own[name].item() for name in NUMBERS}
-        return cls(joints=own["joints"], goal=goal, live=bool(own["live"]), record=own, **numbers)
-
-    @property
-    def moves(self) -> bool:
-        """Whether it moves the arm."""
-        return self.kind in MOTIONS
-
-    @property
-    def is_guarded(self) -> bool:
-        """Whether a touch ends it."""
-        return self.kind == MotionKind.POSE and self.touch != 0.0
-
-    def misfit(self, ranges: Array) -> str:
-        """Return why no arm could do it; empty: it may be possible. `ranges` (joints, 2), rad."""
-        if self.kind not in KINDS:
-            return f"kind {self.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
-        numbers = (self.acceleration, self.segment, self.opening, self.force)
-        if not np.isfinite(numbers).all() or self.acceleration < 0.0 or self.segment < 0.0:
+def misfit_of(request: Message, ranges: Array) -> str:
+    """Return why no arm whose joints have `ranges`, (joints, 2), rad, could do a request; empty: it
+    may be possible."""
+    if request.kind not in KINDS:
+        return f"kind {request.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
+    times = request.acceleration, request.segment
+    if not np.isfinite((*times, request.opening, request.force)).all() or min(times) < 0.0:
+        return f"times {times[0]:g} and {times[1]:g} s; permitted: finite, 0 or more"
+    turn = request.quaternion
+    is_pose = np.isfinite((*request.position, *turn)).all() and turn.any()
+    if request.kind == MotionKind.POSE and not is_pose:
+        return "the pose is not finite, or its quaternion is zero"
+    # Written so that NaN is one.
+    if not request.touch >= 0.0:
+        return f"a guard of {request.touch:g} N m; permitted: 0 or more"
+    if request.kind == MotionKind.JOINTS:
+        # Written so that NaN is outside.
+        outside = ~((request.joints >= ranges[:, 0]) & (request.joints <= ranges[:, 1]))
+        if outside.any():
+            joint = int(outside.argmax())
+            low, high = ranges[joint]
             return (
-                f"times {self.acceleration:g} and {self.segment:g} s; permitted: finite, 0 or more"
+                f"joint {joint + 1} to {request.joints[joint]:g} rad; permitted: {low:.3f} to"
+                f" {high:.3f}"
             )
-        turn = self.record["quaternion"]
-        is_pose = np.isfinite((*self.record["position"], *turn)).all() and turn.any()
-        if self.kind == MotionKind.POSE and not is_pose:
-            return "the pose is not finite, or its quaternion is zero"
-        # Written so that NaN is one.
-        if not self.touch >= 0.0:
-            return f"a guard of {self.touch:g} N m; permitted: 0 or more"
-        if self.kind == MotionKind.JOINTS:
-            # Written so that NaN is outside.
-            outside = ~((self.joints >= ranges[:, 0]) & (self.joints <= ranges[:, 1]))
-            if outside.any():
-                joint = int(outside.argmax())
-                low, high = ranges[joint]
-                return (
-                    f"joint {joint + 1} to {self.joints[joint]:g} rad; permitted: {low:.3f} to"
-                    f" {high:.3f}"
-                )
-        return ""
+    return ""
 
 
 class Agenda:
@@ -105,9 +63,9 @@ class Agenda:
     """
 
     def __init__(self) -> None:
-        self.held: list[MotionRequest] = []
+        self.held: list[Message] = []
         self.begun = False  # the first of them is under way
-        self.goal: MotionRequest | None = None  # at whose goal the arm is, or to which it goes
+        self.goal: Message | None = None  # at whose goal the arm is, or to which it goes
         self.taken = 0  # newest id taken
         self.rests_on = 0  # newest command of an operator on which a request taken rests
         self.error = Error.NONE
@@ -117,12 +75,12 @@ class Agenda:
         self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
 
     @property
-    def current(self) -> MotionRequest | None:
+    def current(self) -> Message | None:
         """The request under way."""
         return self.held[0] if self.begun else None
 
     @property
-    def next(self) -> MotionRequest | None:
+    def next(self) -> Message | None:
         """The request after that, or the first one."""
         at = int(self.begun)
         return self.held[at] if len(self.held) > at else None
@@ -142,10 +100,10 @@ class Agenda:
         cancelled = False
         if requests.is_new:
             for message in (*requests.earlier, requests.value):
-                cancelled |= self._take(MotionRequest.of(message.record))
+                cancelled |= self._take(copied(message))
         return cancelled
 
-    def _take(self, request: MotionRequest) -> bool:
+    def _take(self, request: Message) -> bool:
         # One sent again, by a planning level that was restarted or that misses it in the status, is
         # not a new one.
         if request.id <= self.taken:
@@ -170,13 +128,13 @@ class Agenda:
             self.held.append(request)
         return False
 
-    def begin(self) -> MotionRequest:
+    def begin(self) -> Message:
         """Begin the next request; the one under way is done."""
         if self.begun:
             self.end(RequestEnd.DONE)
         self.begun = True
         request = self.held[0]
-        if request.moves:
+        if request.kind in MOTIONS:
             self.goal = request
         return request
 
@@ -201,7 +159,7 @@ class Agenda:
         self.held = []
         self.begun = False
 
-    def _end(self, request: MotionRequest, how: RequestEnd) -> None:
+    def _end(self, request: Message, how: RequestEnd) -> None:
         self._ended.appendleft((request.id, how))
 
     def report(self, status: Message) -> None:
@@ -226,9 +184,9 @@ class Agenda:
 
     def recall(self, state: Message, status: Message) -> None:
         """Continue from the last messages of a level that was restarted."""
-        self.held = [MotionRequest.of(record) for record in state.requests[: state.count]]
+        self.held = [copy_request(record) for record in state.requests[: state.count]]
         self.begun = bool(state.begun)
-        self.goal = MotionRequest.of(state.goal) if state.goal["id"] else None
+        self.goal = copy_request(state.goal) if state.goal["id"] else None
         self.taken = status.taken
         self.rests_on = status.operator
         self.error = Error(status.error)

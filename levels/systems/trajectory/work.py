@@ -6,16 +6,24 @@ from typing import NamedTuple
 
 from pydantic import Field
 
+from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES
-from rack.levels.systems.trajectory.goal import ToolGoal, Unfit, WorldSight
-from rack.levels.systems.trajectory.legs import JointLeg, Leg, Times, ToolLeg
+from rack.levels.systems.trajectory.legs import (
+    JointLeg,
+    Leg,
+    Times,
+    ToolGoal,
+    ToolLeg,
+    Unfit,
+    WorldSight,
+)
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
-from rack.levels.systems.trajectory.requests import Agenda, MotionRequest
+from rack.levels.systems.trajectory.requests import MOTIONS, Agenda, misfit_of
 from rack.levels.tables import Positive, Table
 
 
@@ -113,7 +121,7 @@ class RequestWork:
         leg = self.motion.leg
         if current is None:
             return 0.0
-        if not current.moves:
+        if current.kind not in MOTIONS:
             lasts = self._lasts_s(current)
             return min(self.passed_s / lasts, 1.0) if lasts > 0.0 else 1.0
         if leg is None:
@@ -141,20 +149,20 @@ class RequestWork:
             segment_s = goal.segment * self._left if is_under_way else 0.0
             self._move(goal, 0.0, segment_s)
 
-    def _is_done(self, current: MotionRequest) -> bool:
+    def _is_done(self, current: Message) -> bool:
         if not self.motion.settled:
             return False
-        if current.moves or current.kind == MotionKind.CANCEL:
+        if current.kind in MOTIONS or current.kind == MotionKind.CANCEL:
             return True
         self.passed_s += self._tools.period_s
         return self.passed_s >= self._lasts_s(current)
 
-    def _lasts_s(self, request: MotionRequest) -> float:
+    def _lasts_s(self, request: Message) -> float:
         if request.kind == MotionKind.GRIP and not request.segment:
             return self._tools.params.gripping
-        return request.segment
+        return float(request.segment)
 
-    def _consider(self, request: MotionRequest) -> None:
+    def _consider(self, request: Message) -> None:
         """Begin `request` if its time has come: nothing is under way, or the leg under way is to be
         blended into it."""
         current = self.agenda.current
@@ -164,12 +172,12 @@ class RequestWork:
         if current is None:
             if self.motion.settled:
                 self._begin(0.0)
-        elif current.moves and request.moves and leg is not None:
+        elif current.kind in MOTIONS and request.kind in MOTIONS and leg is not None:
             half_s = self._blend_s(leg, request)
             if half_s is not None:
                 self._begin(half_s)
 
-    def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
+    def _blend_s(self, leg: Leg, request: Message) -> float | None:
         """Return half the time in which `leg` slows down, if now is the time to blend it into
         `request`."""
         law = leg.law
@@ -182,8 +190,8 @@ class RequestWork:
         left_s = law.nominal_s - passed_s
         return left_s if left_s < half_s + self._tools.period_s else None
 
-    def _can_begin(self, request: MotionRequest) -> bool:
-        return not request.moves or request.body < 0 or self._tools.sight.knows
+    def _can_begin(self, request: Message) -> bool:
+        return request.kind not in MOTIONS or request.body < 0 or self._tools.sight.knows
 
     def _begin(self, half_s: float) -> None:
         request = self.agenda.begin()
@@ -192,21 +200,22 @@ class RequestWork:
         if reason := self._misfit(request):
             self._fail(RequestEnd.REFUSED, reason, Error.UNREACHABLE)
             self.motion.stop()
-        elif request.moves:
+        elif request.kind in MOTIONS:
             self._move(request, half_s, request.segment)
         else:
             self._start(request)
 
-    def _misfit(self, request: MotionRequest) -> str:
+    def _misfit(self, request: Message) -> str:
         """Return why a request cannot be done; empty: it may be possible."""
-        return request.misfit(self._tools.limits.position) or self._tools.sight.misfit(request.body)
+        tools = self._tools
+        return misfit_of(request, tools.limits.position) or tools.sight.misfit(request.body)
 
-    def _start(self, request: MotionRequest) -> None:
+    def _start(self, request: Message) -> None:
         """Begin a request that does not move the arm."""
         if request.kind == MotionKind.GRIP:
             self.grip = request.opening, request.force
 
-    def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
+    def _move(self, request: Message, half_s: float, segment_s: float) -> None:
         """Begin the leg to the goal of `request`; the motion so far slows down over twice
         `half_s`."""
         tools = self._tools

@@ -20,6 +20,7 @@ from rack.boards.config.schema import RackConfig
 from rack.levels.messages import Error
 from rack.levels.operator import Goal
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.systems.cell.coordinator import CellProgram
 from rack.levels.systems.cell.messages import (
     CELL_ORDER,
     CELL_REPORT,
@@ -27,7 +28,6 @@ from rack.levels.systems.cell.messages import (
     OrderVerb,
     Response,
 )
-from rack.levels.systems.cell.program import CellProgram
 from rack.levels.systems.cell.shared_bodies import SHARED_BODIES
 from rack.tools.viewer.window import free_port
 from tests.boards.lan.extreme_levels import Case, cases, message_type

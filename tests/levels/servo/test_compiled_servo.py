@@ -11,13 +11,13 @@ import pytest
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 from rack.levels.servo import ServoExecutor, actuator_monitor, control, curves, sensor_monitor
-from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control, joint_torques
+from rack.levels.systems.joint_boards import ArmExecutor, JointServo, joint_control
 from tests.levels.arms import config
 from tests.levels.servo.joint_rig import APART, JointRig
 from tests.levels.servo.rig import Course, ServoRig
 
 JOINTS = 7
-MODULES = (curves, sensor_monitor, actuator_monitor, control, joint_control, joint_torques)
+MODULES = (curves, sensor_monitor, actuator_monitor, control, joint_control)
 FUNCTIONS = {
     name: found for m in MODULES for name, found in vars(m).items() if isinstance(found, compiled)
 }
@@ -115,17 +115,8 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
     ],
     "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
     "servo_joints": [joints_of(k) for k in range(4)],
-    "add_up": [
-        (
-            noise(k, 3 * JOINTS + 5),
-            noise(k + 1, 3, JOINTS),
-            size * noise(k + 2, 90),
-            np.array([0, 30, 60]),
-        )
-        for k, size in ((1, 1.0), (2, 0.0))
-    ],
 }
-VERDICTS = {"check": 3, "left_over": 3, "set_torque": 2, "add_up": 2}
+VERDICTS = {"check": 3, "left_over": 3, "set_torque": 2}
 """Kinds of verdicts that the cases reach; else: None."""
 
 

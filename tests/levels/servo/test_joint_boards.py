@@ -14,8 +14,8 @@ from rack.backplane.message import Message
 from rack.levels.level import LevelContext, Pace
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.systems.joint_boards.arm_executor import JointTorques
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads
-from rack.levels.systems.joint_boards.joint_torques import JointTorques
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_TORQUE
 from tests.levels.arms import cell, config
 from tests.levels.servo.joint_rig import CLOCK_NS, JOINTS, JointRig
@@ -120,8 +120,9 @@ def test_torques_of_all_boards_are_added_up() -> None:
         (0.0, 0.1, 0.2),
         4,
     )
-    assert torques.missing(readings(fast, slow), TICK, since=0) == ""
-    torques.add_up()
+    read = readings(fast, slow)
+    assert torques.missing(read, TICK, since=0) == ""
+    torques.add_up(read)
     assert torques.torque.tolist() == [7.0, 0.0, 0.0, 0.0, 0.0, -3.0]
     assert torques.wanted.position.tolist() == [0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
     assert (torques.moves, torques.rests_on, torques.grip_force) == (True, 4, 12.0)

@@ -7,8 +7,8 @@ from typing import Any
 from rack.backplane.message import Message, State
 from rack.levels.messages import Error
 from rack.levels.operator import Goal, Operation
-from rack.levels.systems.cell import CELL_REPORT, CellProgram, Coordinator
-from rack.levels.systems.cell.messages import OrderAction, OrderVerb, Response
+from rack.levels.systems.cell.coordinator import CellProgram, Coordinator
+from rack.levels.systems.cell.messages import CELL_REPORT, OrderAction, OrderVerb, Response
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep, Operator
 

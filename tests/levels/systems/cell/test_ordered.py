@@ -13,9 +13,9 @@ from rack.levels.level import Executor, Input, Ports
 from rack.levels.messages import MOVE_STATUS, SERVO_STATUS, TASK_COMMAND, WORLD_MODEL, Error, Verb
 from rack.levels.operator import Operation
 from rack.levels.peer import PEER
-from rack.levels.systems.cell import CELL_ORDER, OrderedTaskExecutor, OrderedTaskPlanner
+from rack.levels.systems.cell import OrderedTaskExecutor, OrderedTaskPlanner
 from rack.levels.systems.cell.actions import write_action
-from rack.levels.systems.cell.messages import OrderVerb, Response
+from rack.levels.systems.cell.messages import CELL_ORDER, OrderVerb, Response
 from rack.levels.task.program import Goto, Home, Transfer
 from tests.levels.arms import cell, config
 from tests.levels.lockstep import BoardSpec, Lockstep, Operator

@@ -164,31 +164,22 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
         )
 
 
-def test_a_part_that_nobody_has_touched_belongs_to_nobody(pair: Pair) -> None:
-    assert pair.alpha.claim == pair.beta.claim == Claim()
-    np.testing.assert_array_equal(pair.alpha.part, pair.beta.part)
-
-
-def test_the_arm_that_takes_the_part_moves_it_in_both_simulations(pair: Pair) -> None:
-    pair.lift(pair.alpha)
-    assert pair.alpha.claim == pair.beta.claim == Claim(1, b"alpha")
-    assert pair.alpha.part[2] == pytest.approx(0.025 + UP_M, abs=0.003)
-    np.testing.assert_allclose(pair.beta.part, pair.alpha.part, atol=1e-4)
-
-
 @pytest.mark.slow
 def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
+    assert pair.alpha.claim == pair.beta.claim == Claim(), "nobody has touched it yet"
+    np.testing.assert_array_equal(pair.alpha.part, pair.beta.part)
     for number, (hoist, other) in enumerate(
-        [(pair.alpha, pair.beta), (pair.beta, pair.alpha)] * 2, start=1
+        [(pair.alpha, pair.beta), (pair.beta, pair.alpha)], start=1
     ):
         pair.lift(hoist)
         assert hoist.claim == other.claim == Claim(number, hoist.servo.context.rack.encode())
-        assert other.part[2] == pytest.approx(0.025 + UP_M, abs=0.003), "the copy is lifted, too"
+        assert hoist.part[2] == pytest.approx(0.025 + UP_M, abs=0.003)
+        np.testing.assert_allclose(other.part, hoist.part, atol=1e-4)
         pair.put_down(hoist)
         assert not hoist.said.bodies[0]["touched"]
         np.testing.assert_allclose(other.part, hoist.part, atol=1e-4)
     differing = [(a, b) for a, b in pair.claims if a != b]
-    assert len(differing) <= 4 * 2 * PERIOD, "after two exchanges both know"
+    assert len(differing) <= 2 * 2 * PERIOD, "after two exchanges both know"
     assert all(abs(a.number - b.number) == 1 for a, b in differing), (
         "and until then one claim is the greater"
     )
@@ -250,6 +241,7 @@ def test_a_rack_launched_anew_gets_its_part_back_where_the_other_saw_it(pair: Pa
     np.testing.assert_allclose(pair.alpha.part, moved, atol=1e-4)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_two_runs_say_the_same_bit_for_bit(tmp_path: Path) -> None:
     runs = [Pair(tmp_path), Pair(tmp_path)]

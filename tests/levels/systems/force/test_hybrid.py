@@ -11,7 +11,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.level import Demand
-from tests.levels.box import Disturbance, hold_back, mute
+from tests.levels.box import hold_back, mute
 from tests.levels.systems.force.hybrid_rig import START, HybridRig
 
 WANTED_N = 20.0
@@ -31,7 +31,8 @@ def pressed(rig: HybridRig, seconds: float) -> np.ndarray:
     return np.array(rig.forces)[-round(seconds * 1e3) :, 2]
 
 
-def test_a_force_settles_at_the_wanted_value_without_overshoot(tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_force_settles_is_kept_along_a_motion_and_ends_without_a_step(tmp_path: Path) -> None:
     rig = pressing(tmp_path)
     assert np.abs(pressed(rig, 0.2) - WANTED_N).max() < 0.5
     assert pressed(rig, 1.2).max() < 1.1 * WANTED_N
@@ -39,29 +40,18 @@ def test_a_force_settles_at_the_wanted_value_without_overshoot(tmp_path: Path) -
     assert rig.force.wrench[2] == pytest.approx(WANTED_N, abs=0.5)
     assert rig.force.offset[2] < -0.005
     assert (rig.force.state, rig.force.reason) == (State.EXECUTING, "")
-
-
-@pytest.mark.slow
-def test_sliding_keeps_the_force_and_follows_the_motion(tmp_path: Path) -> None:
-    rig = pressing(tmp_path)
     rig.line((START[0], START[1] + 0.08, START[2] - 0.015), segment=0.8)
     rig.run(1.6)
     assert np.abs(pressed(rig, 1.6) - WANTED_N).max() < 3.0
     assert np.abs(rig.tool[:2] - (START[0], START[1] + 0.08)).max() < 1e-3
     assert rig.motion.reason == ""
-    assert max(rig.steps()) < 1.2
-
-
-@pytest.mark.slow
-def test_motion_goes_on_without_a_step_when_compliance_ends(tmp_path: Path) -> None:
-    rig = pressing(tmp_path)
-    rig.line((START[0], START[1] + 0.08, START[2] - 0.015), segment=0.8)
+    rig.line((START[0], START[1], START[2] - 0.015), segment=0.8)
     rig.run(0.6)
     rig.comply(None)
     rig.run(1.0)
     assert max(rig.steps()) < 1.2
     assert np.abs(pressed(rig, 0.2)).max() < WANTED_N + 5.0
-    assert abs(rig.tool[1] - START[1] - 0.08) < 1e-3
+    assert abs(rig.tool[1] - START[1]) < 1e-3
     away = rig.status.target - rig.output("trajectory", "command").position
     assert 1e-3 < np.abs(away).max() < 0.1
 
@@ -102,19 +92,13 @@ def test_a_struck_guard_ends_the_motion_once(tmp_path: Path, axis: int) -> None:
     rig.run(0.2)
     assert np.abs(rig.tool - rest).max() < 2e-3
     assert max(rig.steps()) < 1.2
-    before = rig.forces[-1][2]
     if axis == 1:
-        assert abs(before - 2.0 * WANTED_N) < 4.0
-
-
-@pytest.mark.slow
-def test_motion_begins_again_with_another_command(tmp_path: Path) -> None:
-    rig = HybridRig(tmp_path, start=(START[0], START[1], START[2] - 0.015))
-    rig.run(0.2)
-    rig.comply(None, guard=(0.0, 0.0, 8.0, 0.0, 0.0, 0.0))
-    rig.line((START[0], START[1], START[2] - 0.05), segment=2.0)
-    rig.run(1.0)
-    assert rig.force.struck == 1
+        assert abs(rig.forces[-1][2] - 2.0 * WANTED_N) < 4.0
+        return
+    rig.rack.lose("hybrid", ticks=20)
+    rig.run(0.3)
+    assert (rig.force.struck, rig.force.axis) == (command, axis), "a restarted board strikes none"
+    assert rig.force.reason.startswith("guard of axis z was struck")
     rig.comply(None)
     rig.line((START[0], START[1], START[2] + 0.02), segment=0.5)
     rig.run(1.5)
@@ -122,33 +106,27 @@ def test_motion_begins_again_with_another_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("disturbance", "reason"),
-    [
-        (mute, "no wrench from the board of the arm: waiting for it"),
-        (hold_back(20), "wrench is stale, 21 ticks: waiting for the board of the arm"),
-    ],
-)
-def test_force_axes_rest_while_the_wrench_is_not_fresh(
-    tmp_path: Path, disturbance: Disturbance, reason: str
+def test_force_axes_rest_while_the_wrench_is_not_fresh_or_the_level_above_is_lost(
+    tmp_path: Path,
 ) -> None:
     rig = pressing(tmp_path)
-    rig.rack.disturb("arm.wrench", disturbance, ticks=300)
-    rig.run(0.05)
-    rig.comply(-2.0 * WANTED_N)
-    rig.run(0.15)
-    held = rig.status.target.copy()
-    assert rig.force.reason == reason
-    assert (rig.force.state, rig.status.state) == (State.HOLDING, State.HOLDING)
-    rig.run(0.05)
-    assert np.abs(rig.status.target - held).max() < 1e-6
-    rig.run(1.5)
-    assert np.abs(pressed(rig, 0.1) - 2.0 * WANTED_N).max() < 2.0
-
-
-@pytest.mark.slow
-def test_the_arm_rests_while_the_level_above_is_lost(tmp_path: Path) -> None:
-    rig = pressing(tmp_path)
+    silent = "no wrench from the board of the arm: waiting for it"
+    stale = "wrench is stale, 21 ticks: waiting for the board of the arm"
+    for disturbance, reason, wanted in (
+        (mute, silent, 2.0 * WANTED_N),
+        (hold_back(20), stale, WANTED_N),
+    ):
+        rig.rack.disturb("arm.wrench", disturbance, ticks=300)
+        rig.run(0.05)
+        rig.comply(-wanted)
+        rig.run(0.15)
+        held = rig.status.target.copy()
+        assert rig.force.reason == reason
+        assert (rig.force.state, rig.status.state) == (State.HOLDING, State.HOLDING)
+        rig.run(0.05)
+        assert np.abs(rig.status.target - held).max() < 1e-6
+        rig.run(1.5)
+        assert np.abs(pressed(rig, 0.1) - wanted).max() < 2.0
     rig.rack.boxes["trajectory.compliance"].lost = True
     rig.comply(-2.0 * WANTED_N)
     rig.run(0.3)
@@ -184,31 +162,15 @@ def test_an_impossible_command_is_refused(
 
 
 @pytest.mark.slow
-def test_a_restarted_board_goes_on_from_where_the_arm_is_held(tmp_path: Path) -> None:
+def test_after_a_restart_and_after_the_brakes_the_motion_begins_where_the_arm_is(
+    tmp_path: Path,
+) -> None:
     rig = pressing(tmp_path)
     rig.rack.lose("hybrid", ticks=100)
     rig.run(1.2)
     assert np.abs(pressed(rig, 1.2) - WANTED_N).max() < 10.0
     assert np.abs(pressed(rig, 0.1) - WANTED_N).max() < 1.0
     assert max(rig.steps()) < 1.2
-
-
-@pytest.mark.slow
-def test_a_restarted_board_strikes_no_guard_again(tmp_path: Path) -> None:
-    rig = HybridRig(tmp_path, start=(START[0], START[1], START[2] - 0.015))
-    rig.run(0.2)
-    rig.comply(None, guard=(0.0, 0.0, 8.0, 0.0, 0.0, 0.0))
-    rig.line((START[0], START[1], START[2] - 0.05), segment=2.0)
-    rig.run(1.0)
-    rig.rack.lose("hybrid", ticks=20)
-    rig.run(0.3)
-    assert (rig.force.struck, rig.force.axis) == (1, 2)
-    assert rig.force.reason.startswith("guard of axis z was struck")
-
-
-@pytest.mark.slow
-def test_after_the_brakes_the_motion_begins_where_the_arm_is(tmp_path: Path) -> None:
-    rig = pressing(tmp_path)
     rig.rack.stop(Demand.BRAKE, ticks=200)
     rig.run(0.1)
     assert rig.status.stopped

@@ -7,8 +7,8 @@ import pytest
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.systems.hand.fingertip_law import FingertipGains, FingertipLaw
 from rack.levels.systems.hand.kinematics import FingerKinematics
+from rack.levels.systems.hand.laws import FingertipGains, FingertipLaw
 from rack.levels.systems.hand.messages import FINGER_TARGET, GRASP_TARGET, FingerMode
 from tests.levels.arms import cell
 

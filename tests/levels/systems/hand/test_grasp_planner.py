@@ -9,8 +9,8 @@ import pytest
 
 from rack.levels.algebra import Array, mat_vec
 from rack.levels.errors import LevelError
-from rack.levels.systems.hand.grasp_planner import GraspPlanner, GraspRules
 from rack.levels.systems.hand.kinematics import FingerKinematics
+from rack.levels.systems.hand.workstation import GraspPlanner, GraspRules, PlannedGrasp
 from tests.levels.arms import cell
 
 HAND = cell("utah_mit")
@@ -25,6 +25,13 @@ def planner() -> GraspPlanner:
     return GraspPlanner(HAND, "thumb", RULES)
 
 
+@pytest.fixture(scope="module")
+def planned(planner: GraspPlanner) -> PlannedGrasp:
+    found = planner.plan(0, AT, UPRIGHT)
+    assert found is not None
+    return found
+
+
 def tips(posture: Array) -> Array:
     """Return the tips at joint positions, (fingers, 3), m, in the palm's frame."""
     assert HAND.hand is not None
@@ -34,9 +41,8 @@ def tips(posture: Array) -> Array:
 
 
 @pytest.mark.slow
-def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planner: GraspPlanner) -> None:
-    found = planner.plan(0, AT, UPRIGHT)
-    assert found is not None
+def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planned: PlannedGrasp) -> None:
+    found = planned
     radii = np.sqrt((found.contact[:, :2] ** 2).sum(axis=1))
     assert radii == pytest.approx(np.full(4, CAN_RADIUS_M))
     assert found.normal[:3] == pytest.approx(-found.normal[[3, 3, 3]])
@@ -47,10 +53,9 @@ def test_fingers_and_thumb_press_on_opposite_sides_of_the_surface(planner: Grasp
 
 @pytest.mark.slow
 def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_asked(
-    planner: GraspPlanner,
+    planned: PlannedGrasp,
 ) -> None:
-    found = planner.plan(0, AT, UPRIGHT)
-    assert found is not None
+    found = planned
     outside = AT + found.contact - RULES.clear * found.normal
     palm = START.site_xmat[HAND.tool].reshape(3, 3).T
     wanted = np.array([mat_vec(palm, point - START.site_xpos[HAND.tool]) for point in outside])
@@ -59,7 +64,7 @@ def test_the_fingers_close_from_tips_that_are_clear_of_the_object_by_as_much_as_
 
 @pytest.mark.slow
 def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(
-    planner: GraspPlanner,
+    planner: GraspPlanner, planned: PlannedGrasp
 ) -> None:
     turned = np.array([np.cos(0.5), 0.0, 0.0, np.sin(0.5)])
     moved = planner.plan(0, AT + np.array([0.006, -0.004, 0.003]), UPRIGHT)
@@ -70,13 +75,11 @@ def test_contacts_are_of_the_object_wherever_it_stands_and_however_it_is_turned(
         assert np.sqrt((found.contact[:, :2] ** 2).sum(axis=1)) == pytest.approx(
             np.full(4, CAN_RADIUS_M)
         )
-    straight = planner.plan(0, AT, UPRIGHT)
-    assert straight is not None
     spin = np.zeros(9)
     mujoco.mju_quat2Mat(spin, turned)
     # In the world it is the same grasp.
     again = [mat_vec(spin.reshape(3, 3), point) for point in rotated.contact]
-    assert np.array(again) == pytest.approx(straight.contact, abs=1e-6)
+    assert np.array(again) == pytest.approx(planned.contact, abs=1e-6)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from rack.levels.tables import PushConfig
 from tests.levels.arms import config
 from tests.levels.box import mute
 from tests.levels.lockstep import Operator
-from tests.levels.systems.hand.hand_rig import AMPLITUDE_RAD, CLOCK_NS, EVERY, HandRig, Swing
+from tests.levels.systems.hand.hand_rig import AMPLITUDE_RAD, CLOCK_NS, EVERY, HandRig
 
 FINGERS = ("index", "middle", "ring", "thumb")
 
@@ -298,9 +298,3 @@ def test_board_of_an_arm_drives_no_hand(kind: type[ArmExecutor | ServoExecutor])
         kind.__name__,
         "it drives an arm with motors; [robot.hand] is a hand of tendons",
     )
-
-
-def test_rig_swings_by_what_the_hand_has_sensed() -> None:
-    rig = swinging()
-    assert isinstance(rig.swing("thumb"), Swing)
-    assert rig.read("thumb.command").driven.tolist() == [0] * 12 + [1] * 4

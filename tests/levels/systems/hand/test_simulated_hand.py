@@ -11,7 +11,6 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import build_cell, sizes
-from rack.levels.robot.state import state_size
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.systems.hand.simulated import SimulatedHand
 from rack.levels.tables import SensorConfig
@@ -160,20 +159,6 @@ def test_a_restored_hand_continues_bit_for_bit(closes: bool) -> None:
     run(again, range(60, 90))
     assert saved(again).raw == saved(first).raw
     assert all(np.array_equal(a, b) for a, b in zip(again.sense(), first.sense(), strict=True))
-
-
-def test_state_of_the_simulation_holds_what_valves_remember() -> None:
-    hand = hand_of()
-    hand.pull(flexed(hand, INDEX1, 65.0))
-    hand.step(1)  # the command is still in the valve
-    again = hand_of()
-    again.restore(saved(hand))
-    for one in (hand, again):
-        one.pull(np.array(one.wanted))
-        one.step(EVERY)
-    assert hand.sense().tension[FLEXOR, INDEX1] > 16.0
-    assert np.array_equal(again.sense().tension, hand.sense().tension)
-    assert saved(hand).state.shape == (state_size(hand.cell.model),)
 
 
 def test_encoders_of_a_hand_may_be_coarse() -> None:

@@ -12,8 +12,8 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
+from rack.levels.systems.hand.laws import TendonGains, TendonLaw
 from rack.levels.systems.hand.messages import HAND_STATUS
-from rack.levels.systems.hand.tendon_law import TendonGains, TendonLaw
 from tests.levels.arms import cell, config
 
 EVERY, TICK_NS, LAG_S, SUBSTEPS = 4, 500_000, 0.008, 8
@@ -46,7 +46,7 @@ class Valves:
     def run(self, torque: Array, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD_S)):
             sensed, wanted = self.tension.copy(), self.wanted.copy()
-            self.law.tensions(torque, self.wanted)
+            self.law.tensions(self.status, torque, self.wanted)
             for _ in range(SUBSTEPS):
                 aim = self._gain * self.wanted + self._offset
                 self.tension += (aim - self.tension) * (
@@ -68,7 +68,7 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
     valves = Valves()
     hand = valves.hand
     torque = part * hand.torque
-    valves.law.tensions(torque, valves.wanted)
+    valves.law.tensions(valves.status, torque, valves.wanted)
     flexors, extensors = valves.wanted
     assert hand.arms * (flexors - extensors) == pytest.approx(torque)
     assert valves.wanted.min() >= hand.least
@@ -84,7 +84,7 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
 
 def test_a_torque_beyond_the_tendons_is_clipped_and_counted() -> None:
     valves = Valves()
-    valves.law.tensions(3.0 * valves.hand.torque, valves.wanted)
+    valves.law.tensions(valves.status, 3.0 * valves.hand.torque, valves.wanted)
     assert valves.wanted[0] == pytest.approx(valves.hand.most)
     assert valves.wanted[1] == pytest.approx(valves.hand.least)
     assert valves.law.clipped == 1
@@ -122,7 +122,7 @@ def test_a_sensor_that_gives_no_number_teaches_nothing() -> None:
     valves = Valves(gains=TendonGains())
     valves.status.tension[0, 0] = math.nan
     valves.status.tick += EVERY
-    valves.law.tensions(np.zeros(16), valves.wanted)
+    valves.law.tensions(valves.status, np.zeros(16), valves.wanted)
     assert np.isfinite(valves.wanted).all()
     valves.run(0.1 * valves.hand.torque, 2.0)
     assert np.isfinite(valves.tension[:, 1:]).all()
@@ -136,7 +136,7 @@ def test_tendons_of_other_boards_get_no_tension() -> None:
     law.start(status)
     tension = np.zeros((2, 16))
     status.tick += EVERY
-    law.tensions(0.1 * hand.torque, tension)
+    law.tensions(status, 0.1 * hand.torque, tension)
     assert (tension[:, ~hand.fingers[3]] == 0.0).all()
     assert (tension[:, hand.fingers[3]] >= hand.least).all()
 
@@ -150,5 +150,5 @@ def test_valves_that_are_closed_teach_nothing() -> None:
     for _ in range(500):
         valves.status.tick += EVERY
         valves.status.tension += 0.1
-        valves.law.tensions(torque, valves.wanted)
+        valves.law.tensions(valves.status, torque, valves.wanted)
     assert valves.wanted == pytest.approx(before)

@@ -7,7 +7,6 @@ from pathlib import Path
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.level import vocabulary
 from rack.levels.systems.state_table.table import StateTable, read_table
-from rack.levels.systems.state_table.vocabulary import Condition, Phrase
 from rack.levels.tables import Positive, Table
 
 DOOR = """
@@ -76,11 +75,11 @@ class DoorPlan(Table):
 
 DOORS = vocabulary(
     conditions={
-        "lock": Condition(("free", "stuck", "locked"), "the lock"),
-        "place": Condition(("open", "between", "shut"), "where the door is"),
+        "lock": ("free", "stuck", "locked"),
+        "place": ("open", "between", "shut"),
     },
-    commands={"open": Phrase((), "open the door"), "paint": Phrase(("colour",), "paint it")},
-    actions={"drive": Phrase((("slowly", "fast", "stop"),), "drive the door")},
+    commands={"open": (), "paint": ("colour",)},
+    actions={"drive": (("slowly", "fast", "stop"),)},
     plan=DoorPlan,
 )
 LEXICON = {"colour": ("red", "green")}

@@ -20,7 +20,7 @@ from rack.levels.systems.state_table.level import (
     StateTableExecutor,
     answer_of,
 )
-from rack.levels.systems.state_table.vocabulary import Lexicon
+from rack.levels.systems.state_table.table import Lexicon
 from rack.levels.tables import SceneConfig
 from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON
 

@@ -177,17 +177,6 @@ def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: s
     assert bench.level._curve is None
 
 
-def test_set_points_are_due_two_cycles_ahead_and_numbered_by_cycle(bench: Bench) -> None:
-    every = bench.context.every
-    released = bench.tick
-    bench.look()
-    command = bench.give()
-    assert (command.id, command.due) == (released // every + 1, released + 2 * every)
-    bench.below[1].stopped = 1
-    bench.look()
-    assert bench.give().due == 0
-
-
 @pytest.mark.parametrize(
     ("off", "arm"), [(0.009, "arrived"), (-0.009, "arrived"), (0.011, "moving")]
 )
@@ -333,16 +322,6 @@ def test_an_arm_without_a_gripper_is_refused(context: LevelContext) -> None:
         PrimitiveTable(replace(context, robot=robot))
 
 
-def test_inertia_and_load_are_those_at_the_set_point(bench: Bench) -> None:
-    bench.follow()
-    command = bench.write.command
-    at_home = command.inertia.copy(), command.load.copy()
-    bench.level._point[0] = bench.home + 0.4
-    bench.give()
-    assert not np.allclose(command.inertia, at_home[0])
-    assert not np.allclose(command.load, at_home[1])
-
-
 def test_whoever_changes_the_bytes_of_a_message_changes_its_version(context: LevelContext) -> None:
     kinds = (WORD_COMMAND, TABLE_STATUS, JOINT_MOVE, JOINT_MOVE_STATUS, MOVE_TABLE_STATUS)
     sizes = dict(context.sizes)
@@ -365,13 +344,18 @@ def test_a_set_point_is_due_two_cycles_after_its_release_and_carries_the_load_th
     bench.command(bench.home + 0.3)
     bench.look()
     assert level._due == bench.tick + 2 * every
+    released = bench.tick
     level.do_begin()
     # A new curve begins where the set point before ends.
     assert level._from == bench.tick + every
+    command = bench.give()
+    assert (command.id, command.due) == (released // every + 1, released + 2 * every)
     for _ in range(12):
         bench.follow()
-    command = bench.write.command
     assert np.abs(command.velocity).max() > 0.0
     inertia, bias = level._dynamics.terms(command.position, command.velocity)
     np.testing.assert_allclose(command.load, bias)
     np.testing.assert_allclose(command.inertia, np.diagonal(inertia))
+    bench.below[1].stopped = 1
+    bench.look()
+    assert bench.give().due == 0

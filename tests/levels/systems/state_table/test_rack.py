@@ -42,15 +42,6 @@ def test_it_picks_up_a_block_though_a_board_dies_on_the_way(rack_name: str) -> N
 
 
 @pytest.mark.slow
-def test_it_runs_alike_every_time(rack_name: str) -> None:
-    digests = []
-    for _ in range(2):
-        with Rack(load("nist-state-table", [f"name={rack_name}", "clock.mode=lockstep"])) as rack:
-            digests.append(rack.run(0.5).digest)
-    assert digests[0] == digests[1]
-
-
-@pytest.mark.slow
 def test_without_a_task_level_the_operator_commands_the_elemental_moves(rack_name: str) -> None:
     config = load(FOLDER / "direct.toml", [f"name={rack_name}", "clock.mode=lockstep", TASKLESS])
     with Rack(config) as rack:

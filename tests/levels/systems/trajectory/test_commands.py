@@ -94,23 +94,17 @@ def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> N
     assert arm.end_of(last) is RequestEnd.DONE
 
 
-def test_a_full_queue_is_waited_for_and_nothing_is_left_out() -> None:
-    level = Level(room=2)
+@pytest.mark.parametrize(("room", "loses"), [(2, ()), (100, (2,))], ids=["full", "lost"])
+def test_with_a_full_queue_or_a_lost_request_nothing_is_left_out(
+    room: int, loses: tuple[int, ...]
+) -> None:
+    level = Level(room=room)
+    level.loses = {*loses}
     arm = motions(level)
     for _ in range(10):
         arm.stay(0.1)
     assert arm.wait()
     assert [request["id"] for request in level.done] == [*range(1, 11)]
-
-
-def test_a_request_that_is_lost_is_sent_again_with_those_after_it() -> None:
-    level = Level()
-    level.loses = {2}
-    arm = motions(level)
-    for _ in range(4):
-        arm.stay(0.1)
-    assert arm.wait()
-    assert [request["id"] for request in level.done] == [1, 2, 3, 4]
 
 
 def test_a_process_that_is_restarted_cancels_first_and_numbers_beyond_all_before() -> None:

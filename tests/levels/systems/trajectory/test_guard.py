@@ -3,6 +3,8 @@ does not."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
@@ -50,37 +52,39 @@ def test_a_touch_ends_the_line_and_the_next_request_goes_on_from_there(
     assert max(rig.excess()) <= 1.0
 
 
-def test_less_than_the_guard_is_no_touch(rig: TrajectoryRig) -> None:
-    press(rig, 0.9 * MOST)
-    assert end(rig) == RequestEnd.NONE
-
-
-def test_what_is_over_at_once_is_no_touch(rig: TrajectoryRig) -> None:
+def at_once(rig: TrajectoryRig) -> float:
     press(rig, TOUCH)
     rig.cycle()
-    press(rig, -TOUCH)
-    assert end(rig) == RequestEnd.NONE
+    return -TOUCH
 
 
-def test_a_change_across_a_hold_is_no_touch(rig: TrajectoryRig) -> None:
+def across_a_hold(rig: TrajectoryRig) -> float:
     rig.brake()
     rig.level.process(rig._read(), rig.write, rig.tick)
     rig.tick += EVERY
-    press(rig, TOUCH)
-    assert end(rig) == RequestEnd.NONE
+    return TOUCH
 
 
-def test_a_change_across_missed_cycles_of_the_level_is_no_touch(rig: TrajectoryRig) -> None:
+def across_missed_cycles(rig: TrajectoryRig) -> float:
     rig.tick += 2 * EVERY
-    press(rig, TOUCH)
-    assert end(rig) == RequestEnd.NONE
+    return TOUCH
 
 
-def test_a_change_across_a_stale_status_is_no_touch(rig: TrajectoryRig) -> None:
+def across_a_stale_status(rig: TrajectoryRig) -> float:
     rig.lost = {next(iter(rig.statuses))}
     rig.cycle()
     rig.lost = set()
-    press(rig, TOUCH)
+    return TOUCH
+
+
+@pytest.mark.parametrize(
+    "before",
+    [lambda rig: 0.9 * MOST, at_once, across_a_hold, across_missed_cycles, across_a_stale_status],
+)
+def test_a_change_that_is_no_touch(
+    rig: TrajectoryRig, before: Callable[[TrajectoryRig], float]
+) -> None:
+    press(rig, before(rig))
     assert end(rig) == RequestEnd.NONE
 
 

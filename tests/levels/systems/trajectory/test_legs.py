@@ -42,7 +42,7 @@ def test_two_legs_begun_half_a_blend_apart_are_one_straight_motion() -> None:
 
 @pytest.mark.slow
 @given(parts, times, st.floats(0.0, 2.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_a_leg_takes_half_the_acceleration_at_most(
     change: list[float], half: float, segment: float
 ) -> None:
@@ -62,7 +62,7 @@ def test_a_leg_takes_half_the_acceleration_at_most(
 
 @pytest.mark.slow
 @given(parts, parts, st.floats(0.1, 1.0))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_a_ramp_to_rest_continues_its_state_within_the_limits(
     v: list[float], a: list[float], least: float
 ) -> None:

@@ -17,8 +17,7 @@ from rack.levels.messages import TASK_STATUS, WORLD_MODEL, Error
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, MotionKind
-from rack.levels.systems.trajectory.planner import RequestExecutor, RequestPlanner
-from rack.levels.systems.trajectory.program import MotionProgram
+from rack.levels.systems.trajectory.planner import MotionProgram, RequestExecutor, RequestPlanner
 from tests.levels.arms import config
 
 ROBOT, SCENE = config("puma560_crossing")
