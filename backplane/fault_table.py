@@ -35,7 +35,7 @@ class Stage(IntEnum):
     OVER = 3
 
 
-class Entry(IntEnum):
+class Entry:
     """Words of an entry. Once it waits, the clock writes STAGE, FROM and UNTIL, its actor the
     rest."""
 
@@ -84,7 +84,7 @@ class FaultEntry:
         first = address + 8 * Entry.PARAMETER
         self.parameters = segment.view(first, 8 * PARAMETERS).cast("d")
 
-    def __getitem__(self, word: Entry) -> int:
+    def __getitem__(self, word: int) -> int:
         """Return a word of the entry."""
         return self.words[word]
 

@@ -47,7 +47,7 @@ class Client(IntEnum):
     LEASES = 2  # the same, and in force only while its client lives
 
 
-class RequestWord(IntEnum):
+class RequestWord:
     """Words of an entry. The host fills a free one; from then on the clock writes STAGE, SERIAL and
     GIVEN_TICK."""
 
@@ -78,10 +78,10 @@ class RequestEntry:
         size = operator_entry_size(segment.layout)
         address = segment.map.operator + index * size
         self.index = index
-        self.words = segment.words[address // 8 : address // 8 + len(RequestWord)]
+        self.words = segment.words[address // 8 : (address + OPERATOR_HEAD_SIZE) // 8]
         self.message = segment.view(address + OPERATOR_HEAD_SIZE, size - OPERATOR_HEAD_SIZE)
 
-    def __getitem__(self, word: RequestWord) -> int:
+    def __getitem__(self, word: int) -> int:
         """Return a word of the entry."""
         return self.words[word]
 

@@ -20,7 +20,7 @@ from zlib import crc32
 
 import posix_ipc
 
-from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
+from rack.backplane.address_map import BLOCK_SIZE, HEAD_SIZE, MAILBOX_HEAD_SIZE, AddressMap, pages
 from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
@@ -32,7 +32,7 @@ from rack.backplane.layout import (
     MailboxSpec,
     TaskSpec,
 )
-from rack.backplane.words import Block, Box, Head, Run, System
+from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 16
@@ -265,7 +265,7 @@ class Segment:
     def block(self, task: str) -> memoryview:
         """Return a task's control block, as words (`words.Block`). Raises `KeyError`."""
         start = self.map.blocks[task] // 8
-        return self.words[start : start + max(Block) + 1]
+        return self.words[start : start + BLOCK_SIZE // 8]
 
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task by `tick`. Releases since its last cycle are skipped ones as
@@ -279,7 +279,7 @@ class Segment:
     def box(self, mailbox: str) -> memoryview:
         """Return the head of a mailbox, as words (`words.Box`). Raises `KeyError`."""
         start = self.map.mailboxes[mailbox] // 8
-        return self.words[start : start + len(Box)]
+        return self.words[start : start + MAILBOX_HEAD_SIZE // 8]
 
     def is_locked(self, address: int) -> bool:
         """Say whether a process holds the lock on the byte at a bus address: see

@@ -48,7 +48,7 @@ OF_SYSTEM = (
     System.COMMANDED,
     System.HELD,
 )
-STRIKE = tuple(word for word in Entry if word not in (Entry.STRUCK_NS, Entry.PARAMETER))
+STRIKE = tuple(word for word in range(Entry.PARAMETER) if word != Entry.STRUCK_NS)
 BY_CHANCE = ("died", "restart", "given_up")
 """Codes of events that the Rack learns of from the kernel, at no certain tick."""
 TIMELESS = ("tick", "flags", "state")

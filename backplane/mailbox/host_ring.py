@@ -21,10 +21,6 @@ from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
-_HEAD = int(Box.HEAD)
-_TAKEN = int(Box.TAKEN)
-_REFUSED = int(Box.REFUSED)
-
 
 class HostWriter(DoubleBufferWriter):
     """The host board's end of a ring. Opening it claims the mailbox, as any writer does."""
@@ -36,13 +32,13 @@ class HostWriter(DoubleBufferWriter):
     @property
     def is_full(self) -> bool:
         """Whether as many messages wait as the ring holds."""
-        return self._box[_HEAD] - self._box[_TAKEN] >= self.spec.capacity
+        return self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity
 
     def send(self, tick: int) -> bool:
         """Publish `message`, written at `tick`; return False, and count it, when the ring is
         full."""
         if self.is_full:
-            self._box[_REFUSED] += 1
+            self._box[Box.REFUSED] += 1
             return False
         return self.write(tick)
 
@@ -64,12 +60,12 @@ class HostReader:
     @property
     def waiting(self) -> int:
         """Messages that wait, at most the slots of the ring."""
-        return min(max(0, self._box[_HEAD] - self._box[_TAKEN]), self.spec.depth)
+        return min(max(0, self._box[Box.HEAD] - self._box[Box.TAKEN]), self.spec.depth)
 
     @property
     def full(self) -> int:
         """How often the writer found the ring full."""
-        return self._box[_REFUSED]
+        return self._box[Box.REFUSED]
 
     @property
     def written(self) -> int:
@@ -78,20 +74,20 @@ class HostReader:
 
     def take(self) -> Message | None:
         """Take the oldest message that waits; None if it is bad. Valid until the next call."""
-        head = self._box[_HEAD]
-        oldest = self._box[_TAKEN] + 1
+        head = self._box[Box.HEAD]
+        oldest = self._box[Box.TAKEN] + 1
         # Only a writer that does not keep to the rules overwrites what waits.
         serial = max(oldest, head - self.spec.depth + SPARE)
         self.superseded += serial - oldest
-        self._box[_TAKEN] = serial
+        self._box[Box.TAKEN] = serial
         return self._fetched(serial)
 
     def take_newest(self, most: int) -> Message | None:
         """Take all that wait and return the newest good one, looking at no more than `most`; None:
         there is none."""
         waiting = self.waiting
-        head = self._box[_HEAD]
-        self._box[_TAKEN] = head
+        head = self._box[Box.HEAD]
+        self._box[Box.TAKEN] = head
         for back in range(min(waiting, most)):
             if (message := self._fetched(head - back)) is not None:
                 self.superseded += waiting - back - 1

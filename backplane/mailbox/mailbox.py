@@ -29,8 +29,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
 # Plain integers for the hot path.
-_VISIBLE = int(Slot.VISIBLE_AT)
-_HEAD = Struct(f"@{len(Slot)}Q").unpack_from
+_HEAD = Struct("@8Q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -226,7 +225,7 @@ class Reader:
             oldest = last if serial - last < self._depth else serial - self._depth
             heads = self._heads
             mask = self._mask
-            while serial > oldest and heads[serial & mask][_VISIBLE] > tick:
+            while serial > oldest and heads[serial & mask][Slot.VISIBLE_AT] > tick:
                 serial -= 1
         self.found = serial
         if serial == last:

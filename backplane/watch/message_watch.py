@@ -21,8 +21,6 @@ from rack.backplane.words import Slot
 
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
-# Plain integers for the hot path.
-_CHAIN, _CHECK, _, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[2:])
 
 
 class ReadFindings:
@@ -118,14 +116,14 @@ class MessageWatch(ReadFindings):
         # A late reader cannot judge messages that are overwritten.
         for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
             head, body = heads_and_bodies[serial & mask]
-            released = head[_TICK]
+            released = head[Slot.TICK]
             # The reader has checked the message that it took, and only that one.
             if (
-                head[_SERIAL] == serial
-                and self.newest < released > head[_VISIBLE] - late
+                head[Slot.SERIAL] == serial
+                and self.newest < released > head[Slot.VISIBLE_AT] - late
                 and (
                     serial == taken
-                    or xxh3(body, head[_CHAIN] & UNSIGNED) == head[_CHECK] & UNSIGNED
+                    or xxh3(body, head[Slot.CHAIN] & UNSIGNED) == head[Slot.CHECK] & UNSIGNED
                 )
                 and slots.keeps(serial)
             ):

@@ -24,10 +24,6 @@ MUTE_CYCLES = 3
 """Age in cycles of the writer from which silence is investigated; two are normal."""
 STALE_CYCLES = 4
 LONG_AGO = -(1 << 62)
-_LOST = int(Block.LOST)
-_CLAIMANT = int(Box.CLAIMANT)
-_VOID = int(Box.VOID)
-_KEPT = int(Box.KEPT)
 
 
 class ReadingTask:
@@ -100,14 +96,16 @@ class SilenceWatch:
         cause is proven."""
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
-            is_old = tick - self._reader.basis > max_age and not is_on(box[_KEPT], tick)
-            return is_old or is_on(box[_VOID], tick) or self.is_writer_lost(tick)
+            is_old = tick - self._reader.basis > max_age and not is_on(box[Box.KEPT], tick)
+            return is_old or is_on(box[Box.VOID], tick) or self.is_writer_lost(tick)
         newest = self._reader.newest
         age = tick - newest
         if age >= self.quiet:
-            pid = pid_of(self._slots.box[_CLAIMANT])
+            pid = pid_of(self._slots.box[Box.CLAIMANT])
             # The loss may be marked already, and a new process may exist that does not cycle yet.
-            if age >= self._stale_after and (self._block[_LOST] or self._task.is_gone(pid, tick)):
+            if age >= self._stale_after and (
+                self._block[Block.LOST] or self._task.is_gone(pid, tick)
+            ):
                 self._report(Alarm.STALE, tick, age)
             elif self._is_mute(tick):
                 self._report(Alarm.MUTE, tick, age)
@@ -119,7 +117,7 @@ class SilenceWatch:
         """Say whether the writer is lost, however old its messages are."""
         # From the tick after the loss: within that tick the answer would depend on which process is
         # faster.
-        return self._reader.newest != NOT_YET and 0 < self._block[_LOST] <= tick
+        return self._reader.newest != NOT_YET and 0 < self._block[Block.LOST] <= tick
 
     def _is_mute(self, tick: int) -> bool:
         """Say whether the writer has finished a release that writes a message, and the newest is of

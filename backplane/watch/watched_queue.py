@@ -17,12 +17,6 @@ from rack.backplane.watch.message_watch import MessageWatch
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.words import Block, Slot
 
-# Plain integers for the hot path.
-_LOST = int(Block.LOST)
-_SERIAL = int(Slot.SERIAL)
-_TICK = int(Slot.TICK)
-_VISIBLE = int(Slot.VISIBLE_AT)
-
 
 class QueueWatch(MessageWatch):
     """Judges the messages that the reader of a queue has taken, several of one release among
@@ -41,13 +35,13 @@ class QueueWatch(MessageWatch):
         for serial in range(self.seen + 1, queue.taken + 1):
             # Its slot is the writer's again only when the writer learns that it has been taken.
             head = slots.heads[serial & slots.mask]
-            if head[_SERIAL] != serial:
+            if head[Slot.SERIAL] != serial:
                 continue
-            released = head[_TICK]
-            if self.newest <= released > head[_VISIBLE] - self.late_from:
+            released = head[Slot.TICK]
+            if self.newest <= released > head[Slot.VISIBLE_AT] - self.late_from:
                 self.newest = released
             elif slots.copy(serial):
-                self._judge_time(released, head[_VISIBLE], tick)
+                self._judge_time(released, head[Slot.VISIBLE_AT], tick)
         self.seen = queue.taken
         if queue.statistics.lost != self._lost:
             lost = queue.statistics.lost - self._lost
@@ -92,4 +86,4 @@ class WatchedQueue:
         """Say whether the writer is lost."""
         # From the tick after the loss: within that tick the answer would depend on which process is
         # faster.
-        return 0 < self._writer[_LOST] <= tick
+        return 0 < self._writer[Block.LOST] <= tick

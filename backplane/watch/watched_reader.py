@@ -18,8 +18,6 @@ from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
 from rack.backplane.watch.watched_queue import WatchedQueue
 from rack.backplane.words import Block
 
-_LOST = int(Block.LOST)
-
 
 def everything() -> int:
     """Return room for every message."""
@@ -88,9 +86,9 @@ class WatchedReader:
                 messages.newest = newest
             else:
                 messages.judge(tick)
-        if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(
-            tick
-        ):
+        if (
+            tick - reader.newest >= self._quiet or self._writer[Block.LOST]
+        ) and self._silence.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 

@@ -23,8 +23,6 @@ from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 from rack.levels.messages import ARM_STATE
 
-_DEMAND = int(System.DEMAND)
-_CLOCK_SKIPPED = int(System.CLOCK_SKIPPED)
 _DEMANDS = tuple(Demand)
 
 
@@ -96,7 +94,7 @@ class VirtualControlLoop(Task):
         if watch.is_late:
             self._handle_delay(tick)
         guard = self._guard
-        if guard is not None and self.words[_CLOCK_SKIPPED] != guard.reported:
+        if guard is not None and self.words[System.CLOCK_SKIPPED] != guard.reported:
             guard.report_skipped(tick)
         if self.inputs.reads_plan:
             self.exchange(tick)
@@ -122,7 +120,7 @@ class VirtualControlLoop(Task):
         """Let the level process, given the demand on the arm; then report its findings and the
         faults that acted."""
         executor = self.executor
-        executor.demand = _DEMANDS[self.words[_DEMAND]]
+        executor.demand = _DEMANDS[self.words[System.DEMAND]]
         executor.process(self.inputs.values, self.outputs.messages, tick)
         for complete_cycle in executor.complete_cycle:
             complete_cycle(self._arm_state)

@@ -19,11 +19,6 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.words import Block
 
-# Plain integers for the hot path.
-_COUNT = int(Block.INTERRUPTS)
-_LOST = int(Block.INTERRUPTS_LOST)
-_WAITING = int(Block.INTERRUPTS_WAITING)
-
 
 class InterruptHandler:
     """Serves the interrupts of a task's board: charges their time, counts them, and reports those
@@ -61,19 +56,19 @@ class InterruptHandler:
         self._cycles += 1
         inbox.advance(tick)
         if inbox.count != self._served:
-            self._block[_COUNT] += inbox.count - self._served
+            self._block[Block.INTERRUPTS] += inbox.count - self._served
             self._served = inbox.count
             if self._takes_time:
                 compute_until(begun_ns + inbox.service_ns - self._service_ns)
             self._service_ns = inbox.service_ns
-        if inbox.inbox.most_waiting > self._block[_WAITING]:
-            self._block[_WAITING] = inbox.inbox.most_waiting
+        if inbox.inbox.most_waiting > self._block[Block.INTERRUPTS_WAITING]:
+            self._block[Block.INTERRUPTS_WAITING] = inbox.inbox.most_waiting
         if inbox.inbox.lost != sum(self._lost):
             # Count the messages lost in the inbox, and raise an alarm for each mailbox.
             for at, (line, episodes) in enumerate(self._lines):
                 if lost := line.lost - self._lost[at]:
                     self._lost[at] = line.lost
-                    self._block[_LOST] += lost
+                    self._block[Block.INTERRUPTS_LOST] += lost
                     episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
 
 

@@ -40,17 +40,6 @@ tick."""
 SILENT_NS = 1_000_000_000
 """Real time, at the clock's own speed, after which an operator within a lease is gone that was not
 heard."""
-# Plain integers for the hot path.
-_LOSSES, _EMERGENCY, _REQUESTED, _INJECTED, _PEER_STOP = (
-    int(word)
-    for word in (
-        System.LOSSES,
-        System.EMERGENCY_STOP,
-        System.REQUESTED,
-        System.INJECTED,
-        System.PEER_STOP,
-    )
-)
 
 
 class SystemController:
@@ -74,15 +63,15 @@ class SystemController:
         words = self._words
         faults = self._faults
         desk = self._desk
-        if tick >= faults.next_tick or words[_INJECTED] != faults.injected:
+        if tick >= faults.next_tick or words[System.INJECTED] != faults.injected:
             faults.advance(tick)
-        if tick >= desk.next_tick or words[_REQUESTED] != desk.requested:
+        if tick >= desk.next_tick or words[System.REQUESTED] != desk.requested:
             desk.advance(tick)
         if self._settled != (
-            words[_LOSSES],
+            words[System.LOSSES],
             self._driver.watchdog.losses,
-            words[_EMERGENCY],
-            words[_PEER_STOP],
+            words[System.EMERGENCY_STOP],
+            words[System.PEER_STOP],
         ):
             self._handle_losses(tick)
 
@@ -101,15 +90,15 @@ class SystemController:
         """Let restarted boards rejoin, latch for those given up, and set the demand for all other
         losses."""
         words = self._words
-        seen = words[_LOSSES], self._driver.watchdog.losses
+        seen = words[System.LOSSES], self._driver.watchdog.losses
         processes = self._driver.processes
         for task in processes:
             if task.is_lost:
                 self._handle_loss(task, tick)
         lost = [task for task in processes if task.is_lost]
         # Read before they are acted on: a change in between is handled at the next tick.
-        emergency = words[_EMERGENCY]
-        peer = words[_PEER_STOP]
+        emergency = words[System.EMERGENCY_STOP]
+        peer = words[System.PEER_STOP]
         self._set_demand(lost, tick)
         # So is a switch that lies ahead.
         self._settled = (*seen, emergency, peer) if not lost and peer >> 1 <= tick else None
@@ -130,7 +119,7 @@ class SystemController:
             task.rejoin()
         elif task.is_given_up:
             # Even if the latch is already set, as it is before the start.
-            self._words[_EMERGENCY] = 1
+            self._words[System.EMERGENCY_STOP] = 1
             # Time for the arm to come to rest before the run ends.
             ends = tick + self._wiring.linger
             self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
@@ -139,9 +128,9 @@ class SystemController:
         asked = [
             (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
         ]
-        if self._words[_EMERGENCY]:
+        if self._words[System.EMERGENCY_STOP]:
             asked.append((Demand.BRAKE, -1))
-        if is_on(self._words[_PEER_STOP], tick):
+        if is_on(self._words[System.PEER_STOP], tick):
             asked.append((Demand.STOP, PEER))
         demand, subject = max(asked, default=(Demand.NONE, -1))
         if demand != self._demand:
@@ -187,8 +176,8 @@ class OperatorDesk:
 
     def advance(self, tick: int) -> None:
         """Issue all commands due at `tick`."""
-        if self._words[_REQUESTED] != self.requested:
-            self.requested = self._words[_REQUESTED]
+        if self._words[System.REQUESTED] != self.requested:
+            self.requested = self._words[System.REQUESTED]
             self._waiting = self._table.waiting()
             self._leased = self._table.leased()
         for entry in list(self._leased):

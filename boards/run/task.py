@@ -22,10 +22,6 @@ from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
-# Plain integers for the hot path.
-_FAULTS, _TICK_NS, _TICK, _CLOCK_SKIPPED, _SKIPPED_FROM = (
-    int(System[name]) for name in ("FAULTS", "TICK_NS", "TICK", "CLOCK_SKIPPED", "SKIPPED_FROM")
-)
 PUNCTUAL_TICKS = 20
 """Number of punctual ticks that ends an episode of late ones."""
 _P = ParamSpec("_P")
@@ -80,7 +76,7 @@ class Task(ABC):
         tick = self.next_cycle.wait()
         if tick is None:
             return None
-        if self.words[_FAULTS] != self._generation:
+        if self.words[System.FAULTS] != self._generation:
             self._generation = self.faults.refresh(tick)
         return tick
 
@@ -110,21 +106,21 @@ class ClockGuard:
     def report_skipped(self, tick: int) -> None:
         """Report the ticks skipped since the last report, in the cycle released at `tick`."""
         words = self._words
-        since = words[_SKIPPED_FROM]
+        since = words[System.SKIPPED_FROM]
         # A task may begin so late that the clock has skipped ticks since its release: that is for
         # its next cycle.
         if tick >= since:
-            counted = words[_CLOCK_SKIPPED]
+            counted = words[System.CLOCK_SKIPPED]
             self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=counted - self.reported, since=since)
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
     def check_release(self, tick: int) -> None:
         """Check whether the clock was late, in a cycle released at `tick` that begins late."""
         words = self._words
-        late_ns = words[_TICK_NS] - self._clock.time_of(tick)
+        late_ns = words[System.TICK_NS] - self._clock.time_of(tick)
         # Checked after the read: the time is this tick's only if the clock has not advanced
         # meanwhile.
-        if self._clock.is_lockstep or words[_TICK] != tick:
+        if self._clock.is_lockstep or words[System.TICK] != tick:
             return
         if late_ns > self._late_ns:
             if tick >= self._quiet_from:

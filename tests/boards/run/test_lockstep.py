@@ -102,7 +102,7 @@ def test_real_time_is_lockstep_up_to_its_first_miss(
         )
 
 
-def counted(rack: Rack, *words: Block) -> int:
+def counted(rack: Rack, *words: int) -> int:
     """Return the sum of these words over all tasks."""
     return sum(
         rack.segment.block(task.name)[word] for task in rack.segment.layout.tasks for word in words

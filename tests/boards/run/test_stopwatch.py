@@ -51,7 +51,7 @@ class Site:
         row = self._ring.drain().rows[-1]
         return dict(zip(row.dtype.names, row.tolist(), strict=True))
 
-    def counts(self, *words: Block) -> list[int]:
+    def counts(self, *words: int) -> list[int]:
         """Return words of the control block."""
         return [self.block[word] for word in words]
 
