@@ -8,6 +8,26 @@ integers: a member of an enum takes as long to look up as three words take to re
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Protocol
+
+
+class OnWords(Protocol):
+    """What consists of words of shared memory."""
+
+    words: memoryview
+
+
+class Word:
+    """A word at a place among the `words` of an object, as an attribute."""
+
+    def __init__(self, place: int) -> None:
+        self._place = place
+
+    def __get__(self, owner: OnWords, kind: type) -> int:
+        return owner.words[self._place]  # type: ignore[no-any-return]
+
+    def __set__(self, owner: OnWords, value: int) -> None:
+        owner.words[self._place] = value
 
 
 def switch(tick: int, is_on: bool) -> int:

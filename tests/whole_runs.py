@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.fault_table import FAULT_WORDS, FaultTable, Stage
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
@@ -48,7 +48,7 @@ OF_SYSTEM = (
     System.COMMANDED,
     System.HELD,
 )
-STRIKE = tuple(word for word in range(Entry.PARAMETER) if word != Entry.STRUCK_NS)
+STRIKE = tuple(word for word in range(FAULT_WORDS) if word != 13)
 BY_CHANCE = ("died", "restart", "given_up")
 """Codes of events that the Rack learns of from the kernel, at no certain tick."""
 TIMELESS = ("tick", "flags", "state")
@@ -79,7 +79,7 @@ def whole_run(config: RackConfig, seconds: float) -> Mapping[str, object]:
         outcome = rack.run(seconds)
         counts = counted(rack.segment)
         struck = [
-            [*(entry[word] for word in STRIKE), *entry.parameters]
+            [*(entry.words[word] for word in STRIKE), *entry.parameters]
             for entry in FaultTable(rack.segment).staged(tuple(Stage)[1:])
         ]
         events = sorted({_of_event(event) for event in rack.events})

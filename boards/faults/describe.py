@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.checked import as_whole, pick
-from rack.backplane.fault_table import NEVER, Entry, FaultEntry, Stage
+from rack.backplane.checked import as_named, as_whole, pick
+from rack.backplane.fault_table import NEVER, FaultEntry, Stage
 from rack.backplane.layout import Layout
 from rack.boards.faults.kind import kind_of
 
@@ -16,13 +16,13 @@ ALL_JOINTS = "all joints"
 
 def board_of(entry: FaultEntry, layout: Layout) -> str:
     """Return the task that a fault strikes; "clock" for the clock."""
-    return CLOCK if (at := entry[Entry.TASK]) < 0 else pick(layout.processes, at, "task").name
+    return CLOCK if (at := entry.task) < 0 else pick(layout.processes, at, "task").name
 
 
 def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
     """Return the mailbox or the joint that a fault affects; empty if it affects its task alone."""
-    if entry[Entry.MAILBOX] >= 0:
-        return pick(layout.mailboxes, entry[Entry.MAILBOX], "mailbox").name
+    if entry.mailbox >= 0:
+        return pick(layout.mailboxes, entry.mailbox, "mailbox").name
     joint = kind_of(entry).values(entry).get("joint")
     return "" if joint is None else joint_name(as_whole(joint), joints)
 
@@ -37,13 +37,13 @@ def joint_name(at: int, joints: Sequence[str]) -> str:
 def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
     """Return an entry as plain data. Unknown ticks are -1, an unknown `until` is None."""
     kind = kind_of(entry)
-    stage = entry.stage
+    stage = as_named(Stage, entry.stage)
     mailbox = ""
-    if entry[Entry.MAILBOX] >= 0:
-        mailbox = pick(layout.mailboxes, entry[Entry.MAILBOX], "mailbox").name
+    if entry.mailbox >= 0:
+        mailbox = pick(layout.mailboxes, entry.mailbox, "mailbox").name
     until = None
-    if stage in (Stage.ACTIVE, Stage.OVER) and entry[Entry.UNTIL] != NEVER:
-        until = entry[Entry.UNTIL]
+    if stage in (Stage.ACTIVE, Stage.OVER) and entry.until != NEVER:
+        until = entry.until
     return {
         "fault": entry.index,
         "kind": kind.name,
@@ -52,11 +52,11 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
         "parameters": kind.values(entry),
         "text": describe(entry, layout, joints),
         "stage": stage.name.lower(),
-        "begins": entry[Entry.FROM],
+        "begins": entry.tick,
         "until": until,
-        "ticks": entry[Entry.TICKS],
-        "struck_tick": entry[Entry.STRUCK_TICK],
-        "acted": entry[Entry.COUNT],
+        "ticks": entry.ticks,
+        "struck_tick": entry.struck_tick,
+        "acted": entry.count,
     }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
-from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.fault_table import FaultEntry
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import Reader, Writer
@@ -199,7 +199,7 @@ class OutputPorts:
             chosen = [
                 entry
                 for entry in faults
-                if entry[Entry.MAILBOX] in (-1, index)
+                if entry.mailbox in (-1, index)
                 and not (port in self._queues and kind_of(entry).not_queued)
             ]
             if chosen or port in self._faulty:

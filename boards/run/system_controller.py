@@ -24,7 +24,6 @@ from rack.backplane.operator_table import (
     OperatorTable,
     RequestEntry,
     RequestStage,
-    RequestWord,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
@@ -182,44 +181,43 @@ class OperatorDesk:
             self._leased = self._table.leased()
         for entry in list(self._leased):
             self._check_lease(entry, tick)
-        for entry in [entry for entry in self._waiting if entry[RequestWord.TICK] <= tick]:
+        for entry in [entry for entry in self._waiting if entry.tick <= tick]:
             self._waiting.remove(entry)
             # Mark first, then check that it still waits; a client that withdraws it uses the
             # opposite order.
-            entry.words[RequestWord.GIVEN_TICK] = tick
+            entry.given_tick = tick
             if self._table.is_waiting(entry):
                 self._give(entry, tick)
             else:
-                entry.words[RequestWord.GIVEN_TICK] = -1
-        due = [tick + 1] if self._leased else [entry[RequestWord.TICK] for entry in self._waiting]
+                entry.given_tick = -1
+        due = [tick + 1] if self._leased else [entry.tick for entry in self._waiting]
         self.next_tick = min(due, default=sys.maxsize)
 
     def _give(self, entry: RequestEntry, tick: int) -> None:
-        words = entry.words
-        writer = self._writers[entry[RequestWord.MAILBOX]]
-        if not words[RequestWord.SERIAL]:
+        writer = self._writers[entry.mailbox]
+        if not entry.serial:
             # If the clock dies after this line, its successor issues the command again, under the
             # same serial.
             self._words[System.COMMANDED] += 1
-            words[RequestWord.SERIAL] = self._words[System.COMMANDED]
+            entry.serial = self._words[System.COMMANDED]
         message = writer.message
         message.raw[:] = entry.message[: len(message.raw)]
-        message.id = words[RequestWord.SERIAL]
+        message.id = entry.serial
         writer.write(tick, self._clock.now())
-        words[RequestWord.STAGE] = RequestStage.GIVEN
+        entry.stage = RequestStage.GIVEN
         if message.what not in (*SETTINGS, *DRIVES):
-            self._newest[words[RequestWord.MAILBOX]] = message.id
-        self._alarms.ring(tick, Alarm.COMMANDED, entry.index, words[RequestWord.SERIAL])
-        if words[RequestWord.CLIENT] == Client.LEASES:
+            self._newest[entry.mailbox] = message.id
+        self._alarms.ring(tick, Alarm.COMMANDED, entry.index, entry.serial)
+        if entry.client == Client.LEASES:
             self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
         """Have a level hold whose operator has gone while the command is in force."""
-        mailbox = entry[RequestWord.MAILBOX]
+        mailbox = entry.mailbox
         if self._is_over(entry):
             self._table.release(entry)
-        if entry[RequestWord.CLIENT] == Client.LEASES:
-            heard = max(entry[RequestWord.GIVEN_TICK], entry[RequestWord.HEARD])
+        if entry.client == Client.LEASES:
+            heard = max(entry.given_tick, entry.heard)
             if self._table.client_lives(entry) and tick - heard <= self._silent:
                 return
             # At once, without a request: there may be no room for one.
@@ -235,8 +233,8 @@ class OperatorDesk:
     def _is_over(self, entry: RequestEntry) -> bool:
         """Return whether the level has refused the command, or accepted a newer one in its
         place."""
-        mailbox = entry[RequestWord.MAILBOX]
-        serial = entry[RequestWord.SERIAL]
+        mailbox = entry.mailbox
+        serial = entry.serial
         newest = self._newest.get(mailbox, 0)
         if mailbox not in self._statuses:
             return newest > serial

@@ -12,7 +12,7 @@ import pytest
 
 from rack.backplane import semaphores
 from rack.backplane.errors import MailboxError
-from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock, open_writer
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.process import die_with_parent, set_priority, take_processor
@@ -281,9 +281,9 @@ def test_the_load_of_a_fault_is_computed_in_its_cycle(bench: MakeBench) -> None:
     at = [task.name for task in rack.segment.layout.processes].index("wave")
     kind = KINDS["overrun"]
     entry = FaultTable(rack.segment).add(Injection(kind.number, at, parameters=(0.0, 0.0)))
-    entry.words[Entry.STAGE] = Stage.ACTIVE
+    entry.stage = Stage.ACTIVE
     wave.faults.refresh(0)
     rack.to(0)
     wave.cycle(0)
-    assert entry[Entry.COUNT] == 1
-    assert entry[Entry.STRUCK_TICK] == 0
+    assert entry.count == 1
+    assert entry.struck_tick == 0
