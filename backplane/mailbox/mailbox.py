@@ -86,6 +86,8 @@ class Writer:
         """Accesses so far that timed out because a dead or stopped process held the lock."""
         self.held = 0
         """Messages that injected faults hold back."""
+        self.refused = 0
+        """Messages of a queue that this writer has refused because it was full."""
         self.intruder = 0
         """Another process that has published since this writer's last message but one; 0: none."""
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)

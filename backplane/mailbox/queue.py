@@ -94,8 +94,6 @@ class QueueWriter(Writer):
         self._shared[Box.SENT] = self.serial
         self.message = sending(slots.message, self._send, self.room)
         self.taken = 0
-        self.refused = 0
-        """Messages refused by this writer, because the queue was full."""
         self._pending: list[bytes] = []
         self._shown_at = 0
 

@@ -40,6 +40,7 @@ class Stopwatch:
         self._clock = SystemClock(segment)
         self._inputs = inputs
         self._outputs = outputs
+        self._traffic = inputs.traffic + outputs.traffic
         self._reading = inputs.task
         self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
@@ -164,13 +165,11 @@ class Stopwatch:
     def count_bus(self) -> None:
         """Update the bus counters of the control block; doing so in every cycle would cost too
         much."""
-        reads = self._inputs.take_traffic()
-        writes = self._outputs.take_traffic()
-        block = self._block
-        block[Block.READS] += reads[0]
-        block[Block.READ_BYTES] += reads[1]
-        block[Block.WRITES] += writes[0]
-        block[Block.WRITE_BYTES] += writes[1]
+        before = self._traffic
+        self._traffic = self._inputs.traffic + self._outputs.traffic
+        words = (Block.READS, Block.READ_BYTES, Block.WRITES, Block.WRITE_BYTES)
+        for word, count, counted in zip(words, self._traffic, before, strict=True):
+            self._block[word] += count - counted
 
 
 def _state_of(outputs: OutputPorts) -> tuple[int, memoryview]:

@@ -328,16 +328,3 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
             os.kill(pid, signal.SIGCONT)
             assert exit_status(pid) == 0
             assert rack.reader.cycle(6).value.id == 4
-
-
-def test_the_counters_of_a_port_continue_from_call_to_call(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 8)
-    size = rack.segment.layout.mailbox(NAME).size
-    assert rack.writer.ports.take_traffic() == (8, 8 * size)
-    assert rack.reader.ports.take_traffic() == (8, 7 * size)
-    rack.run(8, 10)
-    assert rack.writer.ports.take_traffic() == (2, 2 * size)
-    assert rack.reader.ports.take_traffic() == (2, 2 * size)
-    rack.writer.close()
-    assert WritingTask(rack.segment).ports.take_traffic() == (0, 0)
