@@ -24,7 +24,7 @@ class Word:
         self._place = place
 
     def __get__(self, owner: OnWords, kind: type) -> int:
-        return owner.words[self._place]  # type: ignore[no-any-return]
+        return owner.words[self._place]
 
     def __set__(self, owner: OnWords, value: int) -> None:
         owner.words[self._place] = value

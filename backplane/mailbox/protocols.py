@@ -10,7 +10,7 @@ error: a verdict, never a hang.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Protocol
@@ -80,24 +80,15 @@ class LockWriter(DoubleBufferWriter):
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
-    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish `message`; return False when it is too late, or the lock's bound cut it off."""
-        return self._locked(lambda: super(LockWriter, self).write(tick, now, basis))
-
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
         """Publish `message`; return False when the lock's bound cut it off."""
-        return self._locked(
-            lambda: super(LockWriter, self).publish(tick, visible_at, basis, damage)
-        )
-
-    def _locked(self, access: Callable[[], bool]) -> bool:
         obtained = self.lock.acquire()
         self.held_up = self.lock.held_up
         if not obtained:
             self.bus_errors += 1
             return False
         try:
-            return access()
+            return super().publish(tick, visible_at, basis, damage)
         finally:
             self.lock.release()
 

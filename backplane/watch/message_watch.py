@@ -13,6 +13,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept
 from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.queue import QueueReader
 from rack.backplane.mailbox.slots import UNSIGNED
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
@@ -170,3 +171,35 @@ class MessageWatch(ReadFindings):
 
     def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
         self._episodes.find(code, self._reader.accesses, tick, value, since)
+
+
+class QueueWatch(MessageWatch):
+    """Judges the messages that the reader of a queue has taken, several of one release among
+    them."""
+
+    def __init__(self, segment: Segment, reader: QueueReader, episodes: Episodes) -> None:
+        super().__init__(segment, reader, episodes)
+        self._queue = reader
+        self._lost = 0
+        self.seen = reader.taken
+
+    def judge(self, tick: int) -> None:
+        """Judge the messages taken by the read at `tick`."""
+        queue = self._queue
+        slots = self._slots
+        for serial in range(self.seen + 1, queue.taken + 1):
+            # Its slot is the writer's again only when the writer learns that it has been taken.
+            head = slots.heads[serial & slots.mask]
+            if head[Slot.SERIAL] != serial:
+                continue
+            released = head[Slot.TICK]
+            if self.newest <= released > head[Slot.VISIBLE_AT] - self.late_from:
+                self.newest = released
+            elif slots.copy(serial):
+                self._judge_time(released, head[Slot.VISIBLE_AT], tick)
+        self.seen = queue.taken
+        if queue.statistics.lost != self._lost:
+            lost = queue.statistics.lost - self._lost
+            self._lost = queue.statistics.lost
+            self._find(Alarm.GAP, tick, lost)
+        self.report(tick)

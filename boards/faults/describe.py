@@ -38,9 +38,6 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     """Return an entry as plain data. Unknown ticks are -1, an unknown `until` is None."""
     kind = kind_of(entry)
     stage = as_named(Stage, entry.stage)
-    mailbox = ""
-    if entry.mailbox >= 0:
-        mailbox = pick(layout.mailboxes, entry.mailbox, "mailbox").name
     until = None
     if stage in (Stage.ACTIVE, Stage.OVER) and entry.until != NEVER:
         until = entry.until
@@ -48,7 +45,7 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
         "fault": entry.index,
         "kind": kind.name,
         "board": board_of(entry, layout),
-        "mailbox": mailbox,
+        "mailbox": subject_of(entry, layout, joints) if entry.mailbox >= 0 else "",
         "parameters": kind.values(entry),
         "text": describe(entry, layout, joints),
         "stage": stage.name.lower(),
@@ -72,6 +69,4 @@ def describe(
             unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"
             about.append(f"{parameter.name} {value:g}{unit}")
     details = ", ".join(text for text in about if text)
-    if details:
-        return f"{kind.name}{target} ({details})"
-    return f"{kind.name}{target}"
+    return f"{kind.name}{target}" + f" ({details})" * bool(details)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import monotonic_ns
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import FaultEntry, FaultTable, Stage
@@ -68,22 +68,20 @@ def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
     return max(now, slice_end) + load.cycles_ns(load.entry.parameters[0])
 
 
-class Outputs(Protocol):
-    """The ports through which a task writes."""
-
-    def apply(self, faults: Sequence[FaultEntry]) -> None:
-        """Apply these faults to writes from now on."""
-
-
 class TaskFaults:
-    """Applies a task's active faults. `loads` are those of its computing time."""
+    """Applies a task's active faults: those of its writes by `apply`. `loads` are those of its
+    computing time."""
 
     def __init__(
-        self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner
+        self,
+        segment: Segment,
+        spec: TaskSpec,
+        apply: Callable[[Sequence[FaultEntry]], None],
+        level: Executor | Planner,
     ) -> None:
         self._table = FaultTable(segment)
         self._spec = spec
-        self._outputs = outputs
+        self._apply = apply
         self._level = level
         self._clock = SystemClock(segment)
         self._arm: list[FaultEntry] = []
@@ -103,7 +101,7 @@ class TaskFaults:
             for kind, entry in active
             if kind.where == "load" and callable(kind.step)
         ]
-        self._outputs.apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
+        self._apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
         arm = [(kind, entry) for kind, entry in active if kind.where == "arm"]
         self._arm = [entry for _, entry in arm]
         if self._spec.role == "executor":

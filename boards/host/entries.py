@@ -42,6 +42,7 @@ ENTRY = MessageType(
     ),
 )
 """One entry, in the status of its bridge."""
+_COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
 
 
 class EntryConfig(Table):
@@ -113,7 +114,7 @@ class EntryCount:
     def resume(self, record: Any, tick: int) -> None:
         """Continue with the counts in the status of an earlier cycle."""
         age = int(record["age"])
-        for name in ("passed", "refused", "superseded", "full", "waiting", "arrived"):
+        for name in _COUNTED:
             setattr(self, name, int(record[name]))
         self.written = NEVER if age == NEVER else tick - age
 
@@ -126,16 +127,7 @@ class EntryCount:
     def fill(self, record: Any, tick: int) -> None:
         """Write the counts into the status of a cycle."""
         age = NEVER if self.written == NEVER else tick - self.written
-        counts = (
-            self.passed,
-            self.refused,
-            self.superseded,
-            self.full,
-            self.waiting,
-            self.arrived,
-            age,
-        )
-        fill_counts(record, counts)
+        fill_counts(record, (*(getattr(self, name) for name in _COUNTED), age))
 
 
 class Crossing(Protocol):

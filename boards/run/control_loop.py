@@ -79,13 +79,6 @@ class VirtualControlLoop(Task):
 
         return read_and_note
 
-    def run(self) -> None:
-        """Cycle until the run is over."""
-        self.begin()
-        while (tick := self.wait_until_next_cycle()) is not None:
-            self.cycle(tick)
-        self.stopwatch.count_bus()
-
     def cycle(self, tick: int) -> None:
         """Do the cycle released at `tick`."""
         watch = self.stopwatch
@@ -160,13 +153,6 @@ class PlannerLoop(Task):
         self.write_plan = slowed(self.outputs.write, wiring.transfer.update_ns)
         self._critical_priority = wiring.critical_priority
         self._priority = self.block[Block.PRIORITY]
-
-    def run(self) -> None:
-        """Plan until the run is over."""
-        self.begin()
-        while (tick := self.wait_until_next_cycle()) is not None:
-            self.cycle(tick)
-        self.stopwatch.count_bus()
 
     def cycle(self, tick: int) -> None:
         """Plan in the cycle released at `tick`, if a plan is wanted."""

@@ -60,13 +60,8 @@ class Task(ABC):
         self.inputs.task.now = self.clock.now
         self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs, wiring.sent)
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
-        self.faults = TaskFaults(segment, spec, self.outputs, level)
+        self.faults = TaskFaults(segment, spec, self.outputs.apply, level)
         self._generation = 0
-
-    def begin(self) -> None:
-        """Mark the task as running on the backplane, and start to count its processor time."""
-        self.block[Block.STATE] = TaskState.RUNNING
-        self.stopwatch.begin()
 
     def wait_until_next_cycle(self) -> int | None:
         """Wait for the next release and return its tick; None when the run is over.
@@ -80,9 +75,17 @@ class Task(ABC):
             self._generation = self.faults.refresh(tick)
         return tick
 
-    @abstractmethod
     def run(self) -> None:
         """Cycle until the run is over."""
+        self.block[Block.STATE] = TaskState.RUNNING
+        self.stopwatch.begin()
+        while (tick := self.wait_until_next_cycle()) is not None:
+            self.cycle(tick)
+        self.stopwatch.count_bus()
+
+    @abstractmethod
+    def cycle(self, tick: int) -> None:
+        """Do the cycle released at `tick`."""
 
 
 class ClockGuard:

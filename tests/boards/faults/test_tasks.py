@@ -128,7 +128,7 @@ def test_a_task_has_the_faults_that_are_active_by_its_tick(
     table = FaultTable(segment)
     level = Level()
     outputs = Writes()
-    faults = TaskFaults(segment, segment.layout.task("level"), outputs, cast(Executor, level))
+    faults = TaskFaults(segment, segment.layout.task("level"), outputs.apply, cast(Executor, level))
     kinds = ("overrun", "drop", "sensor-bias", "hog")
     entries = [
         table.add(Injection(KINDS[kind].number, 0, tick=4, seed=9, parameters=(1.0,)))

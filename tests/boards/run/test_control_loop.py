@@ -18,7 +18,7 @@ from rack.backplane.mailbox.slots import Slots
 from rack.backplane.process import die_with_parent, set_priority, take_processor
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import Flag, trace_ring
-from rack.backplane.words import Block, System
+from rack.backplane.words import Block, Slot, System
 from rack.boards.classes import find_class
 from rack.boards.config import Resolved, resolve
 from rack.boards.faults.kind import KINDS
@@ -161,7 +161,7 @@ def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -
     watch.cycle(8)
     slots = Slots(rack.segment, rack.segment.layout.mailbox("watch.status"))
     assert slots.fetch(1)
-    assert (slots.tick, slots.basis) == (8, 3)
+    assert (slots.tick, slots.words[Slot.BASIS]) == (8, 3)
 
 
 def test_the_update_of_a_plan_is_stamped_inside_the_critical_section(
