@@ -133,16 +133,17 @@ class ClockDriver(ABC):
         """The first tick before which the run may end."""
         return 0
 
-    @abstractmethod
     def settle(self) -> None:
-        """In lockstep, wait until each task has finished the work of its release, plans too.
+        """In lockstep, wait until each task has finished the work of its release, plans too; in
+        real time a change may take effect within a cycle.
 
         Call it before changing anything that tasks read at any time rather than as of a tick.
         """
 
-    @abstractmethod
-    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
-        """In lockstep, wait until `condition` on the state of a task holds."""
+    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
+        """In lockstep, wait until `condition` on the state of a task holds, which the task's
+        reports make true; False when the launcher is gone. Real time does not wait."""
+        return True
 
     @abstractmethod
     def run(self) -> None:
@@ -207,12 +208,6 @@ class RealtimeDriver(ClockDriver):
             tick = self._sleep_until_next(tick)
         self._sleep_until(self._time_of(tick))
         self.end()
-
-    def settle(self) -> None:
-        """Return at once: in real time a change may take effect within a cycle."""
-
-    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
-        """Return at once: real time does not wait."""
 
     def _release(self, tick: int, last: int) -> None:
         """Give every task its release in (last, tick]: those that sleep in time, the others at the

@@ -131,7 +131,7 @@ class LockstepDriver(ClockDriver):
             task.release(tick, end - tick - 1)
             if task.is_posted:
                 task.wake()
-            if one_at_a_time and not self._wait(task, task.is_settled):
+            if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
         self.check(due, tick)
         return self._wait_for_all(end)
@@ -148,7 +148,7 @@ class LockstepDriver(ClockDriver):
                 task.done.take()
             else:
                 slowest = task
-                if not self._wait(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
+                if not self.await_state(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
                     return False
         if slowest is not None and slowest is not order[0]:
             order.remove(slowest)
@@ -158,13 +158,9 @@ class LockstepDriver(ClockDriver):
     def settle(self) -> None:
         """Wait until every task has finished the work of its release, plans too."""
         for task in self.tasks:
-            self._wait(task, task.is_settled)
+            self.await_state(task, task.is_settled)
 
-    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
-        """Wait until `condition` on the state of a task holds."""
-        self._wait(task, condition)
-
-    def _wait(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
+    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
         """Wait until `condition` holds, which the task's reports make true; False when the launcher
         is gone."""
         wait = task.done.wait

@@ -31,15 +31,10 @@ class HostWriter(DoubleBufferWriter):
         super().__init__(segment, name)
         self._box = self._slots.box
 
-    @property
-    def is_full(self) -> bool:
-        """Whether as many messages wait as the ring holds."""
-        return self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity
-
     def send(self, tick: int) -> bool:
         """Publish `message`, written at `tick`; return False, and count it, when the ring is
         full."""
-        if self.is_full:
+        if self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity:
             self._box[Box.REFUSED] += 1
             return False
         return self.write(tick)

@@ -27,8 +27,7 @@ LONG_AGO = -(1 << 62)
 
 
 class ReadingTask:
-    """The task that reads: the tick `since` which it has read without a pause, and which writers
-    are dead or stopped.
+    """The task that reads: the tick `since` which it has read without a pause.
 
     After a pause of this task or of the clock, all messages are old but no writer is silent.
     `troubles` counts reads that failed or found a bad message. `now` returns the clock's tick;
@@ -42,8 +41,6 @@ class ReadingTask:
         self.troubles = 0
         self._last = LONG_AGO
         self._step = NOT_YET
-        self._asked_at = -1
-        self._gone: dict[int, bool] = {}
 
     def reads(self, tick: int) -> None:
         """Note a read of a task that does not know how many cycles it skipped."""
@@ -54,16 +51,6 @@ class ReadingTask:
             elif self._last != LONG_AGO:
                 self._step = step
         self._last = tick
-
-    def is_gone(self, pid: int, tick: int) -> bool:
-        """Say whether a process is dead or stopped. The kernel is asked once per cycle and
-        process."""
-        if tick != self._asked_at:
-            self._asked_at = tick
-            self._gone.clear()
-        if pid not in self._gone:
-            self._gone[pid] = state_of(pid) in GONE + STOPPED
-        return self._gone[pid]
 
 
 class SilenceWatch:
@@ -104,7 +91,7 @@ class SilenceWatch:
             pid = pid_of(self._slots.box[Box.CLAIMANT])
             # The loss may be marked already, and a new process may exist that does not cycle yet.
             if age >= self._stale_after and (
-                self._block[Block.LOST] or self._task.is_gone(pid, tick)
+                self._block[Block.LOST] or state_of(pid) in GONE + STOPPED
             ):
                 self._report(Alarm.STALE, tick, age)
             elif self._is_mute(tick):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from time import process_time_ns
-from typing import Self
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.mailbox.interrupt import BoardInbox
@@ -39,15 +38,6 @@ class InterruptHandler:
         self._service_ns = inbox.service_ns
         self._lost = [line.lost for line in inbox.lines.values()]
         self._cycles = 0
-
-    @classmethod
-    def of(
-        cls, segment: Segment, task: str, inbox: BoardInbox | None, alarms: AlarmWriter
-    ) -> Self | None:
-        """Return the handler that a task runs; None: nothing interrupts its board, or another task
-        runs it."""
-        is_first = task == segment.layout.handler(segment.layout.task(task).slot)
-        return cls(segment, task, inbox, alarms) if inbox is not None and is_first else None
 
     def serve(self, tick: int) -> None:
         """Serve everything that has come up to the release at `tick`."""

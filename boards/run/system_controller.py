@@ -260,15 +260,16 @@ class EndOfRun:
         self._task_ends: int | None = None
         self._linger = wiring.linger
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
-        self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
         self._silent = wiring.silent
         self._heard: int | None = None
         # By ticks, a message becomes visible at a boundary of its writer's period.
         self._every = 1
         self._phase = 0
-        if self._reader is not None and self._reader.spec.is_by_ticks:
-            self._every = self._reader.spec.every
-            self._phase = self._reader.spec.phase
+        if self._reader is not None:
+            self._writer = segment.block(self._reader.spec.writer)
+            if self._reader.spec.is_by_ticks:
+                self._every = self._reader.spec.every
+                self._phase = self._reader.spec.phase
         self._next = 0
 
     @property
@@ -282,12 +283,7 @@ class EndOfRun:
         """Return the tick at which the run stops, by the messages as of the tick before; None until
         it is known."""
         final = tick - 1
-        if (
-            final >= self._next
-            and self._task_ends is None
-            and self._reader is not None
-            and self._writer is not None
-        ):
+        if final >= self._next and self._task_ends is None and self._reader is not None:
             boundary = final - (final - self._phase) % self._every
             self._next = boundary + self._every
             reading = self._reader.read(boundary)

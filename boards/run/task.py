@@ -47,7 +47,10 @@ class Task(ABC):
             segment, wiring.task, self.alarms if wiring.guards_clock else None
         )
         inbox = open_inbox(segment, wiring.task)
-        self.interrupts = InterruptHandler.of(segment, wiring.task, inbox, self.alarms)
+        self.interrupts: InterruptHandler | None = None
+        # The first task of a board serves its interrupts.
+        if inbox is not None and wiring.task == segment.layout.handler(spec.slot):
+            self.interrupts = InterruptHandler(segment, wiring.task, inbox, self.alarms)
         self.inputs = InputPorts(
             segment,
             wiring.inputs,
