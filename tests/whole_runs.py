@@ -82,7 +82,9 @@ def whole_run(config: RackConfig, seconds: float) -> Mapping[str, object]:
             [*(entry.words[word] for word in STRIKE), *entry.parameters]
             for entry in FaultTable(rack.segment).staged(tuple(Stage)[1:])
         ]
-        events = sorted({_of_event(event) for event in rack.events})
+        # A busy machine makes a launch wait for its boards.
+        heard = [event for event in rack.events if event.kind != "waiting"]
+        events = sorted({_of_event(event) for event in heard})
     end = (outcome.cause, outcome.ticks, outcome.state, outcome.reason, outcome.faults)
     return {"messages": outcome.digest, "events": events, **counts, "struck": struck, "end": end}
 
@@ -93,3 +95,10 @@ def _of_event(event: Event) -> tuple[object, ...]:
     tick = -1 if event.code in BY_CHANCE or event.kind == "start" else event.tick
     board = "" if event.kind == "detection" else event.board
     return (tick, event.kind, board, event.code, event.fault, event.subject, event.since)
+
+
+def in_short(parts: Mapping[str, object]) -> dict[str, object]:
+    """Return the parts of a whole run for a snapshot: messages, events, and all counts together."""
+    apart = ("messages", "events")
+    counts = {name: part for name, part in parts.items() if name not in apart}
+    return {name: parts[name] for name in apart if name in parts} | {"counts": counts}

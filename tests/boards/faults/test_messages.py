@@ -21,7 +21,7 @@ from tests.link import Link, MakeLink, WritingTask, links, struck
 from tests.processes import FORKS, exit_status, fork, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
-RATES = [(1, 1), (1, 8), (8, 1), (4, 4), (2, 3)]
+RATES = [(1, 1), (1, 8), (8, 1), pytest.param((4, 4), marks=pytest.mark.thorough), (2, 3)]
 """Periods of writer and reader."""
 FAULTS: dict[str, tuple[float, ...]] = {
     "mute": (),
