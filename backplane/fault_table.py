@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from time import monotonic_ns
 
-from rack.backplane.address_map import CLOCK, FAULT_ENTRIES, FAULT_ENTRY_SIZE
+from rack.backplane.address_map import FAULT_ENTRIES, FAULT_ENTRY_SIZE
 from rack.backplane.byte_lock import locked
 from rack.backplane.errors import FaultTableError
 from rack.backplane.segment import Segment
@@ -100,9 +100,6 @@ class FaultTable:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._words = segment.words
-        self._tasks = {task.name: index for index, task in enumerate(segment.layout.processes)} | {
-            CLOCK: -1
-        }
         self.entries = [FaultEntry(segment, index) for index in range(FAULT_ENTRIES)]
 
     @property
@@ -137,11 +134,6 @@ class FaultTable:
             return False
         entry.stage = Stage.FREE
         return True
-
-    def active(self, task: str) -> list[FaultEntry]:
-        """Return the active faults of a task; "clock" is the clock."""
-        index = self._tasks[task]
-        return [e for e in self.entries if e.stage == Stage.ACTIVE and e.task == index]
 
     def staged(self, stages: Sequence[Stage]) -> list[FaultEntry]:
         """Return the entries in one of these stages."""

@@ -81,6 +81,7 @@ class TaskFaults:
     ) -> None:
         self._table = FaultTable(segment)
         self._spec = spec
+        self._index = segment.layout.processes.index(spec)
         self._apply = apply
         self._level = level
         self._clock = SystemClock(segment)
@@ -94,7 +95,8 @@ class TaskFaults:
         next call. The generation is then -1.
         """
         generation = self._table.generation
-        found = [(kind_of(entry), entry) for entry in self._table.active(self._spec.name)]
+        entries = self._table.staged((Stage.ACTIVE,))
+        found = [(kind_of(entry), entry) for entry in entries if entry.task == self._index]
         active = [(kind, entry) for kind, entry in found if entry.tick <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)

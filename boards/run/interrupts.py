@@ -8,7 +8,6 @@ waiting. In lockstep, where nothing waits for a processor, it takes no time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from time import process_time_ns
 
 from rack.backplane.clock.system_clock import SystemClock
@@ -60,17 +59,3 @@ class InterruptHandler:
                     self._lost[at] = line.lost
                     self._block[Block.INTERRUPTS_LOST] += lost
                     episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
-
-
-def interrupted(
-    read: Callable[[int], None], handler: InterruptHandler | None
-) -> Callable[[int], None]:
-    """Return `read`, after the handler has served what has come; `read` itself without one."""
-    if handler is None:
-        return read
-
-    def serve_and_read(tick: int) -> None:
-        handler.serve(tick)
-        read(tick)
-
-    return serve_and_read

@@ -47,10 +47,10 @@ class Task(ABC):
             segment, wiring.task, self.alarms if wiring.guards_clock else None
         )
         inbox = open_inbox(segment, wiring.task)
-        self.interrupts: InterruptHandler | None = None
+        self.serve: Callable[[int], None] | None = None
         # The first task of a board serves its interrupts.
         if inbox is not None and wiring.task == segment.layout.handler(spec.slot):
-            self.interrupts = InterruptHandler(segment, wiring.task, inbox, self.alarms)
+            self.serve = InterruptHandler(segment, wiring.task, inbox, self.alarms).serve
         self.inputs = InputPorts(
             segment,
             wiring.inputs,
@@ -132,6 +132,18 @@ class ClockGuard:
             if tick >= self._quiet_from:
                 self._alarms.ring(tick, Alarm.CLOCK_LATE, value=late_ns)
             self._quiet_from = tick + PUNCTUAL_TICKS
+
+
+def in_turn(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
+    """Return a function that makes these accesses one after the other, as far as there are any; one
+    alone itself."""
+    found = [access for access in accesses if access is not None]
+
+    def make_all(tick: int) -> None:
+        for access in found:
+            access(tick)
+
+    return make_all if len(found) > 1 else found[0]
 
 
 def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
