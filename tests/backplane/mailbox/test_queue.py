@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
-from itertools import product
 
 import pytest
 
@@ -234,8 +233,8 @@ def test_no_damage_to_a_slot_holds_up_the_queue(make_bus: MakeBus, word: int, at
     words[word] ^= 1 << 40
     found = ids(reader.read(1))
     # The checksum does not cover the time stamp.
-    assert found == [serial for serial in (1, 2, 3) if serial != at or word is Slot.STAMP_NS]
-    assert reader.statistics.bad_reads == (word is not Slot.STAMP_NS)
+    assert found == [serial for serial in (1, 2, 3) if serial != at or word == Slot.STAMP_NS]
+    assert reader.statistics.bad_reads == (word != Slot.STAMP_NS)
     assert reader.taken == 3
     writer.taken = reader.taken
     assert send(writer, 1, 4) == [True]
@@ -273,14 +272,18 @@ def bookkeeping(segment: Segment) -> Iterator[int]:
 
 
 @pytest.mark.slow
-def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(make_bus: MakeBus) -> None:
+@pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.thorough), 3])
+def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(
+    make_bus: MakeBus, step: int
+) -> None:
     segment = make_bus(*queue(8))
     writer = open_writer(segment, NAME)
     assert isinstance(writer, QueueWriter)
     send(writer, 0, 1, 2, 3, 4, 5)
     assert exit_status(fork(lambda: take_three(segment))) == -signal.SIGKILL
     before = bytes(segment.bytes)
-    for address, bit in product(bookkeeping(segment), range(8)):
+    bits = [(address, bit) for address in bookkeeping(segment) for bit in range(8)]
+    for address, bit in bits[::step]:
         segment.bytes[:] = before
         segment.bytes[address] ^= 1 << bit
         reader = open_reader(segment, NAME)
