@@ -35,7 +35,7 @@ from struct import Struct
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.message import Field, Message, MessageType, sending
+from rack.backplane.message import Field, Message, MessageType, copied, sending
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
@@ -202,7 +202,7 @@ class QueueReader(Reader):
             self.statistics.bad_reads += 1
             self._count_forged()
         while count < most and self._sees(self.taken + 1, last, tick):
-            before = bytes(self.message.raw) if count else b""
+            before = copied(self.message) if count else None
             if not self._obtain(self.taken + 1):
                 # Count the fault of the message fetched last, which is not good.
                 slots = self.slots
@@ -215,8 +215,8 @@ class QueueReader(Reader):
                 else:
                     self._count_forged()
             else:
-                if count:
-                    earlier.append(Message(self.slots.dtype, memoryview(bytearray(before))))
+                if before is not None:
+                    earlier.append(before)
                 count += 1
             self.taken += 1
         newest = self.taken

@@ -172,12 +172,6 @@ class Slots:
         of that message."""
         return serial >= oldest_kept(self.box[0], self.depth)
 
-    def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
-        """Return each slot's head, as words, and the part of the slot that its checksum covers."""
-        return [
-            (head, slot[CHECKED_FROM:]) for head, slot in zip(self.heads, self.places, strict=True)
-        ]
-
     def visible_at(self, serial: int) -> int:
         """Return the tick from which the message in that serial's slot may be read."""
         return self.heads[serial & self.mask][_VISIBLE]

@@ -14,7 +14,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 from rack.backplane.address_map import oldest_kept
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.queue import QueueReader
-from rack.backplane.mailbox.slots import UNSIGNED
+from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
@@ -51,14 +51,11 @@ class MessageWatch(ReadFindings):
     release tick.
     """
 
-    found_again = ("_heads_and_bodies",)
-
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         super().__init__(reader, episodes)
         self.seen = -1
         self._spec = reader.spec
         self._slots = reader.slots
-        self._heads_and_bodies = reader.slots.heads_and_bodies()
         self._cycles = CycleRecord(segment, reader.spec.writer)
         self.newest = LONG_AGO
         self._is_sliced = reader.spec.is_by_ticks
@@ -110,13 +107,12 @@ class MessageWatch(ReadFindings):
     def _walk(self, found: int, tick: int) -> None:
         """Judge the messages one by one, up to the newest found."""
         slots = self._slots
-        heads_and_bodies = self._heads_and_bodies
         mask = slots.mask
         taken = self._reader.serial
         late = self.late_from
         # A late reader cannot judge messages that are overwritten.
         for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
-            head, body = heads_and_bodies[serial & mask]
+            head = slots.heads[serial & mask]
             released = head[Slot.TICK]
             # The reader has checked the message that it took, and only that one.
             if (
@@ -124,7 +120,8 @@ class MessageWatch(ReadFindings):
                 and self.newest < released > head[Slot.VISIBLE_AT] - late
                 and (
                     serial == taken
-                    or xxh3(body, head[Slot.CHAIN] & UNSIGNED) == head[Slot.CHECK] & UNSIGNED
+                    or xxh3(slots.places[serial & mask][CHECKED_FROM:], head[Slot.CHAIN] & UNSIGNED)
+                    == head[Slot.CHECK] & UNSIGNED
                 )
                 and slots.keeps(serial)
             ):

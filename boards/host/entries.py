@@ -146,8 +146,8 @@ class Inward:
         self._port = port
         self._table = table
         self._count = count
-        self._refused = count.refused
-        self._superseded = count.superseded
+        self._ring.refused = count.refused
+        self._ring.superseded = count.superseded
         self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
@@ -166,8 +166,8 @@ class Inward:
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
             count.passes(tick, ring.written)
-        count.refused = self._refused + ring.refused
-        count.superseded = self._superseded + ring.superseded
+        count.refused = ring.refused
+        count.superseded = ring.superseded
         count.full = ring.full
         count.waiting = ring.waiting
 

@@ -122,26 +122,10 @@ class InputPorts:
         return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
 
-class OldestOf:
-    """The basis of what rests on several mailboxes: the oldest of those that hold a message. As of
-    a `Reader`."""
-
-    def __init__(self, readers: Sequence[Reader]) -> None:
-        self._readers = readers
-
-    @property
-    def serial(self) -> int:
-        """Serial of one of the messages; 0: there is none."""
-        return max([reader.serial for reader in self._readers])
-
-    @property
-    def basis(self) -> int:
-        """Tick of the oldest information that the last good messages rest on."""
-        return min([reader.basis for reader in self._readers if reader.serial])
-
-
 class OutputPort:
     """One mailbox that a task writes; `message` is its outgoing message.
+
+    It rests on the messages of `sources`: its basis is the oldest of theirs.
 
     A level sends the messages of a queue itself, unless it does not (`sends`): its message is then
     sent in every cycle in which it is written. A mailbox with a `max_age` is written on demand, in
@@ -153,13 +137,13 @@ class OutputPort:
         segment: Segment,
         writer: Writer,
         alarms: AlarmWriter,
-        source: Reader | OldestOf | None,
+        sources: Sequence[Reader],
         sends: bool,
     ) -> None:
         spec = writer.spec
         self.writer = writer
         self.message = writer.message
-        self._source = source
+        self._sources = sources
         self._is_on_demand = spec.max_age > 0
         self._is_sent = not self._is_on_demand
         self._basis: int | None = None
@@ -204,8 +188,7 @@ class OutputPort:
         if (tick + self._ahead) % self._every or not self._is_sent:
             self.flush(tick, now)
         else:
-            source = self._source
-            basis = source.basis if source is not None and source.serial else tick
+            basis = min([source.basis for source in self._sources if source.serial], default=tick)
             if self._is_on_demand:
                 self._is_sent = False
                 basis = basis if self._basis is None else self._basis
@@ -258,9 +241,8 @@ class OutputPorts:
         self.messages = Ports()
         self._ports: list[OutputPort] = []
         for port, writer in self.writers.items():
-            found = [inputs.readers[name] for name in writer.spec.rests_on]
-            source = OldestOf(found) if len(found) > 1 else next(iter(found), None)
-            output = OutputPort(segment, writer, alarms, source, port in sent)
+            sources = [inputs.readers[name] for name in writer.spec.rests_on]
+            output = OutputPort(segment, writer, alarms, sources, port in sent)
             self._ports.append(output)
             setattr(self.messages, port, output.message)
             if isinstance(writer, QueueWriter):

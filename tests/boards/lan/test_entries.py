@@ -59,7 +59,7 @@ class Importing:
         self.entry.open(self.network, self.sealer)  # type: ignore[arg-type]
         self.writer = open_writer(self.segment, "lan.other")
         alarms = AlarmWriter(self.segment, "lan")
-        self.port = OutputPort(self.segment, self.writer, alarms, None, False)
+        self.port = OutputPort(self.segment, self.writer, alarms, (), False)
 
     def restart(self, tick: int) -> None:
         """Kill the adapter, and begin another one with what the first wrote."""
