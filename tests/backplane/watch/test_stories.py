@@ -12,7 +12,14 @@ from tests.link import MakeLink, links, story
 from tests.snapshots import Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
-ENDS = (((1, 1), True), ((1, 1), False), ((4, 1), True), ((1, 8), True), ((1, 8), False))
+ENDS = (
+    ((1, 1), True),
+    ((1, 1), False),
+    ((4, 1), True),
+    ((2, 4), False),
+    ((1, 8), True),
+    ((1, 8), False),
+)
 """Rates of writer and reader, and whether the reader comes first."""
 FAULTS: dict[str, tuple[float, ...]] = {
     "mute": (),
