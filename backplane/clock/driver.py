@@ -79,10 +79,6 @@ class ClockDriver(ABC):
         self._ended = ended
         self._segment = segment
 
-    def task(self, name: str) -> ReleasedTask:
-        """Return the task of that name. Raises `KeyError`."""
-        return {task.spec.name: task for task in self.tasks}[name]
-
     def begin(self, tick: int) -> bool:
         """Publish `tick` and do the work due before its releases; False when the tick is
         skipped."""

@@ -102,14 +102,14 @@ class Slots:
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.spec = spec
-        self.dtype = message_dtype(spec.fields, spec.size)
+        dtype = message_dtype(spec.fields, spec.size)
         address = segment.map.mailboxes[spec.name]
         stride = slot_stride(spec)
         self.box = segment.box(spec.name)
         self.depth = spec.depth
         self.mask = spec.depth - 1
         self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
-        self.message = Message(self.dtype, self.record[SLOT_HEAD_SIZE:])
+        self.message = Message(dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
         self.places = [
