@@ -16,8 +16,7 @@ LINE = 64
 """Bytes of a cache line: blocks of two writers never share one."""
 
 HEAD_SIZE = PAGE
-BLOCK_WORDS = 32
-BLOCK_SIZE = BLOCK_WORDS * 8
+BLOCK_SIZE = 256
 TRACE_RECORD_SIZE = 88
 ALARM_RECORD_SIZE = 64
 ALARM_DEPTH = 256

@@ -12,6 +12,8 @@ from __future__ import annotations
 import fcntl
 import os
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 _HELD: set[ProcessLock] = set()
 _FLOCK = struct.Struct("hhqqi4x")
@@ -44,6 +46,19 @@ class ByteLock:
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
+
+
+@contextmanager
+def locked(fd: int, address: int) -> Iterator[None]:
+    """Hold a lock for a moment, in which an entry of a table is filled; other processes wait for it
+    no longer."""
+    lock = ByteLock(fd, address)
+    try:
+        while not lock.take():
+            continue
+        yield
+    finally:
+        lock.close()
 
 
 class ProcessLock(ByteLock):

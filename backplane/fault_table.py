@@ -13,21 +13,21 @@ from dataclasses import dataclass
 from enum import IntEnum
 from time import monotonic_ns
 
-from rack.backplane.address_map import CLOCK, FAULT_ENTRIES, FAULT_ENTRY_SIZE
-from rack.backplane.byte_lock import ByteLock
-from rack.backplane.checked import as_named
+from rack.backplane.address_map import FAULT_ENTRIES, FAULT_ENTRY_SIZE
+from rack.backplane.byte_lock import locked
 from rack.backplane.errors import FaultTableError
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
+from rack.backplane.words import System, Word
 
+FAULT_WORDS = 16
 PARAMETERS = 8
-"""Parameters of one fault."""
+"""Parameters of one fault, float64, after its words."""
 NEVER = 1 << 62
 """`until` of a fault that lasts until the end of the run."""
 
 
 class Stage(IntEnum):
-    """Values of `Entry.STAGE`."""
+    """Values of `FaultEntry.stage`."""
 
     FREE = 0
     WAITING = 1  # for its tick, or its condition
@@ -35,33 +35,10 @@ class Stage(IntEnum):
     OVER = 3
 
 
-class Entry(IntEnum):
-    """Words of an entry. Once it waits, the clock writes STAGE, FROM and UNTIL, its actor the
-    rest."""
-
-    STAGE = 0
-    KIND = 1  # number of the kind, from its name
-    TASK = 2  # index among the layout's tasks; -1: the clock
-    MAILBOX = 3  # index among the layout's mailboxes; -1: every one that the task writes, or none
-    FROM = 4  # first tick of the fault; -1: as soon as possible, or when its condition holds
-    UNTIL = 5  # first tick after it; known once it has begun
-    TICKS = 6  # duration; 0: until the end of the run, or once, depending on the kind
-    PHASE = 7  # part of its first tick after which it strikes, in 1/1000
-    SEED = 8
-    WHEN_BOX = 9  # condition: index of a mailbox; -1: none
-    WHEN_FIELD = 10  # index of a field in it
-    WHEN_VALUE = 11  # number that the field must equal
-    STRUCK_TICK = 12  # tick at which it first changed anything, however little; -1: not yet
-    STRUCK_NS = 13  # CLOCK_MONOTONIC at that time
-    COUNT = 14  # times it acted so much that it must be found
-    HIDDEN = 15  # ticks from STRUCK_TICK to the first of these times
-    PARAMETER = 16  # eight of them, as bits of float64
-
-
 @dataclass(frozen=True)
 class Injection:
-    """One fault as an entry holds it: see `Entry`. `when` is (mailbox, field, value): two indices
-    and a number."""
+    """One fault as an entry holds it: see `FaultEntry`. `when` is (mailbox, field, value): two
+    indices and a number."""
 
     kind: int
     task: int
@@ -75,33 +52,46 @@ class Injection:
 
 
 class FaultEntry:
-    """One entry of the table: `words` and `parameters` are views of shared memory."""
+    """One entry of the table: `words` and `parameters` are views of shared memory.
+
+    Once it waits, the clock writes `stage`, `tick` and `until`, its actor the words from
+    `struck_tick` on.
+    """
+
+    stage = Word(0)  # Stage
+    kind = Word(1)  # number of the kind, from its name
+    task = Word(2)  # index among the layout's tasks; -1: the clock
+    # index among the layout's mailboxes; -1: every one that the task writes, or none
+    mailbox = Word(3)
+    # first tick of the fault; -1: as soon as possible, or when its condition holds
+    tick = Word(4)
+    until = Word(5)  # first tick after it; known once it has begun
+    ticks = Word(6)  # duration; 0: until the end of the run, or once, depending on the kind
+    phase = Word(7)  # part of its first tick after which it strikes, in 1/1000
+    seed = Word(8)
+    when_box = Word(9)  # condition: index of a mailbox; -1: none
+    when_field = Word(10)  # index of a field in it
+    when_value = Word(11)  # number that the field must equal
+    struck_tick = Word(12)  # tick at which it first changed anything, however little; -1: not yet
+    struck_ns = Word(13)  # CLOCK_MONOTONIC at that time
+    count = Word(14)  # times it acted so much that it must be found
+    hidden = Word(15)  # ticks from `struck_tick` to the first of these times
 
     def __init__(self, segment: Segment, index: int) -> None:
         address = segment.map.faults + index * FAULT_ENTRY_SIZE
         self.index = index
         self.words = segment.words[address // 8 : (address + FAULT_ENTRY_SIZE) // 8]
-        first = address + 8 * Entry.PARAMETER
-        self.parameters = segment.view(first, 8 * PARAMETERS).cast("d")
-
-    def __getitem__(self, word: Entry) -> int:
-        """Return a word of the entry."""
-        return self.words[word]
-
-    @property
-    def stage(self) -> Stage:
-        """The stage of the fault."""
-        return as_named(Stage, self.words[Entry.STAGE])
+        self.parameters = segment.view(address + 8 * FAULT_WORDS, 8 * PARAMETERS).cast("d")
 
     def acted(self, tick: int, shows: bool = True) -> None:
         """Note one action of the fault, and the time of the first one; count those that show: they
         must be found."""
-        if self.words[Entry.STRUCK_TICK] < 0:
-            self.words[Entry.STRUCK_NS] = monotonic_ns()
-            self.words[Entry.STRUCK_TICK] = tick
-        if shows and not self.words[Entry.COUNT]:
-            self.words[Entry.HIDDEN] = tick - self.words[Entry.STRUCK_TICK]
-        self.words[Entry.COUNT] += shows
+        if self.struck_tick < 0:
+            self.struck_ns = monotonic_ns()
+            self.struck_tick = tick
+        if shows and not self.count:
+            self.hidden = tick - self.struck_tick
+        self.count += shows
 
 
 class FaultTable:
@@ -110,9 +100,6 @@ class FaultTable:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._words = segment.words
-        self._tasks = {task.name: index for index, task in enumerate(segment.layout.processes)} | {
-            CLOCK: -1
-        }
         self.entries = [FaultEntry(segment, index) for index in range(FAULT_ENTRIES)]
 
     @property
@@ -124,11 +111,7 @@ class FaultTable:
     def add(self, injection: Injection) -> FaultEntry:
         """Fill a free entry; its fault begins when the clock finds it due. Raises
         `FaultTableError`."""
-        lock = ByteLock(self._segment.fd, self._segment.map.faults)
-        try:
-            # Bounded by the time in which another process fills an entry.
-            while not lock.take():
-                continue
+        with locked(self._segment.fd, self._segment.map.faults):
             entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
             if entry is None:
                 raise FaultTableError(
@@ -136,57 +119,34 @@ class FaultTable:
                 )
             _fill(entry, injection)
             self._words[System.INJECTED] += 1
-        finally:
-            lock.close()
         return entry
 
     def disarm(self, entry: FaultEntry) -> None:
         """Keep a waiting fault from beginning; `free` may follow after the next tick."""
         # In this order: without a condition and with a tick that has passed, it would begin at
         # once.
-        entry.words[Entry.FROM] = NEVER
-        entry.words[Entry.WHEN_BOX] = -1
+        entry.tick = NEVER
+        entry.when_box = -1
 
     def free(self, entry: FaultEntry) -> bool:
         """Free the entry of a disarmed fault; False when the clock has already begun it."""
         if entry.stage != Stage.WAITING:
             return False
-        entry.words[Entry.STAGE] = Stage.FREE
+        entry.stage = Stage.FREE
         return True
-
-    def active(self, task: str) -> list[FaultEntry]:
-        """Return the active faults of a task; "clock" is the clock."""
-        index = self._tasks[task]
-        return [
-            e
-            for e in self.entries
-            if e.words[Entry.STAGE] == Stage.ACTIVE and e.words[Entry.TASK] == index
-        ]
 
     def staged(self, stages: Sequence[Stage]) -> list[FaultEntry]:
         """Return the entries in one of these stages."""
-        return [e for e in self.entries if e.words[Entry.STAGE] in stages]
+        return [e for e in self.entries if e.stage in stages]
 
 
 def _fill(entry: FaultEntry, injection: Injection) -> None:
-    words = entry.words
-    when = injection.when or (-1, 0, 0)
-    for word, value in (
-        (Entry.KIND, injection.kind),
-        (Entry.TASK, injection.task),
-        (Entry.MAILBOX, injection.mailbox),
-        (Entry.FROM, injection.tick),
-        (Entry.UNTIL, NEVER),
-        (Entry.TICKS, injection.ticks),
-        (Entry.PHASE, injection.phase),
-        (Entry.SEED, injection.seed),
-        (Entry.WHEN_BOX, when[0]),
-        (Entry.WHEN_FIELD, when[1]),
-        (Entry.WHEN_VALUE, when[2]),
-        (Entry.STRUCK_TICK, -1),
-    ):
-        words[word] = value
+    for name in ("kind", "task", "mailbox", "tick", "ticks", "phase", "seed"):
+        setattr(entry, name, getattr(injection, name))
+    entry.until = NEVER
+    entry.when_box, entry.when_field, entry.when_value = injection.when or (-1, 0, 0)
+    entry.struck_tick = -1
     for place, parameter in enumerate(injection.parameters):
         entry.parameters[place] = parameter
     # Last: from here the clock may begin it.
-    words[Entry.STAGE] = Stage.WAITING
+    entry.stage = Stage.WAITING

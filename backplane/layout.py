@@ -7,6 +7,7 @@ classes.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -20,6 +21,10 @@ BY_TICKS: tuple[Protocol, ...] = ("time-slice", "queue", "interrupt")
 
 Role = Literal["executor", "planner", "host"]
 """A "host" is a board of the host side: it has no rate, and the clock does not release it."""
+
+KIND = re.compile(r"[<>|]?[biufcSUV]\d+")
+"""Kinds of fields. A layout may be another user's: numpy would take an object of Python's from the
+number in a message."""
 
 Wake = Literal["signal", "timer", "poll"]
 """How a task waits for its next cycle: see `rack.backplane.clock.wake`."""
@@ -93,6 +98,10 @@ class FieldSpec:
     fields: tuple[FieldSpec, ...] = ()
     values: tuple[tuple[str, int], ...] = ()
     length: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not KIND.fullmatch(self.kind):
+            raise ValueError(f"a field of kind {self.kind}")
 
 
 @dataclass(frozen=True)

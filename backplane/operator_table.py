@@ -20,11 +20,10 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from rack.backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
-from rack.backplane.byte_lock import ByteLock
-from rack.backplane.checked import as_named
+from rack.backplane.byte_lock import ByteLock, locked
 from rack.backplane.errors import OperatorTableError
 from rack.backplane.segment import Segment
-from rack.backplane.words import System
+from rack.backplane.words import System, Word
 
 _CLAIMS = 1 << 40
 """Address of the byte that the client of ticket 0 locks: beyond any segment, since a lock needs no
@@ -32,7 +31,7 @@ memory."""
 
 
 class RequestStage(IntEnum):
-    """Values of `RequestWord.STAGE`."""
+    """Values of `RequestEntry.stage`."""
 
     FREE = 0
     WAITING = 1  # for its tick
@@ -40,25 +39,11 @@ class RequestStage(IntEnum):
 
 
 class Client(IntEnum):
-    """Values of `RequestWord.CLIENT`."""
+    """Values of `RequestEntry.client`."""
 
     NONE = 0  # the request belongs to the run
     WAITS = 1  # issued only while its client lives
     LEASES = 2  # the same, and in force only while its client lives
-
-
-class RequestWord(IntEnum):
-    """Words of an entry. The host fills a free one; from then on the clock writes STAGE, SERIAL and
-    GIVEN_TICK."""
-
-    STAGE = 0
-    TICKET = 1  # number of the request: it changes when the entry is filled again
-    MAILBOX = 2  # index among the layout's mailboxes
-    TICK = 3  # tick at which to issue it; -1: at once
-    SERIAL = 4  # of the command, rising over all levels in the order of issue; 0: not yet
-    GIVEN_TICK = 5  # -1: not yet
-    CLIENT = 6
-    HEARD = 7  # tick at which the client of a lease was last heard
 
 
 @dataclass(frozen=True)
@@ -72,29 +57,37 @@ class Request:
 
 
 class RequestEntry:
-    """One entry of the table: `words` and `message` are views of shared memory."""
+    """One entry of the table: `words` and `message` are views of shared memory.
+
+    The host fills a free one; from then on the clock writes `stage`, `serial` and `given_tick`.
+    """
+
+    stage = Word(0)  # RequestStage
+    ticket = Word(1)  # number of the request: it changes when the entry is filled again
+    mailbox = Word(2)  # index among the layout's mailboxes
+    tick = Word(3)  # tick at which to issue it; -1: at once
+    serial = Word(4)  # of the command, rising over all levels in the order of issue; 0: not yet
+    given_tick = Word(5)  # -1: not yet
+    client = Word(6)  # Client
+    heard = Word(7)  # tick at which the client of a lease was last heard
 
     def __init__(self, segment: Segment, index: int) -> None:
         size = operator_entry_size(segment.layout)
         address = segment.map.operator + index * size
         self.index = index
-        self.words = segment.words[address // 8 : address // 8 + len(RequestWord)]
+        self.words = segment.words[address // 8 : (address + OPERATOR_HEAD_SIZE) // 8]
         self.message = segment.view(address + OPERATOR_HEAD_SIZE, size - OPERATOR_HEAD_SIZE)
 
-    def __getitem__(self, word: RequestWord) -> int:
-        """Return a word of the entry."""
-        return self.words[word]
-
     @property
-    def stage(self) -> RequestStage:
-        """Stage of the request."""
-        return as_named(RequestStage, self.words[RequestWord.STAGE])
+    def is_leased(self) -> bool:
+        """Whether it was issued under a lease that is not released."""
+        return self.client == Client.LEASES and self.stage == RequestStage.GIVEN
 
     def becomes(self, issued: Request) -> bool:
         """Say whether this request may be the one that was issued so."""
         return (
-            self.words[RequestWord.MAILBOX] == issued.mailbox
-            and self.words[RequestWord.TICK] <= issued.tick
+            self.mailbox == issued.mailbox
+            and self.tick <= issued.tick
             and self.message[: len(issued.message)] == issued.message
         )
 
@@ -126,7 +119,7 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        claim = self._await_turn(request, Client.NONE)
+        claim = self.enter(request, Client.NONE)
         claim.leave()
         return claim.entry
 
@@ -137,95 +130,73 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        claim = self._await_turn(request, client)
+        claim = self.enter(request, client)
         try:
             yield claim.entry
         finally:
             self.withdraw(claim.entry, claim.ticket)
             claim.leave()
 
-    def _await_turn(self, request: Request, client: Client) -> RequestClaim:
-        # Bounded by the time in which another process fills an entry.
-        while (claim := self.try_claim(request, client)) is None:
-            continue
-        return claim
-
-    def try_claim(self, request: Request, client: Client = Client.WAITS) -> RequestClaim | None:
-        """Add a request without waiting; None while another process fills an entry, and might be
-        preempted meanwhile.
+    def enter(self, request: Request, client: Client = Client.WAITS) -> RequestClaim:
+        """Add a request as its client, until that leaves.
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        lock = ByteLock(self._segment.fd, self._segment.map.operator)
-        try:
-            return self._add(request, client) if lock.take() else None
-        finally:
-            lock.close()
-
-    def _add(self, request: Request, client: Client) -> RequestClaim:
-        leased = self.leased()
-        settled = [e for e in self.entries if not self.is_waiting(e) and e not in leased]
-        if not settled:
-            why = f"{len(self.entries)} commands wait for their ticks"
-            raise OperatorTableError(
-                f"the operator table is full: {why}; permitted: once one of them is given"
-            )
-        entry = min(settled, key=lambda e: (e.stage, e[RequestWord.SERIAL]))
-        ticket = self._words[System.REQUESTED] + 1
-        lock = ByteLock(self._segment.fd, _CLAIMS + ticket)
-        if client:
-            lock.take()
-        self._fill(entry, request, ticket, client)
+        with locked(self._segment.fd, self._segment.map.operator):
+            settled = [e for e in self.entries if not self.is_waiting(e) and not e.is_leased]
+            if not settled:
+                why = f"{len(self.entries)} commands wait for their ticks"
+                raise OperatorTableError(
+                    f"the operator table is full: {why}; permitted: once one of them is given"
+                )
+            entry = min(settled, key=lambda e: (e.stage, e.serial))
+            ticket = self._words[System.REQUESTED] + 1
+            lock = ByteLock(self._segment.fd, _CLAIMS + ticket)
+            if client:
+                lock.take()
+            self._fill(entry, request, ticket, client)
         return RequestClaim(entry, ticket, lock)
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
         """Withdraw a request that still waits; False when it was issued."""
-        words = entry.words
-        if words[RequestWord.TICKET] != ticket or words[RequestWord.STAGE] != RequestStage.WAITING:
+        if entry.ticket != ticket or entry.stage != RequestStage.WAITING:
             return False
-        words[RequestWord.STAGE] = RequestStage.FREE
+        entry.stage = RequestStage.FREE
         # The clock first marks the request as issued, then checks whether it is still wanted.
-        return words[RequestWord.GIVEN_TICK] < 0
+        return entry.given_tick < 0
 
     def is_waiting(self, entry: RequestEntry) -> bool:
         """Say whether a request waits, and its client, if any, still lives."""
-        words = entry.words
-        if words[RequestWord.STAGE] != RequestStage.WAITING:
+        if entry.stage != RequestStage.WAITING:
             return False
-        return not words[RequestWord.CLIENT] or self.client_lives(entry)
+        return not entry.client or self.client_lives(entry)
 
     def client_lives(self, entry: RequestEntry) -> bool:
         """Say whether the client of a request lives."""
-        return self._segment.is_locked(_CLAIMS + entry.words[RequestWord.TICKET])
+        return self._segment.is_locked(_CLAIMS + entry.ticket)
 
     def leased(self) -> list[RequestEntry]:
         """Return the requests that were issued under a lease, until it is released."""
-        return [
-            entry
-            for entry in self.entries
-            if entry[RequestWord.CLIENT] == Client.LEASES
-            and entry[RequestWord.STAGE] == RequestStage.GIVEN
-        ]
+        return [entry for entry in self.entries if entry.is_leased]
 
     def hear(self, entry: RequestEntry, ticket: int) -> bool:
         """Note that the client of a lease is there; False when the lease was released."""
-        entry.words[RequestWord.HEARD] = self._words[System.TICK]
-        words = entry.words
-        return words[RequestWord.TICKET] == ticket and words[RequestWord.CLIENT] == Client.LEASES
+        entry.heard = self._words[System.TICK]
+        return entry.ticket == ticket and entry.client == Client.LEASES
 
     def release(self, entry: RequestEntry) -> None:
         """End the lease of a request: what happens to its client does not matter any more."""
-        entry.words[RequestWord.CLIENT] = Client.WAITS
+        entry.client = Client.WAITS
 
     def waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""
         found = [entry for entry in self.entries if self.is_waiting(entry)]
-        return sorted(found, key=lambda entry: entry.words[RequestWord.TICKET])
+        return sorted(found, key=lambda entry: entry.ticket)
 
     def lacking(self, requests: Sequence[Request]) -> list[Request]:
         """Return those of a run's commands, given in the order of issue, that do not wait here
         already: each entry is issued at its tick or, added late, after it."""
-        waiting = sorted(self.waiting(), key=lambda entry: entry[RequestWord.TICK])
+        waiting = sorted(self.waiting(), key=lambda entry: entry.tick)
         found = []
         for wanted in requests:
             entry = next((entry for entry in waiting if entry.becomes(wanted)), None)
@@ -236,16 +207,15 @@ class OperatorTable:
         return found
 
     def _fill(self, entry: RequestEntry, request: Request, ticket: int, client: Client) -> None:
-        words = entry.words
-        words[RequestWord.STAGE] = RequestStage.FREE
-        words[RequestWord.TICKET] = ticket
-        words[RequestWord.CLIENT] = client
-        words[RequestWord.MAILBOX] = request.mailbox
-        words[RequestWord.TICK] = request.tick
-        words[RequestWord.SERIAL] = 0
-        words[RequestWord.GIVEN_TICK] = -1
-        words[RequestWord.HEARD] = -1
+        entry.stage = RequestStage.FREE
+        entry.ticket = ticket
+        entry.client = client
+        entry.mailbox = request.mailbox
+        entry.tick = request.tick
+        entry.serial = 0
+        entry.given_tick = -1
+        entry.heard = -1
         entry.message[: len(request.message)] = request.message
         # From here the clock may issue it.
-        words[RequestWord.STAGE] = RequestStage.WAITING
+        entry.stage = RequestStage.WAITING
         self._words[System.REQUESTED] += 1

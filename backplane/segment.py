@@ -10,38 +10,28 @@ from __future__ import annotations
 import json
 import mmap
 import os
-import re
 import stat
 import time
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, get_args, get_type_hints
 from zlib import crc32
 
 import posix_ipc
 
-from rack.backplane.address_map import HEAD_SIZE, AddressMap, pages
+from rack.backplane.address_map import BLOCK_SIZE, HEAD_SIZE, MAILBOX_HEAD_SIZE, AddressMap, pages
 from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
-from rack.backplane.layout import (
-    ExchangeSpec,
-    FieldSpec,
-    InterruptSpec,
-    Layout,
-    MailboxSpec,
-    TaskSpec,
-)
-from rack.backplane.words import Block, Box, Head, Run, System
+from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.words import Block, Head, Run, System
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 16
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 """Words with the addresses of the texts; the word after each has its size."""
 PREFIX = "nasrem-rack."
-KIND = re.compile(r"[<>|]?[biufcSUV]\d+")
-"""Kinds of fields. A layout may be another user's: numpy would take an object of Python's from the
-number in a message."""
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which `shm_open` of the C library keeps its names."""
 LOOK_S = 0.02
@@ -265,7 +255,7 @@ class Segment:
     def block(self, task: str) -> memoryview:
         """Return a task's control block, as words (`words.Block`). Raises `KeyError`."""
         start = self.map.blocks[task] // 8
-        return self.words[start : start + max(Block) + 1]
+        return self.words[start : start + BLOCK_SIZE // 8]
 
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task by `tick`. Releases since its last cycle are skipped ones as
@@ -279,7 +269,7 @@ class Segment:
     def box(self, mailbox: str) -> memoryview:
         """Return the head of a mailbox, as words (`words.Box`). Raises `KeyError`."""
         start = self.map.mailboxes[mailbox] // 8
-        return self.words[start : start + len(Box)]
+        return self.words[start : start + MAILBOX_HEAD_SIZE // 8]
 
     def is_locked(self, address: int) -> bool:
         """Say whether a process holds the lock on the byte at a bus address: see
@@ -401,32 +391,25 @@ def _shm_name(rack: str) -> str:
     return f"/{PREFIX}{rack}"
 
 
-def _field(entry: dict[str, Any]) -> FieldSpec:
-    if not KIND.fullmatch(entry["kind"]):
-        raise ValueError(f"a field of kind {entry['kind']}")
-    shape = tuple(entry["shape"])
-    fields = tuple(map(_field, entry["fields"]))
-    values = tuple((name, number) for name, number in entry["values"])
-    length = entry.get("length") and tuple(entry["length"])
-    return FieldSpec(
-        **{**entry, "shape": shape, "fields": fields, "values": values, "length": length}
-    )
+def layout_of(plain: dict[str, Any]) -> Layout:
+    """Return a layout from the plain data that `dataclasses.asdict` makes of it. Recordings of
+    earlier versions lack some of it."""
+    layout: Layout = _restored(Layout, plain)
+    return layout
 
 
-def _mailbox(entry: dict[str, Any]) -> MailboxSpec:
-    # Recordings of earlier versions lack `rests_on` and what follows it.
-    names = {key: tuple(entry.get(key, ())) for key in ("readers", "rests_on")}
-    fields = tuple(map(_field, entry["fields"]))
-    exchanges = tuple(ExchangeSpec(**exchange) for exchange in entry.get("exchanges", ()))
-    how = entry.get("interrupt")
-    interrupt = None if how is None else InterruptSpec(**{**how, "slots": tuple(how["slots"])})
-    return MailboxSpec(
-        **{**entry, **names, "fields": fields, "exchanges": exchanges, "interrupt": interrupt}
-    )
+def _restored(kind: Any, plain: Any) -> Any:
+    if isinstance(plain, list):
+        inner, *_ = get_args(kind)
+        return tuple([_restored(inner, entry) for entry in plain])
+    if isinstance(plain, dict):
+        # Of an optional part, the type that is not None.
+        record, *_ = get_args(kind) or (kind,)
+        types = _types_of(record)
+        return record(**{name: _restored(types[name], entry) for name, entry in plain.items()})
+    return plain
 
 
-def layout_of(entry: dict[str, Any]) -> Layout:
-    """Return a layout from the plain data that `dataclasses.asdict` makes of it."""
-    boxes = tuple(_mailbox(box) for box in entry["mailboxes"])
-    tasks, hosts = (tuple(TaskSpec(**t) for t in entry[key]) for key in ("tasks", "hosts"))
-    return Layout(**{**entry, "tasks": tasks, "hosts": hosts, "mailboxes": boxes})
+@cache
+def _types_of(record: type) -> dict[str, Any]:
+    return get_type_hints(record)

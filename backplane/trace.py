@@ -59,7 +59,6 @@ _TICK, _END, _FLAGS = (FIELDS.index(name) for name in ("tick", "end_ns", "flags"
 _RECORD = TRACE_RECORD_SIZE // 8
 # Native alignment: each number is stored whole.
 _PACK = Struct(f"@{len(FIELDS)}q").pack_into
-_TRACE_HEAD = int(Block.TRACE_HEAD)
 _BUS_ERROR = int(Flag.BUS_ERROR)
 
 
@@ -77,7 +76,7 @@ class TraceWriter:
         """Append a record: its numbers in the order of `RECORD`."""
         self._count = count = self._count + 1
         _PACK(self._ring, (count & self._mask) * TRACE_RECORD_SIZE, *record)
-        self._block[_TRACE_HEAD] = count
+        self._block[Block.TRACE_HEAD] = count
 
 
 def trace_ring(segment: Segment, task: str) -> Ring:
@@ -105,7 +104,7 @@ class CycleRecord:
     @property
     def finished(self) -> int:
         """Newest release whose cycle has ended with every access done; -1: none, or not known."""
-        count = self._block[_TRACE_HEAD]
+        count = self._block[Block.TRACE_HEAD]
         at = self._at(count)
         flags = self._words[at + _FLAGS]
         tick = self._words[at + _TICK]
@@ -114,7 +113,7 @@ class CycleRecord:
     def ended_ns(self, tick: int) -> int | None:
         """Return the end of the cycle released at `tick`, CLOCK_MONOTONIC; None without a record of
         it."""
-        count = self._block[_TRACE_HEAD]
+        count = self._block[Block.TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
             at = self._at(number)
             found = self._words[at + _TICK]
@@ -126,7 +125,7 @@ class CycleRecord:
         return None
 
     def _keeps(self, number: int) -> bool:
-        return number >= oldest_kept(self._block[_TRACE_HEAD], self._depth)
+        return number >= oldest_kept(self._block[Block.TRACE_HEAD], self._depth)
 
     def _at(self, number: int) -> int:
         return self._first + number % self._depth * _RECORD

@@ -1,12 +1,33 @@
 """The shared words: every number on the backplane outside messages, by name.
 
 Each is an aligned 64-bit integer with one writer, stored and loaded whole through a memoryview cast
-to 'q'. (`struct` packs byte by byte: a reader could see half a number.)
+to 'q'. (`struct` packs byte by byte: a reader could see half a number.) Their places are plain
+integers: a member of an enum takes as long to look up as three words take to read.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Protocol
+
+
+class OnWords(Protocol):
+    """What consists of words of shared memory."""
+
+    words: memoryview
+
+
+class Word:
+    """A word at a place among the `words` of an object, as an attribute."""
+
+    def __init__(self, place: int) -> None:
+        self._place = place
+
+    def __get__(self, owner: OnWords, kind: type) -> int:
+        return owner.words[self._place]
+
+    def __set__(self, owner: OnWords, value: int) -> None:
+        owner.words[self._place] = value
 
 
 def switch(tick: int, is_on: bool) -> int:
@@ -24,7 +45,7 @@ def is_on(word: int, tick: int) -> bool:
     return bool(word & 1) == (tick >= word >> 1)
 
 
-class Head(IntEnum):
+class Head:
     """Words at the head of the segment, written once by the Rack."""
 
     MAGIC = 0
@@ -43,7 +64,7 @@ class Head(IntEnum):
     CHECK = 13  # CRC-32 of the three texts
 
 
-class System(IntEnum):
+class System:
     """Words of the system clock and the utility lines, after those of the head."""
 
     STATE = 32  # Run
@@ -96,7 +117,7 @@ class Demand(IntEnum):
     BRAKE = 2  # brake at once
 
 
-class Block(IntEnum):
+class Block:
     """Words of a task's control block, written by the task; RELEASED by the clock, LOST by the
     finder of a loss.
 
@@ -155,7 +176,7 @@ class TaskState(IntEnum):
     GIVEN_UP = 6  # lost, and not to be restarted; written by the Rack
 
 
-class Box(IntEnum):
+class Box:
     """Words at the head of a mailbox."""
 
     HEAD = 0  # serial of the newest whole message; 0: none
@@ -180,7 +201,7 @@ class Box(IntEnum):
     FIRST = 12  # serial of the newest message before this run: see `Block.TRACE_FIRST`
 
 
-class Slot(IntEnum):
+class Slot:
     """Words in front of every message in its slot.
 
     The checksum covers BASIS to the end of the message and, as it is seeded with CHAIN, the

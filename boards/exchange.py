@@ -7,7 +7,7 @@ A board whose config has tables `[board.<name>.exchange.<port>]` writes this int
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,25 +31,17 @@ NEVER = -1
 
 def exchange_message(reads: Mapping[str, Source]) -> MessageType:
     """Return the message type for a board that reads these ports: two fields for each mailbox."""
-    fields = [field for label in _labels(reads) for field in _fields(label)]
-    return MessageType(EXCHANGE, 1, tuple(fields))
-
-
-def _labels(reads: Mapping[str, Source]) -> Iterator[str]:
-    for port, source in reads.items():
-        if isinstance(source, str):
-            yield port
-        else:
-            yield from (f"{port}_{board}" for board in source)
-
-
-def _fields(label: str) -> tuple[Field, Field]:
     age = (
         "from the release of the message in use to that of this cycle; negative: released later; 0"
         " before the first"
     )
     taken = f"release of the cycle that took it; {NEVER} before the first"
-    return tick(f"{label}_{AGE}", age), tick(f"{label}_{TAKEN}", taken)
+    fields: list[Field] = []
+    for port, source in reads.items():
+        labels = [port] if isinstance(source, str) else [f"{port}_{board}" for board in source]
+        for label in labels:
+            fields += [tick(f"{label}_{AGE}", age), tick(f"{label}_{TAKEN}", taken)]
+    return MessageType(EXCHANGE, 1, tuple(fields))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from rack.backplane.errors import DamageError
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
-from rack.backplane.operator_table import RequestEntry, RequestWord
+from rack.backplane.operator_table import RequestEntry
 from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
 
 
@@ -28,7 +28,7 @@ def message_of(entry: RequestEntry, layout: Layout) -> Message:
 
 def _mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
     """Return the mailbox of a request. Raises `DamageError` if it is no operator's."""
-    found = pick(layout.mailboxes, entry[RequestWord.MAILBOX], "mailbox")
+    found = pick(layout.mailboxes, entry.mailbox, "mailbox")
     if found.message != OPERATOR_COMMAND.name:
         raise DamageError(f"a command for '{found.name}'")
     return found

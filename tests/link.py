@@ -9,7 +9,7 @@ from time import monotonic_ns
 from typing import NamedTuple
 
 from rack.backplane import semaphores
-from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
+from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.interrupt import open_inbox
@@ -23,7 +23,7 @@ from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
 
-COUNTED = (Entry.STAGE, Entry.STRUCK_TICK, Entry.HIDDEN, Entry.COUNT)
+COUNTED = ("stage", "struck_tick", "hidden", "count")
 """Words of a fault's entry that do not depend on time."""
 
 
@@ -176,7 +176,7 @@ def story(rack: Link, kind: str, *parameters: float) -> dict[str, object]:
         "written": written,
         "reader": rack.rung("reader"),
         "writer": rack.rung("writer"),
-        "struck": [[entry[word] for word in COUNTED] for entry in entries],
+        "struck": [[getattr(entry, word) for word in COUNTED] for entry in entries],
         "statistics": {
             name: getattr(statistics, name) for name in statistics.__slots__ if name != "forger"
         },
@@ -192,7 +192,7 @@ def story(rack: Link, kind: str, *parameters: float) -> dict[str, object]:
 
 def struck(entry: FaultEntry) -> int:
     """Return the tick at which a fault has first acted."""
-    return entry[Entry.STRUCK_TICK]
+    return entry.struck_tick
 
 
 MakeLink = Callable[..., Link]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.fault_table import FAULT_WORDS, FaultTable, Stage
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
@@ -48,7 +48,7 @@ OF_SYSTEM = (
     System.COMMANDED,
     System.HELD,
 )
-STRIKE = tuple(word for word in Entry if word not in (Entry.STRUCK_NS, Entry.PARAMETER))
+STRIKE = tuple(word for word in range(FAULT_WORDS) if word != 13)
 BY_CHANCE = ("died", "restart", "given_up")
 """Codes of events that the Rack learns of from the kernel, at no certain tick."""
 TIMELESS = ("tick", "flags", "state")
@@ -79,10 +79,12 @@ def whole_run(config: RackConfig, seconds: float) -> Mapping[str, object]:
         outcome = rack.run(seconds)
         counts = counted(rack.segment)
         struck = [
-            [*(entry[word] for word in STRIKE), *entry.parameters]
+            [*(entry.words[word] for word in STRIKE), *entry.parameters]
             for entry in FaultTable(rack.segment).staged(tuple(Stage)[1:])
         ]
-        events = sorted({_of_event(event) for event in rack.events})
+        # A busy machine makes a launch wait for its boards.
+        heard = [event for event in rack.events if event.kind != "waiting"]
+        events = sorted({_of_event(event) for event in heard})
     end = (outcome.cause, outcome.ticks, outcome.state, outcome.reason, outcome.faults)
     return {"messages": outcome.digest, "events": events, **counts, "struck": struck, "end": end}
 
@@ -93,3 +95,10 @@ def _of_event(event: Event) -> tuple[object, ...]:
     tick = -1 if event.code in BY_CHANCE or event.kind == "start" else event.tick
     board = "" if event.kind == "detection" else event.board
     return (tick, event.kind, board, event.code, event.fault, event.subject, event.since)
+
+
+def in_short(parts: Mapping[str, object]) -> dict[str, object]:
+    """Return the parts of a whole run for a snapshot: messages, events, and all counts together."""
+    apart = ("messages", "events")
+    counts = {name: part for name, part in parts.items() if name not in apart}
+    return {name: parts[name] for name in apart if name in parts} | {"counts": counts}

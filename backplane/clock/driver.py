@@ -26,10 +26,6 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
 
-# Plain integers for the hot path.
-_TICK, _TICK_NS, _STOP_TICK, _STOP_REQUEST = (
-    int(word) for word in (System.TICK, System.TICK_NS, System.STOP_TICK, System.STOP_REQUEST)
-)
 LEAD_NS = 300_000
 """How far ahead of its grid point the clock begins a tick: room for its own wake-up and for the
 work of a tick."""
@@ -83,14 +79,10 @@ class ClockDriver(ABC):
         self._ended = ended
         self._segment = segment
 
-    def task(self, name: str) -> ReleasedTask:
-        """Return the task of that name. Raises `KeyError`."""
-        return {task.spec.name: task for task in self.tasks}[name]
-
     def begin(self, tick: int) -> bool:
         """Publish `tick` and do the work due before its releases; False when the tick is
         skipped."""
-        self.words[_TICK] = tick
+        self.words[System.TICK] = tick
         if self.controller is not None:
             self.controller.begin(tick)
         if not self.skip:
@@ -130,23 +122,24 @@ class ClockDriver(ABC):
 
         No task is released twice for it: its deadline shows that it has been.
         """
-        return self.words[_TICK] if self.words[System.STATE] == Run.RUNNING else 0
+        return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @property
     def first_end(self) -> int:
         """The first tick before which the run may end."""
         return 0
 
-    @abstractmethod
     def settle(self) -> None:
-        """In lockstep, wait until each task has finished the work of its release, plans too.
+        """In lockstep, wait until each task has finished the work of its release, plans too; in
+        real time a change may take effect within a cycle.
 
         Call it before changing anything that tasks read at any time rather than as of a tick.
         """
 
-    @abstractmethod
-    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
-        """In lockstep, wait until `condition` on the state of a task holds."""
+    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
+        """In lockstep, wait until `condition` on the state of a task holds, which the task's
+        reports make true; False when the launcher is gone. Real time does not wait."""
+        return True
 
     @abstractmethod
     def run(self) -> None:
@@ -155,15 +148,15 @@ class ClockDriver(ABC):
     def is_over(self, tick: int) -> bool:
         """Say whether the run ends before `tick`."""
         words = self.words
-        stop = words[_STOP_TICK]
-        if words[_STOP_REQUEST] and (not stop or stop > tick):
-            stop = words[_STOP_TICK] = max(tick, 1)
+        stop = words[System.STOP_TICK]
+        if words[System.STOP_REQUEST] and (not stop or stop > tick):
+            stop = words[System.STOP_TICK] = max(tick, 1)
         if stop and tick >= stop:
             return True
         # Asked even where the stop is known: a run that continues this one may end by it.
         found = self._ended(tick)
         if not stop and found is not None:
-            stop = words[_STOP_TICK] = max(found, self.first_end, 1)
+            stop = words[System.STOP_TICK] = max(found, self.first_end, 1)
         return bool(stop) and tick >= stop
 
     @property
@@ -212,12 +205,6 @@ class RealtimeDriver(ClockDriver):
         self._sleep_until(self._time_of(tick))
         self.end()
 
-    def settle(self) -> None:
-        """Return at once: in real time a change may take effect within a cycle."""
-
-    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
-        """Return at once: real time does not wait."""
-
     def _release(self, tick: int, last: int) -> None:
         """Give every task its release in (last, tick]: those that sleep in time, the others at the
         grid point."""
@@ -226,7 +213,7 @@ class RealtimeDriver(ClockDriver):
         sleeping = [task for task in due if task.sleeps]
         for task in sleeping:
             task.release(tick)
-        now = self.words[_TICK_NS] = time.monotonic_ns()
+        now = self.words[System.TICK_NS] = time.monotonic_ns()
         if now >= point or tick > last + 1:
             for task in sleeping:
                 # It has looked for its release already, and sleeps on.
@@ -261,7 +248,7 @@ class RealtimeDriver(ClockDriver):
         self._sleep_until(due_ns - self._lead_ns)
         self._woke_ns = time.monotonic_ns()
         now = (self._woke_ns + self._lead_ns - self._epoch_ns) // self._period_ns
-        if stop := self.words[_STOP_TICK]:
+        if stop := self.words[System.STOP_TICK]:
             # Even a late clock makes the run's last tick: tasks that are late for it are seen.
             now = min(now, stop - 1)
         next_tick = max(tick + 1, now)

@@ -30,12 +30,6 @@ from rack.backplane.words import Run, System
 IDLE_S = 30.0
 """Bound of the wait for a recorder that is stopped, or dead and not replaced. Its launcher replaces
 it much sooner."""
-# Plain integers for the hot path.
-_FOLLOWER_PID = int(System.FOLLOWER_PID)
-_FOLLOWER_TICK = int(System.FOLLOWER_TICK)
-_HOLD_AT = int(System.HOLD_AT)
-_STOP_TICK = int(System.STOP_TICK)
-_TICK = int(System.TICK)
 BATCH = 8
 """Most ticks of a batch: what the host asks for meanwhile comes after them."""
 LOOK_S = 0.001
@@ -95,7 +89,7 @@ class LockstepDriver(ClockDriver):
             end = self._batch_end(due, tick)
             if not self._step(due, tick, end):
                 break
-            self._last = self.words[_TICK] = end - 1
+            self._last = self.words[System.TICK] = end - 1
             self._next = end
         self.end()
 
@@ -119,9 +113,9 @@ class LockstepDriver(ClockDriver):
             return tick + 1
         words = self.words
         end = min(tick + BATCH, self._kept_until, controller.rests_until(tick))
-        if stop := words[_STOP_TICK]:
+        if stop := words[System.STOP_TICK]:
             end = min(end, stop)
-        if (hold := words[_HOLD_AT]) > 0:
+        if (hold := words[System.HOLD_AT]) > 0:
             end = min(end, hold - 1)
         for task in self.tasks:
             if end <= tick + 1:
@@ -137,7 +131,7 @@ class LockstepDriver(ClockDriver):
             task.release(tick, end - tick - 1)
             if task.is_posted:
                 task.wake()
-            if one_at_a_time and not self._wait(task, task.is_settled):
+            if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
         self.check(due, tick)
         return self._wait_for_all(end)
@@ -154,7 +148,7 @@ class LockstepDriver(ClockDriver):
                 task.done.take()
             else:
                 slowest = task
-                if not self._wait(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
+                if not self.await_state(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
                     return False
         if slowest is not None and slowest is not order[0]:
             order.remove(slowest)
@@ -164,13 +158,9 @@ class LockstepDriver(ClockDriver):
     def settle(self) -> None:
         """Wait until every task has finished the work of its release, plans too."""
         for task in self.tasks:
-            self._wait(task, task.is_settled)
+            self.await_state(task, task.is_settled)
 
-    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> None:
-        """Wait until `condition` on the state of a task holds."""
-        self._wait(task, condition)
-
-    def _wait(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
+    def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
         """Wait until `condition` holds, which the task's reports make true; False when the launcher
         is gone."""
         wait = task.done.wait
@@ -195,11 +185,11 @@ class LockstepDriver(ClockDriver):
         still meanwhile."""
         words = self.words
         since = time.monotonic()
-        while (pid := words[_FOLLOWER_PID]) and self._is_ahead(tick):
+        while (pid := words[System.FOLLOWER_PID]) and self._is_ahead(tick):
             if state_of(pid) not in (*STOPPED, *GONE):
                 since = time.monotonic()
             elif time.monotonic() - since > IDLE_S:
-                words[_FOLLOWER_PID] = 0
+                words[System.FOLLOWER_PID] = 0
             if words[System.STOP_REQUEST] or not self.launcher_is_alive:
                 return False
             time.sleep(LOOK_S)
@@ -210,16 +200,16 @@ class LockstepDriver(ClockDriver):
         than a tick."""
         if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
             return True
-        return self.words[_FOLLOWER_TICK] < tick - self._history_ticks
+        return self.words[System.FOLLOWER_TICK] < tick - self._history_ticks
 
     def _wait_for_step(self, tick: int) -> bool:
         """Hold before `tick` while the host steps the rack; False when the launcher is gone."""
         words = self.words
-        if not 0 < words[_HOLD_AT] <= tick + 1:
+        if not 0 < words[System.HOLD_AT] <= tick + 1:
             return True
         self.settle()
         words[System.HELD] = tick + 1
-        while 0 < words[_HOLD_AT] <= tick + 1 and not words[System.STOP_REQUEST]:
+        while 0 < words[System.HOLD_AT] <= tick + 1 and not words[System.STOP_REQUEST]:
             if not self.launcher_is_alive:
                 return False
             time.sleep(LOOK_S)

@@ -17,12 +17,6 @@ from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, TaskState
 
-# Plain integers for the hot path.
-_RELEASED, _FIRST, _DEADLINE, _DONE, _LOST = (
-    int(Block[name]) for name in ("RELEASED", "FIRST", "DEADLINE", "DONE", "LOST")
-)
-
-
 RELEASES_MISSED = 4
 """Missed releases before a task is checked: three gave one false trip in 24,000 cycles at 400
 Hz."""
@@ -50,11 +44,11 @@ class ReleasedTask:
         self.is_posted = spec.wake != "poll"
         self.missed = 0
         self.is_stopped = False
-        self.deadline = self.block[_DEADLINE]
+        self.deadline = self.block[Block.DEADLINE]
         self._every = spec.every
         self._phase = spec.phase
         self._early = spec.every - segment.layout.due(spec)
-        self._done = self.block[_DONE]
+        self._done = self.block[Block.DONE]
         self.wake: Callable[[], None] = wake_semaphore(segment.rack, spec.name).release
         self.done = done_semaphore(segment.rack, spec.name)
 
@@ -62,7 +56,7 @@ class ReleasedTask:
         """Say whether the task can take a release; it cannot while it works on a plan or is
         lost."""
         block = self.block
-        return block[_DEADLINE] <= release and not self.is_lost
+        return block[Block.DEADLINE] <= release and not self.is_lost
 
     def release(self, tick: int, more: int = 0) -> None:
         """Give the task its newest release and, in lockstep, so many `more` after it."""
@@ -71,8 +65,8 @@ class ReleasedTask:
         release = tick - (tick - self._phase) % every
         if self.is_stopped:
             self.check_stopped()
-        done = block[_DONE]
-        if done == block[_RELEASED]:
+        done = block[Block.DONE]
+        if done == block[Block.RELEASED]:
             self.missed = 0
         elif done != self._done:
             self.missed = min(self.missed + 1, 2)
@@ -80,10 +74,10 @@ class ReleasedTask:
             self.missed += 1
         self._done = done
         newest = release + more * every
-        block[_DEADLINE] = newest + every
+        block[Block.DEADLINE] = newest + every
         self.deadline = newest + every - self._early
-        block[_FIRST] = release
-        block[_RELEASED] = newest
+        block[Block.FIRST] = release
+        block[Block.RELEASED] = newest
 
     def next_event(self, tick: int) -> int:
         """Return the first tick after `tick` that must wait for the task, or releases it."""
@@ -94,11 +88,11 @@ class ReleasedTask:
     def is_settled(self) -> bool:
         """Say whether it has finished, or will not: there is nothing to wait for."""
         block = self.block
-        return block[_DONE] == block[_RELEASED] or self.is_lost or self.is_stopped
+        return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
         """Say whether `tick` may begin without waiting for the task."""
-        self.deadline = self.block[_DEADLINE] - self._early
+        self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 
     def check_stopped(self) -> None:
@@ -108,12 +102,12 @@ class ReleasedTask:
     @property
     def is_lost(self) -> bool:
         """Whether the task was found lost and has not rejoined."""
-        return bool(self.block[_LOST])
+        return bool(self.block[Block.LOST])
 
     @property
     def lost_tick(self) -> int:
         """Tick at which a lost task was found so."""
-        return self.block[_LOST] - 1
+        return self.block[Block.LOST] - 1
 
     @property
     def is_ready(self) -> bool:
@@ -129,16 +123,16 @@ class ReleasedTask:
     def lose(self, tick: int) -> None:
         """Stop releasing it until its new process has rejoined."""
         self.block[Block.STATE] = TaskState.ABSENT
-        self.block[_LOST] = tick + 1
+        self.block[Block.LOST] = tick + 1
 
     def rejoin(self) -> None:
         """Admit its new process: the next release on the grid is its first."""
         block = self.block
-        block[_DONE] = block[_RELEASED]
-        block[_DEADLINE] = 0
+        block[Block.DONE] = block[Block.RELEASED]
+        block[Block.DEADLINE] = 0
         self.missed = 0
         self.is_stopped = False
-        block[_LOST] = 0
+        block[Block.LOST] = 0
 
 
 def by_priority(layout: Layout) -> list[TaskSpec]:

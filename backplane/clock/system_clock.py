@@ -9,44 +9,39 @@ from rack.backplane.errors import ClockError
 from rack.backplane.segment import Segment
 from rack.backplane.words import Run, System
 
-# Plain integers for the hot path.
-_STATE, _TICK, _EPOCH, _PERIOD, _LOCKSTEP = (
-    int(w) for w in (System.STATE, System.TICK, System.EPOCH_NS, System.PERIOD_NS, System.LOCKSTEP)
-)
-
 
 class SystemClock:
     """Read access to the clock: the current tick, and the times of ticks on CLOCK_MONOTONIC."""
 
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
-        self.is_lockstep = bool(self._words[_LOCKSTEP])
+        self.is_lockstep = bool(self._words[System.LOCKSTEP])
 
     @property
     def tick(self) -> int:
         """The newest tick of the clock board."""
-        return self._words[_TICK]
+        return self._words[System.TICK]
 
     @property
     def is_stopped(self) -> bool:
         """True when the run is over."""
-        return self._words[_STATE] == Run.STOPPED
+        return self._words[System.STATE] == Run.STOPPED
 
     def now(self) -> int:
         """Return the current tick: in real time by the grid, as the clock board may be late; else
         the newest tick."""
         if self.is_lockstep:
-            return self._words[_TICK]
-        return (monotonic_ns() - self._words[_EPOCH]) // self._words[_PERIOD]
+            return self._words[System.TICK]
+        return (monotonic_ns() - self._words[System.EPOCH_NS]) // self._words[System.PERIOD_NS]
 
     @property
     def period_ns(self) -> int:
         """Time from tick to tick, in ns of the wall clock."""
-        return self._words[_PERIOD]
+        return self._words[System.PERIOD_NS]
 
     def time_of(self, tick: int) -> int:
         """Return the CLOCK_MONOTONIC time of a tick, in ns."""
-        return self._words[_EPOCH] + tick * self._words[_PERIOD]
+        return self._words[System.EPOCH_NS] + tick * self._words[System.PERIOD_NS]
 
 
 def ticks_of(

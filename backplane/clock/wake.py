@@ -29,14 +29,7 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
 
 # Plain integers for the hot path.
-_RELEASED = int(Block.RELEASED)
-_DONE = int(Block.DONE)
-_FIRST = int(Block.FIRST)
-_SAVE = int(Block.SAVE)
-_STATE = int(System.STATE)
 _STOPPED = int(Run.STOPPED)
-_EPOCH = int(System.EPOCH_NS)
-_PERIOD = int(System.PERIOD_NS)
 CHECK_S = 0.25
 """A longer wait checks whether the launcher is still alive."""
 NEAR_NS = 25_000_000
@@ -81,8 +74,8 @@ class NextCycle:
         )
         # A restarted task takes no release from before its start: those are skipped. The clock does
         # not write this word until the task has rejoined.
-        self._block[_RELEASED] = self._block[_DONE]
-        self._due = self._block[_DONE] + 1
+        self._block[Block.RELEASED] = self._block[Block.DONE]
+        self._due = self._block[Block.DONE] + 1
         self.hold_until(self._due)
         self._slack = 0
         self.skipped = 0
@@ -101,10 +94,10 @@ class NextCycle:
         while True:
             # Read first: a task that is late for the run's last release still takes it, so that the
             # miss is seen.
-            is_over = words[_STATE] == _STOPPED
+            is_over = words[System.STATE] == _STOPPED
             # The task's own release, not the clock's tick: in lockstep its turn may come later in a
             # tick.
-            newest = block[_RELEASED]
+            newest = block[Block.RELEASED]
             if self._sleeps and newest >= self._due and self._is_ahead(newest):
                 # A task woken late may find the next release there already: the one before it is
                 # still to be taken.
@@ -116,7 +109,7 @@ class NextCycle:
                     self._semaphore.take()
                 self._newest = newest
                 return self._take(newest)
-            if block[_SAVE] and self.save is not None:
+            if block[Block.SAVE] and self.save is not None:
                 self.save()
             if is_over or not self._pause():
                 return None
@@ -126,7 +119,7 @@ class NextCycle:
         """Take the oldest release that has not passed."""
         every = self._spec.every
         expected = self._due
-        oldest = self._block[_FIRST] if self._takes_batches else newest - self._slack
+        oldest = self._block[Block.FIRST] if self._takes_batches else newest - self._slack
         release = max(expected, oldest)
         self.skipped = (release - expected) // every
         self._due = release + every
@@ -137,7 +130,9 @@ class NextCycle:
 
     def _is_ahead(self, release: int) -> bool:
         """Say whether the grid point of a release is yet to come."""
-        return monotonic_ns() < self._words[_EPOCH] + release * self._words[_PERIOD]
+        return (
+            monotonic_ns() < self._words[System.EPOCH_NS] + release * self._words[System.PERIOD_NS]
+        )
 
     def _sleep(self) -> bool:
         """Sleep to the next release's grid point or, if that has passed, to the task's next one or
@@ -147,9 +142,9 @@ class NextCycle:
         deadline = bound = now + int(CHECK_S * 1e9)
         is_due = False
         # Before its start the clock has no grid. It then wakes every task once.
-        if epoch := words[_EPOCH]:
-            point = epoch + self._due * words[_PERIOD]
-            step = self._spec.every * words[_PERIOD]
+        if epoch := words[System.EPOCH_NS]:
+            point = epoch + self._due * words[System.PERIOD_NS]
+            step = self._spec.every * words[System.PERIOD_NS]
             if now < point < now + NEAR_NS:
                 sleep((point - now) * 1e-9)
                 return True
@@ -158,7 +153,7 @@ class NextCycle:
                 point += ((now - point) // step + 1) * step
             deadline = min(bound, point)
         self._semaphore.bind(deadline)
-        if not self._semaphore.wait() or is_due or self._block[_RELEASED] >= self._due:
+        if not self._semaphore.wait() or is_due or self._block[Block.RELEASED] >= self._due:
             return True
         return self._look_around()
 
@@ -176,7 +171,7 @@ class NextCycle:
         block = self._block
         due = self._due
         for _ in range(SPINS):
-            if block[_RELEASED] >= due:
+            if block[Block.RELEASED] >= due:
                 return True
         os.sched_yield()
         return self._segment.launcher_is_alive

@@ -19,11 +19,23 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_MASK, Slots, epoch_of, message_dtype
 from rack.backplane.ring import Drained, Ring
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, Slot, System
+from rack.backplane.words import Box, System
+
+HEAD_WORDS = {
+    "stamp_ns": "i8",
+    "epoch": "i8",
+    "chain": "u8",
+    "check": "u8",
+    "basis": "i8",
+    "serial": "i8",
+    "tick": "i8",
+    "visible_at": "i8",
+}
+"""The words of `words.Slot` in their order, with their types."""
 
 
 class MailboxRing(Ring):
-    """The messages of a mailbox as a ring: fields of `words.Slot` in lower case, then `message`.
+    """The messages of a mailbox as a ring: `HEAD_WORDS`, then `message`.
 
     It omits the messages that every reader rejects: lost, damaged or forged ones.
     """
@@ -70,12 +82,9 @@ def row_dtype(spec: MailboxSpec) -> np.dtype:
     message = message_dtype(spec.fields, spec.size)
     return np.dtype(
         {
-            "names": [word.name.lower() for word in Slot] + ["message"],
-            "formats": [
-                *("u8" if word in (Slot.CHAIN, Slot.CHECK) else "i8" for word in Slot),
-                message,
-            ],
-            "offsets": [8 * word for word in Slot] + [8 * len(Slot)],
+            "names": [*HEAD_WORDS, "message"],
+            "formats": [*HEAD_WORDS.values(), message],
+            "offsets": range(0, SLOT_HEAD_SIZE + 8, 8),
             "itemsize": slot_stride(spec),
         }
     )

@@ -12,6 +12,8 @@ its messages could become visible).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rack.backplane.layout import SPARE, FieldSpec
@@ -21,10 +23,6 @@ from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
-_HEAD = int(Box.HEAD)
-_TAKEN = int(Box.TAKEN)
-_REFUSED = int(Box.REFUSED)
-
 
 class HostWriter(DoubleBufferWriter):
     """The host board's end of a ring. Opening it claims the mailbox, as any writer does."""
@@ -33,16 +31,11 @@ class HostWriter(DoubleBufferWriter):
         super().__init__(segment, name)
         self._box = self._slots.box
 
-    @property
-    def is_full(self) -> bool:
-        """Whether as many messages wait as the ring holds."""
-        return self._box[_HEAD] - self._box[_TAKEN] >= self.spec.capacity
-
     def send(self, tick: int) -> bool:
         """Publish `message`, written at `tick`; return False, and count it, when the ring is
         full."""
-        if self.is_full:
-            self._box[_REFUSED] += 1
+        if self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity:
+            self._box[Box.REFUSED] += 1
             return False
         return self.write(tick)
 
@@ -55,7 +48,6 @@ class HostReader:
         self.spec = spec = segment.layout.mailbox(name)
         self._slots = Slots(segment, spec)
         self._box = self._slots.box
-        self._is_proper = ProperContent(spec.fields)
         self.refused = 0
         """Messages refused: damaged, forged, or improper."""
         self.superseded = 0
@@ -64,12 +56,12 @@ class HostReader:
     @property
     def waiting(self) -> int:
         """Messages that wait, at most the slots of the ring."""
-        return min(max(0, self._box[_HEAD] - self._box[_TAKEN]), self.spec.depth)
+        return min(max(0, self._box[Box.HEAD] - self._box[Box.TAKEN]), self.spec.depth)
 
     @property
     def full(self) -> int:
         """How often the writer found the ring full."""
-        return self._box[_REFUSED]
+        return self._box[Box.REFUSED]
 
     @property
     def written(self) -> int:
@@ -78,20 +70,20 @@ class HostReader:
 
     def take(self) -> Message | None:
         """Take the oldest message that waits; None if it is bad. Valid until the next call."""
-        head = self._box[_HEAD]
-        oldest = self._box[_TAKEN] + 1
+        head = self._box[Box.HEAD]
+        oldest = self._box[Box.TAKEN] + 1
         # Only a writer that does not keep to the rules overwrites what waits.
         serial = max(oldest, head - self.spec.depth + SPARE)
         self.superseded += serial - oldest
-        self._box[_TAKEN] = serial
+        self._box[Box.TAKEN] = serial
         return self._fetched(serial)
 
     def take_newest(self, most: int) -> Message | None:
         """Take all that wait and return the newest good one, looking at no more than `most`; None:
         there is none."""
         waiting = self.waiting
-        head = self._box[_HEAD]
-        self._box[_TAKEN] = head
+        head = self._box[Box.HEAD]
+        self._box[Box.TAKEN] = head
         for back in range(min(waiting, most)):
             if (message := self._fetched(head - back)) is not None:
                 self.superseded += waiting - back - 1
@@ -100,52 +92,34 @@ class HostReader:
 
     def _fetched(self, serial: int) -> Message | None:
         slots = self._slots
-        if slots.fetch(serial) and slots.is_lawful(0) and self._is_proper(slots.message):
+        if (
+            slots.fetch(serial)
+            and slots.is_lawful(0)
+            and is_proper(slots.message.record, self.spec.fields)
+        ):
             return slots.message
         self.refused += 1
         return None
 
 
-class ProperContent:
-    """Says whether a message holds only what its type permits: finite numbers, lengths, members of
-    enums, ASCII.
+def is_proper(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool:
+    """Say whether a message, or some groups of one, hold only what their types permit: finite
+    numbers, lengths, members of enums, ASCII."""
+    return all(_is_permitted(record[field.name], field) for field in fields)
 
-    In an array of groups, those that are all zero are empty.
-    """
 
-    def __init__(self, fields: tuple[FieldSpec, ...]) -> None:
-        self._numbers = [field.name for field in fields if np.dtype(field.kind).kind == "f"]
-        self._texts = [field.name for field in fields if np.dtype(field.kind).kind == "S"]
-        self._lengths = [
-            (field.name, field.length, bool(field.shape)) for field in fields if field.length
-        ]
-        self._enums = [
-            (field.name, [number for _, number in field.values]) for field in fields if field.values
-        ]
-        self._groups = [
-            (field.name, ProperContent(field.fields)) for field in fields if field.fields
-        ]
-
-    def __call__(self, message: Message) -> bool:
-        """Say whether a message is proper."""
-        return self._permits(message.record)
-
-    def _permits(self, record: np.ndarray | np.void) -> bool:
-        if not all(np.isfinite(record[name]).all() for name in self._numbers):
-            return False
-        if not all(record[name].tobytes().isascii() for name in self._texts):
-            return False
-        if not all(np.isin(record[name], numbers).all() for name, numbers in self._enums):
-            return False
-        if not all(
-            _has_length(record[name], limits, is_vector)
-            for name, limits, is_vector in self._lengths
-        ):
-            return False
-        groups = [(record[name], content) for name, content in self._groups]
-        return all(
-            content._permits(group[group != np.zeros_like(group)]) for group, content in groups
-        )
+def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
+    kind = values.dtype.kind
+    if kind == "f" and not np.isfinite(values).all():
+        return False
+    if kind == "S" and not values.tobytes().isascii():
+        return False
+    if field.values and not np.isin(values, [number for _, number in field.values]).all():
+        return False
+    if field.length and not _has_length(values, field.length, bool(field.shape)):
+        return False
+    # In an array of groups, those that are all zero are empty.
+    return not field.fields or is_proper(values[values != np.zeros_like(values)], field.fields)
 
 
 def _has_length(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:

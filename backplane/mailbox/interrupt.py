@@ -38,11 +38,6 @@ from rack.backplane.mailbox.slots import Slots
 from rack.backplane.segment import Segment
 from rack.backplane.words import Slot
 
-# Plain integers for the hot path.
-_EPOCH = int(Slot.EPOCH)
-_SERIAL = int(Slot.SERIAL)
-_VISIBLE = int(Slot.VISIBLE_AT)
-
 
 def how_sent(spec: MailboxSpec) -> InterruptSpec:
     """Return how the messages of a mailbox of protocol interrupt are sent."""
@@ -111,15 +106,15 @@ class InterruptLine:
         serial = max(serial, oldest_kept(head, self._slots.depth))
         while serial <= head:
             words = heads[serial & mask]
-            if words[_SERIAL] != serial:
+            if words[Slot.SERIAL] != serial:
                 # Its slot was never filled: it raises no interrupt.
                 self._missing = serial
-            elif words[_EPOCH] != self._signature and not self._accepts(serial):
+            elif words[Slot.EPOCH] != self._signature and not self._accepts(serial):
                 # The true message will replace it, under the same serial.
                 self._suspect = serial
                 break
             else:
-                at_ns = words[_VISIBLE] * self._clock_ns + self._sent_ns
+                at_ns = words[Slot.VISIBLE_AT] * self._clock_ns + self._sent_ns
                 if at_ns > until_ns:
                     break
                 self._last_ns = max(self._last_ns, at_ns)

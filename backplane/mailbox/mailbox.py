@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
 from typing import NamedTuple
@@ -29,8 +30,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
 # Plain integers for the hot path.
-_VISIBLE = int(Slot.VISIBLE_AT)
-_HEAD = Struct(f"@{len(Slot)}Q").unpack_from
+_HEAD = Struct("@8Q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -79,7 +79,7 @@ class Writer:
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.mailbox(name)
         self._slots = Slots(segment, spec)
-        self._delay = self._shown_after = spec.delay
+        self._delay = spec.delay
         self._due = spec.delay  # ticks from a release until its message must be written
         self.message = self._slots.message
         self.bus_errors = 0
@@ -87,6 +87,8 @@ class Writer:
         """Accesses so far that timed out because a dead or stopped process held the lock."""
         self.held = 0
         """Messages that injected faults hold back."""
+        self.refused = 0
+        """Messages of a queue that this writer has refused because it was full."""
         self.intruder = 0
         """Another process that has published since this writer's last message but one; 0: none."""
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
@@ -105,7 +107,7 @@ class Writer:
 
     def sign(self) -> None:
         """Sign with this process's claim: the local record has come from another process."""
-        self._slots.sign(self._slots.box[Box.CLAIMANT])
+        self._slots.signature = self._slots.box[Box.CLAIMANT]
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`, released at `tick`; return False when it is too late.
@@ -113,11 +115,9 @@ class Writer:
         It becomes visible at `tick` + delay. If the clock, `now`, has passed that tick, it becomes
         visible at the next boundary of the writer's period.
         """
-        visible_at = tick + self._shown_after if now is None else self.visible_at(tick, now)
-        if basis is None:
-            basis = tick
-        self.intruder = self._slots.publish(tick, visible_at, basis)
-        return now is None or now < tick + self._due
+        visible_at = self.visible_at(tick, now)
+        is_whole = self.publish(tick, visible_at, tick if basis is None else basis)
+        return is_whole and self.is_in_time(tick, now)
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
         """Say whether a message released at `tick` and written now comes in time; `now` as in
@@ -161,19 +161,17 @@ class Writer:
         self._claim.close()
 
 
+@dataclass(slots=True)
 class ReadStatistics:
     """Counts of one reader's failed reads so far."""
 
-    __slots__ = ("bad_reads", "bus_errors", "corrupt", "forged", "forger", "held_up", "lost")
-
-    def __init__(self) -> None:
-        self.bad_reads = 0  # reads with any of the following
-        self.bus_errors = 0  # accesses that their bound cut off
-        self.corrupt = 0  # messages that failed their check
-        self.forged = 0  # messages of a process that does not hold the claim
-        self.forger = 0  # process id of the last such process
-        self.lost = 0  # of a queue: serials without a message
-        self.held_up = 0  # accesses that timed out because a dead or stopped process held the lock
+    bad_reads: int = 0  # reads with any of the following
+    bus_errors: int = 0  # accesses that their bound cut off
+    corrupt: int = 0  # messages that failed their check
+    forged: int = 0  # messages of a process that does not hold the claim
+    forger: int = 0  # process id of the last such process
+    held_up: int = 0  # accesses that timed out because a dead or stopped process held the lock
+    lost: int = 0  # of a queue: serials without a message
 
 
 class Reader:
@@ -226,7 +224,7 @@ class Reader:
             oldest = last if serial - last < self._depth else serial - self._depth
             heads = self._heads
             mask = self._mask
-            while serial > oldest and heads[serial & mask][_VISIBLE] > tick:
+            while serial > oldest and heads[serial & mask][Slot.VISIBLE_AT] > tick:
                 serial -= 1
         self.found = serial
         if serial == last:
@@ -298,6 +296,13 @@ class Reader:
         verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
         return self._readings[verdict]
 
+    def with_earlier(self, reading: Reading, before: int) -> Reading:
+        """Return a reading with the good messages after serial `before` and before its own, as far
+        as the slots reach back."""
+        if self.serial <= before + 1:
+            return reading
+        return reading._replace(earlier=tuple(self.slots.between(before, self.serial)))
+
     def peek(self) -> Reading:
         """Return the newest whole message at once, under any protocol: for the host side."""
         self.found = head = self._box[0]
@@ -308,10 +313,6 @@ class Reader:
 
 class DoubleBufferWriter(Writer):
     """A writer under protocol double-buffer: its message is visible as soon as it is whole."""
-
-    def __init__(self, segment: Segment, name: str) -> None:
-        super().__init__(segment, name)
-        self._shown_after = 0
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick at which the message is written: it is visible at once."""

@@ -10,7 +10,7 @@ error: a verdict, never a hang.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Protocol
@@ -32,9 +32,6 @@ LOCK_WAIT_S = 0.002
 """Bound of one wait: an access takes a microsecond or two, a preempted holder some hundred."""
 
 
-_OWNER = int(Box.OWNER)
-
-
 class MailboxLock:
     """Mutual exclusion on one mailbox, with a bounded wait.
 
@@ -53,21 +50,21 @@ class MailboxLock:
     def acquire(self) -> bool:
         """Take the lock within its bound; False when a living holder keeps it."""
         if not self._semaphore.acquire(self._wait_s):
-            holder = self._box[_OWNER]
+            holder = self._box[Box.OWNER]
             # It may have released the lock, and ended, since.
-            if holder and state_of(holder) in GONE + STOPPED and self._box[_OWNER] == holder:
+            if holder and state_of(holder) in GONE + STOPPED and self._box[Box.OWNER] == holder:
                 self.held_up += 1
         # After a timeout, the kernel's lock is free if the semaphore's holder is dead; one of
         # several waiters gets it. After a successful wait it may be taken: such a waiter got in
         # between the two steps and is the owner.
         if not self._owner.take():
             return False
-        self._box[_OWNER] = self._pid
+        self._box[Box.OWNER] = self._pid
         return True
 
     def release(self) -> None:
         """Release the lock. Only its owner may."""
-        self._box[_OWNER] = 0
+        self._box[Box.OWNER] = 0
         self._owner.release()
         self._semaphore.release()
 
@@ -83,24 +80,15 @@ class LockWriter(DoubleBufferWriter):
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
-    def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
-        """Publish `message`; return False when it is too late, or the lock's bound cut it off."""
-        return self._locked(lambda: super(LockWriter, self).write(tick, now, basis))
-
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
         """Publish `message`; return False when the lock's bound cut it off."""
-        return self._locked(
-            lambda: super(LockWriter, self).publish(tick, visible_at, basis, damage)
-        )
-
-    def _locked(self, access: Callable[[], bool]) -> bool:
         obtained = self.lock.acquire()
         self.held_up = self.lock.held_up
         if not obtained:
             self.bus_errors += 1
             return False
         try:
-            return access()
+            return super().publish(tick, visible_at, basis, damage)
         finally:
             self.lock.release()
 

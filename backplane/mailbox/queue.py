@@ -35,7 +35,7 @@ from struct import Struct
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.message import Field, Message, MessageType, sending
+from rack.backplane.message import Field, Message, MessageType, copied, sending
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
@@ -53,12 +53,6 @@ TAKEN = MessageType(
     ),
 )
 # Plain integers for the hot path.
-_HEAD = int(Box.HEAD)
-_REFUSED = int(Box.REFUSED)
-_SENT = int(Box.SENT)
-_POSITION = int(Box.POSITION)
-_EPOCH = int(Slot.EPOCH)
-_VISIBLE = int(Slot.VISIBLE_AT)
 _PUT_POSITION = Struct("@2q").pack_into
 ALL = 1 << 62
 """Room for every message."""
@@ -97,11 +91,9 @@ class QueueWriter(Writer):
         self._shared = slots.box
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before this.
-        self._shared[_SENT] = self.serial
+        self._shared[Box.SENT] = self.serial
         self.message = sending(slots.message, self._send, self.room)
         self.taken = 0
-        self.refused = 0
-        """Messages refused by this writer, because the queue was full."""
         self._pending: list[bytes] = []
         self._shown_at = 0
 
@@ -113,7 +105,7 @@ class QueueWriter(Writer):
     def _send(self, basis: int | None = None) -> bool:
         if not self.room():
             self.refused += 1
-            self._shared[_REFUSED] += 1
+            self._shared[Box.REFUSED] += 1
             return False
         self._pending.append(bytes(self.message.raw))
         return True
@@ -142,8 +134,8 @@ class QueueWriter(Writer):
         there again."""
         slots = self._slots
         present = bytes(self.message.raw)
-        if self._shared[_HEAD] != slots.box[_HEAD]:
-            self.intruder = pid_of(slots.heads[(self.serial + 1) & slots.mask][_EPOCH])
+        if self._shared[Box.HEAD] != slots.box[Box.HEAD]:
+            self.intruder = pid_of(slots.heads[(self.serial + 1) & slots.mask][Slot.EPOCH])
         pending = self._pending
         self._pending = []
         for content in pending:
@@ -160,13 +152,13 @@ class QueueWriter(Writer):
         """Publish a serial without its message, as an injected loss does: the reader finds the gap
         at its tick."""
         slots = self._slots
-        slots.heads[(self.serial + 1) & slots.mask][_VISIBLE] = self._shown_at
+        slots.heads[(self.serial + 1) & slots.mask][Slot.VISIBLE_AT] = self._shown_at
         slots.lose()
 
     def show(self) -> None:
         """Show everything published: by one store each, first to observers, then to the reader."""
-        self._shared[_HEAD] = serial = self.serial
-        self._shared[_SENT] = serial
+        self._shared[Box.HEAD] = serial = self.serial
+        self._shared[Box.SENT] = serial
 
 
 class QueueReader(Reader):
@@ -180,7 +172,7 @@ class QueueReader(Reader):
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
         written = int(Reader(segment, taken_name(name)).peek().value.taken)
-        taken, rest = divmod(self._box[_POSITION], 3)
+        taken, rest = divmod(self._box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
         # The value of a reading without a new message, until there is one.
@@ -202,15 +194,15 @@ class QueueReader(Reader):
         box = self._box
         count = 0
         earlier = list[Message]()
-        head = box[_HEAD]
-        last = min(box[_SENT], self.taken + self._depth)
+        head = box[Box.HEAD]
+        last = min(box[Box.SENT], self.taken + self._depth)
         if head > last and self.slots.fetch(head) and not self.slots.is_lawful(self._signature):
             # Count a message that is not the writer's, and that its next one will replace: it is
             # not taken.
             self.statistics.bad_reads += 1
             self._count_forged()
         while count < most and self._sees(self.taken + 1, last, tick):
-            before = bytes(self.message.raw) if count else b""
+            before = copied(self.message) if count else None
             if not self._obtain(self.taken + 1):
                 # Count the fault of the message fetched last, which is not good.
                 slots = self.slots
@@ -223,14 +215,14 @@ class QueueReader(Reader):
                 else:
                     self._count_forged()
             else:
-                if count:
-                    earlier.append(Message(self.slots.dtype, memoryview(bytearray(before))))
+                if before is not None:
+                    earlier.append(before)
                 count += 1
             self.taken += 1
         newest = self.taken
         while self._sees(newest + 1, last, tick):
             newest += 1
-        self._box[_POSITION] = 3 * self.taken
+        self._box[Box.POSITION] = 3 * self.taken
         position = self._position
         _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
         position.write(tick, now)
@@ -243,7 +235,7 @@ class QueueReader(Reader):
         that far ahead."""
         if serial > last:
             return False
-        ahead = self._heads[serial & self._mask][_VISIBLE] - tick
+        ahead = self._heads[serial & self._mask][Slot.VISIBLE_AT] - tick
         return ahead <= 0 or (ahead > self._farthest and not self.slots.fetch(serial))
 
     def close(self) -> None:

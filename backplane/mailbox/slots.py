@@ -31,7 +31,7 @@ from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest
 from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.backplane.message import Message, copied
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, Slot
+from rack.backplane.words import Box, Slot, Word
 
 CHECKED_FROM = Slot.BASIS * 8
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
@@ -87,19 +87,29 @@ class Slots:
     words.
     """
 
+    # Of the message in the local record: when it was published, CLOCK_MONOTONIC, and by which
+    # writer (see `claim`); the checksum over it and every earlier message of the mailbox; its
+    # serial, 0 without a message; the release of the cycle that wrote it, and the tick from which
+    # it may be read.
+    stamp_ns = Word(Slot.STAMP_NS)
+    signature = Word(Slot.EPOCH)
+    chain = Word(Slot.CHECK)
+    serial = Word(Slot.SERIAL)
+    tick = Word(Slot.TICK)
+    visible = Word(Slot.VISIBLE_AT)
     # Thousands of views, which no checkpoint needs to look at: they never change.
     found_again = ("places", "heads")
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.spec = spec
-        self.dtype = message_dtype(spec.fields, spec.size)
+        dtype = message_dtype(spec.fields, spec.size)
         address = segment.map.mailboxes[spec.name]
         stride = slot_stride(spec)
         self.box = segment.box(spec.name)
         self.depth = spec.depth
         self.mask = spec.depth - 1
         self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
-        self.message = Message(self.dtype, self.record[SLOT_HEAD_SIZE:])
+        self.message = Message(dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
         self.places = [
@@ -117,15 +127,11 @@ class Slots:
         # slot.
         while whole > max(0, head - self.depth) and not self.holds(whole):
             whole -= 1
-        self.words[_SERIAL] = head
-        self.sign(signature)
-        self.words[_CHECK] = (
+        self.serial = head
+        self.signature = signature
+        self.chain = (
             self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
         )
-
-    def sign(self, signature: int) -> None:
-        """Publish under that signature from now on."""
-        self.words[_EPOCH] = signature
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an
@@ -146,7 +152,7 @@ class Slots:
         words[_STAMP] = monotonic_ns()
         self.places[at][:] = self.record
         if damage:
-            message = self.places[serial & self.mask][SLOT_HEAD_SIZE:]
+            message = self.places[at][SLOT_HEAD_SIZE:]
             for bit in damage:
                 message[bit >> 3] ^= 1 << (bit & 7)
         box[0] = serial
@@ -154,8 +160,8 @@ class Slots:
 
     def lose(self) -> None:
         """Publish a serial without filling its slot."""
-        self.words[_SERIAL] += 1
-        self.box[0] = self.words[_SERIAL]
+        self.serial += 1
+        self.box[0] = self.serial
 
     def holds(self, serial: int) -> bool:
         """Say whether that serial's slot holds its message, not an older or a newer one."""
@@ -166,12 +172,6 @@ class Slots:
         of that message."""
         return serial >= oldest_kept(self.box[0], self.depth)
 
-    def heads_and_bodies(self) -> list[tuple[memoryview, memoryview]]:
-        """Return each slot's head, as words, and the part of the slot that its checksum covers."""
-        return [
-            (head, slot[CHECKED_FROM:]) for head, slot in zip(self.heads, self.places, strict=True)
-        ]
-
     def visible_at(self, serial: int) -> int:
         """Return the tick from which the message in that serial's slot may be read."""
         return self.heads[serial & self.mask][_VISIBLE]
@@ -179,7 +179,7 @@ class Slots:
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
         self.record[:] = self.places[serial & self.mask]
-        return self.words[_SERIAL] == serial and self.is_sound
+        return self.serial == serial and self.is_sound
 
     def between(self, before: int, newest: int) -> Iterator[Message]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""
@@ -196,17 +196,7 @@ class Slots:
     @property
     def is_sound(self) -> bool:
         """Whether the message in the local record passes its check."""
-        return self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])
-
-    @property
-    def serial(self) -> int:
-        """Serial of the message in the local record; 0: none."""
-        return self.words[_SERIAL]
-
-    @property
-    def signature(self) -> int:
-        """Signature of its writer: see `claim`."""
-        return self.words[_EPOCH]
+        return self.chain == xxh3(self.covered, self.words[_CHAIN])
 
     def is_lawful(self, known: int) -> bool:
         """Say whether that message comes from the writer that holds the claim, or from an earlier
@@ -214,33 +204,8 @@ class Slots:
 
         `known` is the signature of the last lawful message, 0 before the first: epochs only rise.
         """
-        signature = self.words[_EPOCH]
+        signature = self.signature
         holder = self.box[_CLAIMANT]
         return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(
             holder
         )
-
-    @property
-    def tick(self) -> int:
-        """Release tick of the cycle that wrote that message."""
-        return self.words[_TICK]
-
-    @property
-    def visible(self) -> int:
-        """Tick from which that message may be read."""
-        return self.words[_VISIBLE]
-
-    @property
-    def stamp_ns(self) -> int:
-        """When that message was published, CLOCK_MONOTONIC."""
-        return self.words[_STAMP]
-
-    @property
-    def basis(self) -> int:
-        """Tick of the oldest information that the message rests on, level by level."""
-        return self.words[_BASIS]
-
-    @property
-    def chain(self) -> int:
-        """Checksum over this and every earlier message of the mailbox."""
-        return self.words[_CHECK]

@@ -13,7 +13,8 @@ from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept
 from rack.backplane.mailbox.mailbox import Reader
-from rack.backplane.mailbox.slots import UNSIGNED
+from rack.backplane.mailbox.queue import QueueReader
+from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
@@ -21,8 +22,6 @@ from rack.backplane.words import Slot
 
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
-# Plain integers for the hot path.
-_CHAIN, _CHECK, _, _SERIAL, _TICK, _VISIBLE = (int(word) for word in tuple(Slot)[2:])
 
 
 class ReadFindings:
@@ -52,14 +51,11 @@ class MessageWatch(ReadFindings):
     release tick.
     """
 
-    found_again = ("_heads_and_bodies",)
-
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         super().__init__(reader, episodes)
         self.seen = -1
         self._spec = reader.spec
         self._slots = reader.slots
-        self._heads_and_bodies = reader.slots.heads_and_bodies()
         self._cycles = CycleRecord(segment, reader.spec.writer)
         self.newest = LONG_AGO
         self._is_sliced = reader.spec.is_by_ticks
@@ -111,21 +107,21 @@ class MessageWatch(ReadFindings):
     def _walk(self, found: int, tick: int) -> None:
         """Judge the messages one by one, up to the newest found."""
         slots = self._slots
-        heads_and_bodies = self._heads_and_bodies
         mask = slots.mask
         taken = self._reader.serial
         late = self.late_from
         # A late reader cannot judge messages that are overwritten.
         for serial in range(max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), found + 1):
-            head, body = heads_and_bodies[serial & mask]
-            released = head[_TICK]
+            head = slots.heads[serial & mask]
+            released = head[Slot.TICK]
             # The reader has checked the message that it took, and only that one.
             if (
-                head[_SERIAL] == serial
-                and self.newest < released > head[_VISIBLE] - late
+                head[Slot.SERIAL] == serial
+                and self.newest < released > head[Slot.VISIBLE_AT] - late
                 and (
                     serial == taken
-                    or xxh3(body, head[_CHAIN] & UNSIGNED) == head[_CHECK] & UNSIGNED
+                    or xxh3(slots.places[serial & mask][CHECKED_FROM:], head[Slot.CHAIN] & UNSIGNED)
+                    == head[Slot.CHECK] & UNSIGNED
                 )
                 and slots.keeps(serial)
             ):
@@ -172,3 +168,35 @@ class MessageWatch(ReadFindings):
 
     def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
         self._episodes.find(code, self._reader.accesses, tick, value, since)
+
+
+class QueueWatch(MessageWatch):
+    """Judges the messages that the reader of a queue has taken, several of one release among
+    them."""
+
+    def __init__(self, segment: Segment, reader: QueueReader, episodes: Episodes) -> None:
+        super().__init__(segment, reader, episodes)
+        self._queue = reader
+        self._lost = 0
+        self.seen = reader.taken
+
+    def judge(self, tick: int) -> None:
+        """Judge the messages taken by the read at `tick`."""
+        queue = self._queue
+        slots = self._slots
+        for serial in range(self.seen + 1, queue.taken + 1):
+            # Its slot is the writer's again only when the writer learns that it has been taken.
+            head = slots.heads[serial & slots.mask]
+            if head[Slot.SERIAL] != serial:
+                continue
+            released = head[Slot.TICK]
+            if self.newest <= released > head[Slot.VISIBLE_AT] - self.late_from:
+                self.newest = released
+            elif slots.copy(serial):
+                self._judge_time(released, head[Slot.VISIBLE_AT], tick)
+        self.seen = queue.taken
+        if queue.statistics.lost != self._lost:
+            lost = queue.statistics.lost - self._lost
+            self._lost = queue.statistics.lost
+            self._find(Alarm.GAP, tick, lost)
+        self.report(tick)

@@ -24,15 +24,10 @@ MUTE_CYCLES = 3
 """Age in cycles of the writer from which silence is investigated; two are normal."""
 STALE_CYCLES = 4
 LONG_AGO = -(1 << 62)
-_LOST = int(Block.LOST)
-_CLAIMANT = int(Box.CLAIMANT)
-_VOID = int(Box.VOID)
-_KEPT = int(Box.KEPT)
 
 
 class ReadingTask:
-    """The task that reads: the tick `since` which it has read without a pause, and which writers
-    are dead or stopped.
+    """The task that reads: the tick `since` which it has read without a pause.
 
     After a pause of this task or of the clock, all messages are old but no writer is silent.
     `troubles` counts reads that failed or found a bad message. `now` returns the clock's tick;
@@ -46,8 +41,6 @@ class ReadingTask:
         self.troubles = 0
         self._last = LONG_AGO
         self._step = NOT_YET
-        self._asked_at = -1
-        self._gone: dict[int, bool] = {}
 
     def reads(self, tick: int) -> None:
         """Note a read of a task that does not know how many cycles it skipped."""
@@ -58,16 +51,6 @@ class ReadingTask:
             elif self._last != LONG_AGO:
                 self._step = step
         self._last = tick
-
-    def is_gone(self, pid: int, tick: int) -> bool:
-        """Say whether a process is dead or stopped. The kernel is asked once per cycle and
-        process."""
-        if tick != self._asked_at:
-            self._asked_at = tick
-            self._gone.clear()
-        if pid not in self._gone:
-            self._gone[pid] = state_of(pid) in GONE + STOPPED
-        return self._gone[pid]
 
 
 class SilenceWatch:
@@ -100,14 +83,16 @@ class SilenceWatch:
         cause is proven."""
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
-            is_old = tick - self._reader.basis > max_age and not is_on(box[_KEPT], tick)
-            return is_old or is_on(box[_VOID], tick) or self.is_writer_lost(tick)
+            is_old = tick - self._reader.basis > max_age and not is_on(box[Box.KEPT], tick)
+            return is_old or is_on(box[Box.VOID], tick) or self.is_writer_lost(tick)
         newest = self._reader.newest
         age = tick - newest
         if age >= self.quiet:
-            pid = pid_of(self._slots.box[_CLAIMANT])
+            pid = pid_of(self._slots.box[Box.CLAIMANT])
             # The loss may be marked already, and a new process may exist that does not cycle yet.
-            if age >= self._stale_after and (self._block[_LOST] or self._task.is_gone(pid, tick)):
+            if age >= self._stale_after and (
+                self._block[Block.LOST] or state_of(pid) in GONE + STOPPED
+            ):
                 self._report(Alarm.STALE, tick, age)
             elif self._is_mute(tick):
                 self._report(Alarm.MUTE, tick, age)
@@ -119,7 +104,7 @@ class SilenceWatch:
         """Say whether the writer is lost, however old its messages are."""
         # From the tick after the loss: within that tick the answer would depend on which process is
         # faster.
-        return self._reader.newest != NOT_YET and 0 < self._block[_LOST] <= tick
+        return self._reader.newest != NOT_YET and 0 < self._block[Block.LOST] <= tick
 
     def _is_mute(self, tick: int) -> bool:
         """Say whether the writer has finished a release that writes a message, and the newest is of

@@ -3,27 +3,19 @@ messages."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.mailbox.protocols import open_reader
-from rack.backplane.mailbox.queue import ALL
-from rack.backplane.mailbox.slots import Slots
+from rack.backplane.mailbox.queue import ALL, QueueReader
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter, Episodes
-from rack.backplane.watch.message_watch import MessageWatch, ReadFindings
+from rack.backplane.watch.message_watch import MessageWatch, QueueWatch, ReadFindings
 from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
-from rack.backplane.watch.watched_queue import WatchedQueue
 from rack.backplane.words import Block
-
-_LOST = int(Block.LOST)
-
-
-def everything() -> int:
-    """Return room for every message."""
-    return ALL
 
 
 def watched(
@@ -32,9 +24,9 @@ def watched(
     alarms: AlarmWriter,
     task: ReadingTask,
     *,
-    room: Callable[[], int] = everything,
+    room: Callable[[], int] = lambda: ALL,
     asynchronous: bool = False,
-) -> WatchedReader | SporadicReader | WatchedQueue:
+) -> Watched:
     """Open a mailbox for a task, with the checks that suit its writer: messages of the clock have
     no period.
 
@@ -43,27 +35,56 @@ def watched(
     """
     spec = segment.layout.mailbox(name)
     if spec.protocol == "queue":
-        return WatchedQueue(segment, name, alarms, task, room)
-    kind = SporadicReader if spec.writer == CLOCK else WatchedReader
-    return kind(segment, open_reader(segment, name, asynchronous, task.inbox), alarms, task)
+        return WatchedQueue(segment, QueueReader(segment, name), alarms, task, room)
+    reader = open_reader(segment, name, asynchronous, task.inbox)
+    if spec.writer == CLOCK:
+        findings = ReadFindings(reader, Episodes(segment, name, alarms))
+        return SporadicReader(reader, findings, task)
+    return WatchedReader(segment, reader, alarms, task)
 
 
-class WatchedReader:
-    """Reads a mailbox for a task and raises the task's alarms about it. A clean read costs a few
-    comparisons more."""
+class Watched(ABC):
+    """Base of the readers that watch a mailbox for a task, and raise the task's alarms about it."""
+
+    def __init__(self, reader: Reader, messages: ReadFindings, task: ReadingTask) -> None:
+        self.reader = reader
+        self._messages = messages
+        self._task = task
+        self._bad_reads = 0
+
+    @abstractmethod
+    def read(self, tick: int) -> Reading:
+        """Return the newest message visible at `tick`, with its verdict, and whether its writer is
+        lost."""
+
+    @abstractmethod
+    def is_writer_lost(self, tick: int) -> bool:
+        """Say whether the writer is lost, without a read."""
+
+    def _has_trouble(self) -> bool:
+        """Say whether the last read failed, or found a bad message; count it for the task."""
+        bad_reads = self.reader.statistics.bad_reads
+        if bad_reads == self._bad_reads:
+            return False
+        self._bad_reads = bad_reads
+        self._task.troubles += 1
+        return True
+
+
+class WatchedReader(Watched):
+    """Reads a mailbox that is written by ticks. A clean read costs a few comparisons more."""
+
+    _messages: MessageWatch
 
     def __init__(
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
     ) -> None:
-        self.reader = reader
         episodes = Episodes(segment, reader.spec.name, alarms)
-        self._messages = MessageWatch(segment, reader, episodes)
+        super().__init__(reader, MessageWatch(segment, reader, episodes), task)
         self._silence = SilenceWatch(segment, reader, episodes, task)
-        self._task = task
         self._late_from = self._messages.late_from
         self._quiet = self._silence.quiet
         self._writer = segment.block(reader.spec.writer)
-        self._bad_reads = 0
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading:
@@ -72,9 +93,7 @@ class WatchedReader:
         reader = self.reader
         messages = self._messages
         reading = reader.read(tick)
-        if reader.statistics.bad_reads != self._bad_reads:
-            self._bad_reads = reader.statistics.bad_reads
-            self._task.troubles += 1
+        if self._has_trouble():
             messages.judge(tick)
         elif reader.found != messages.seen:
             found = reader.found
@@ -88,9 +107,9 @@ class WatchedReader:
                 messages.newest = newest
             else:
                 messages.judge(tick)
-        if (tick - reader.newest >= self._quiet or self._writer[_LOST]) and self._silence.is_lost(
-            tick
-        ):
+        if (
+            tick - reader.newest >= self._quiet or self._writer[Block.LOST]
+        ) and self._silence.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 
@@ -99,7 +118,7 @@ class WatchedReader:
         return self._silence.is_writer_lost(tick)
 
 
-class SporadicReader:
+class SporadicReader(Watched):
     """Reads an operator's mailbox: silence there proves nothing, but messages must be whole, and
     the clock's.
 
@@ -108,31 +127,56 @@ class SporadicReader:
     board must know them.
     """
 
-    def __init__(
-        self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
-    ) -> None:
-        self.reader = reader
-        self._task = task
-        self._slots = Slots(segment, reader.spec)
-        self._findings = ReadFindings(reader, Episodes(segment, reader.spec.name, alarms))
-        self._bad_reads = 0
-
     def read(self, tick: int) -> Reading:
         """Return the newest message visible at `tick`, with its verdict, and the unread ones before
         it."""
         before = self.reader.serial
         reading = self.reader.read(tick)
-        if self.reader.statistics.bad_reads != self._bad_reads:
-            self._bad_reads = self.reader.statistics.bad_reads
-            self._task.troubles += 1
-            self._findings.report(tick)
-        if self.reader.serial > before + 1:
-            return reading._replace(earlier=tuple(self._slots.between(before, self.reader.serial)))
-        return reading
+        if self._has_trouble():
+            self._messages.report(tick)
+        return self.reader.with_earlier(reading, before)
 
     def is_writer_lost(self, tick: int) -> bool:
         """Return False: a lost clock releases no board, so silence proves nothing."""
         return False
+
+
+class WatchedQueue(Watched):
+    """Reads a queue, as many messages as the task has `room` for.
+
+    Silence proves nothing, since a queue is written on demand. Only a writer found dead or hanging
+    counts as lost.
+    """
+
+    reader: QueueReader
+    _messages: QueueWatch
+
+    def __init__(
+        self,
+        segment: Segment,
+        reader: QueueReader,
+        alarms: AlarmWriter,
+        task: ReadingTask,
+        room: Callable[[], int],
+    ) -> None:
+        episodes = Episodes(segment, reader.spec.name, alarms)
+        super().__init__(reader, QueueWatch(segment, reader, episodes), task)
+        self._room = room
+        self._writer = segment.block(reader.spec.writer)
+
+    def read(self, tick: int) -> Reading:
+        """Take the messages visible at `tick`; the reading says whether their writer is lost."""
+        reader = self.reader
+        reading = reader.take(tick, self._room(), self._task.now())
+        if self._has_trouble() or reader.taken != self._messages.seen:
+            self._messages.judge(tick)
+        return reading._replace(is_lost=True) if self.is_writer_lost(tick) else reading
+
+    def is_writer_lost(self, tick: int) -> bool:
+        """Say whether the writer is lost."""
+        # From the tick after the loss: within that tick the answer would depend on which process is
+        # faster.
+        return 0 < self._writer[Block.LOST] <= tick
 
 
 class GridReader:
@@ -143,9 +187,7 @@ class GridReader:
     as before.
     """
 
-    def __init__(
-        self, watched: WatchedReader | SporadicReader | WatchedQueue, grid: TickGrid
-    ) -> None:
+    def __init__(self, watched: Watched, grid: TickGrid) -> None:
         self.reader = watched.reader
         self._watched, self._every, self._phase = watched, *grid
         kept = [Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named, as_whole, pick
-from rack.backplane.fault_table import Entry, FaultEntry, FaultTable
+from rack.backplane.fault_table import FaultEntry, FaultTable
 from rack.backplane.message import Message
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
@@ -291,8 +291,8 @@ class AlarmEvents:
     def _duration(self, entry: FaultEntry, code: str) -> str:
         """Return the duration of a fault that begins, or how often a fault that ends has acted."""
         if code == "ends":
-            return f"; acted {counting(entry[Entry.COUNT], 'time')}"
-        return f", for {self._span(entry[Entry.TICKS])}" if entry[Entry.TICKS] else ""
+            return f"; acted {counting(entry.count, 'time')}"
+        return f", for {self._span(entry.ticks)}" if entry.ticks else ""
 
     def _task(self, number: int, other: str) -> str:
         return pick(self._layout.processes, number, "task").name if number >= 0 else other

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
 from rack.boards.config.schema import RackConfig
@@ -40,15 +40,15 @@ def judge_lost_cycles(
     fraction = config.supervision.max_missed_fraction
     restart_s = config.supervision.restart_s(config.clock.mode == "lockstep")
     table = FaultTable(segment).staged((Stage.ACTIVE, Stage.OVER))
-    faults = [fault for fault in table if fault[Entry.STRUCK_TICK] >= 0]
+    faults = [fault for fault in table if fault.struck_tick >= 0]
     for task in layout.tasks:
         counts = segment.count_cycles(task, end)
         disturbed = []
         for fault in faults:
             recovery = kind_of(fault).recovery_ticks(board_of(fault, layout), layout, restart_s)
             # The cycle that is at work when the fault strikes may be lost, too.
-            first = max(0, fault[Entry.STRUCK_TICK] - task.slice + 1)
-            disturbed.append((first, min(end, fault[Entry.UNTIL] + recovery)))
+            first = max(0, fault.struck_tick - task.slice + 1)
+            disturbed.append((first, min(end, fault.until + recovery)))
         excusable = min(counts.due, _count_releases(task, disturbed))
         rest = counts.lost - excusable
         judged = counts.due - excusable

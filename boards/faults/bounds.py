@@ -93,20 +93,9 @@ class BoundCase:
         return cycle_ticks(self.layout, self.board)
 
     @property
-    def period(self) -> int:
-        """Ticks from one release of the task to the next; a planner has several in its time
-        slice."""
-        return self.layout.task(self.board).every
-
-    @property
     def write(self) -> int:
         """Ticks between messages in the slowest mailbox."""
         return max(mailbox.every for mailbox in self.mailboxes)
-
-    @property
-    def delivery(self) -> int:
-        """Ticks from the writer's release until its message has been read."""
-        return max(mailbox.delay for mailbox in self.mailboxes) + self.read
 
     @property
     def read(self) -> int:
@@ -215,9 +204,13 @@ def by_rack_or(count: int) -> Bound:
 
 
 READ = Bound("1 read", lambda case: case.read)
-DELIVERY = Bound("1 delivery", lambda case: case.delivery)
+DELIVERY = Bound(
+    "1 delivery", lambda case: max(mailbox.delay for mailbox in case.mailboxes) + case.read
+)
+"""From the writer's release until its message has been read."""
 SLICE = Bound("1 time slice", lambda case: case.cycle)
-RELEASE = Bound("1 cycle", lambda case: case.period)
+RELEASE = Bound("1 cycle", lambda case: case.layout.task(case.board).every)
+"""From one release of the task to the next; a planner has several in its time slice."""
 LOCK_WAIT = Bound(
     "the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns)
 )

@@ -18,7 +18,7 @@ from functools import cache
 from rack.backplane.clock.driver import ClockDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.fault_table import NEVER, FaultEntry, FaultTable, Stage
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
@@ -49,9 +49,7 @@ class StruckRack:
 
     def target(self, entry: FaultEntry) -> ReleasedTask | None:
         """Return the task, or host board, that a fault strikes; None: the clock."""
-        return next(
-            (task for task in self.driver.processes if task.index == entry[Entry.TASK]), None
-        )
+        return next((task for task in self.driver.processes if task.index == entry.task), None)
 
     def send(
         self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals
@@ -130,7 +128,7 @@ def _is_lost(rack: StruckRack, entry: FaultEntry) -> bool:
 
 def _masquerade(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     entry.acted(tick)
-    forge(rack.segment, rack.segment.layout.mailboxes[entry[Entry.MAILBOX]].name, tick)
+    forge(rack.segment, rack.segment.layout.mailboxes[entry.mailbox].name, tick)
 
 
 def _stop_clock(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
@@ -146,7 +144,7 @@ def _skip(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
 
 def _delay(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
     entry.acted(tick)
-    part = random.Random(entry[Entry.SEED] + tick).uniform(LEAST_LATE, entry.parameters[0])
+    part = random.Random(entry.seed + tick).uniform(LEAST_LATE, entry.parameters[0])
     until = rack.clock.time_of(tick) + int(part * rack.clock.period_ns)
     # A tick is delayed by less than a tick period, so the grid itself stays.
     time.sleep(max(0, until - time.monotonic_ns()) * 1e-9)
@@ -170,10 +168,10 @@ def _step(entry: FaultEntry) -> ClockStep:
 def _next_change(entry: FaultEntry, tick: int) -> int:
     """Return the first tick after `tick` at which a fault may begin, act or end."""
     if entry.stage == Stage.WAITING:
-        return tick + 1 if entry[Entry.WHEN_BOX] >= 0 else max(tick + 1, entry[Entry.FROM])
+        return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
     if entry.stage == Stage.ACTIVE:
         may_end_early = kind_of(entry).once or _step(entry) is not ELSEWHERE
-        return tick + 1 if may_end_early else entry[Entry.UNTIL]
+        return tick + 1 if may_end_early else entry.until
     return NEVER
 
 
@@ -218,12 +216,12 @@ class FaultStage:
             # A running cycle finishes with the faults with which it began.
             self._rack.driver.settle()
         for entry in over:
-            entry.words[Entry.STAGE] = Stage.OVER
+            entry.stage = Stage.OVER
             # Some end early: they strike once, or have lost their object.
-            entry.words[Entry.UNTIL] = min(entry[Entry.UNTIL], tick)
+            entry.until = min(entry.until, tick)
             self._words[System.FAULTS] += 1
             _step(entry).end(self._rack, entry, tick)
-            self._alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry[Entry.COUNT])
+            self._alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry.count)
             self._await_messages(entry)
         for entry in due:
             self._begin(entry, tick)
@@ -247,16 +245,16 @@ class FaultStage:
         if not self._phased:
             return
         clock = self._rack.clock
-        for entry in sorted(self._phased, key=lambda e: e[Entry.PHASE]):
-            at = clock.time_of(tick) + entry[Entry.PHASE] * clock.period_ns // PHASES
+        for entry in sorted(self._phased, key=lambda e: e.phase):
+            at = clock.time_of(tick) + entry.phase * clock.period_ns // PHASES
             time.sleep(max(0, at - time.monotonic_ns()) * 1e-9)
             _step(entry).begin(self._rack, entry, tick)
         self._phased.clear()
 
     def _is_over(self, entry: FaultEntry, tick: int) -> bool:
         kind = kind_of(entry)
-        has_acted = kind.once and kind.is_of_task and entry[Entry.COUNT] > 0
-        return entry[Entry.UNTIL] <= tick or has_acted or _step(entry).is_void(self._rack, entry)
+        has_acted = kind.once and kind.is_of_task and entry.count > 0
+        return entry.until <= tick or has_acted or _step(entry).is_void(self._rack, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
         """Say whether a fault begins. Its condition is read in every tick, so that no message is
@@ -265,26 +263,25 @@ class FaultStage:
         It is read as of the tick before: the clock works ahead of the grid, where messages of
         `tick` may be missing.
         """
-        if entry[Entry.WHEN_BOX] < 0:
-            return entry[Entry.FROM] <= tick
-        observer = self._observer(entry[Entry.WHEN_BOX])
+        if entry.when_box < 0:
+            return entry.tick <= tick
+        observer = self._observer(entry.when_box)
         reading = observer.read(tick - 1)
-        field = observer.spec.fields[entry[Entry.WHEN_FIELD]].name
-        return reading.is_there and int(getattr(reading.value, field)) == entry[Entry.WHEN_VALUE]
+        field = observer.spec.fields[entry.when_field].name
+        return reading.is_there and int(getattr(reading.value, field)) == entry.when_value
 
     def _begin(self, entry: FaultEntry, tick: int) -> None:
-        words = entry.words
         kind = kind_of(entry)
-        words[Entry.FROM] = tick
-        lasts = entry[Entry.TICKS]
+        entry.tick = tick
+        lasts = entry.ticks
         if kind.once and not kind.is_of_task:
             # Such a fault of a task stays active until the task's next cycle.
             lasts = 1
-        words[Entry.UNTIL] = tick + lasts if lasts else NEVER
-        words[Entry.STAGE] = Stage.ACTIVE
+        entry.until = tick + lasts if lasts else NEVER
+        entry.stage = Stage.ACTIVE
         self._words[System.FAULTS] += 1
         self._alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)
-        if entry[Entry.PHASE] and not self._rack.clock.is_lockstep:
+        if entry.phase and not self._rack.clock.is_lockstep:
             self._phased.append(entry)
         else:
             _step(entry).begin(self._rack, entry, tick)
@@ -292,5 +289,5 @@ class FaultStage:
     def _await_messages(self, entry: FaultEntry) -> None:
         layout = self._segment.layout
         if kind_of(entry).takes_mailbox:
-            for box in struck_mailboxes(layout, entry[Entry.MAILBOX], board_of(entry, layout)):
-                self._awaited[layout.mailboxes.index(box)] = entry[Entry.UNTIL]
+            for box in struck_mailboxes(layout, entry.mailbox, board_of(entry, layout)):
+                self._awaited[layout.mailboxes.index(box)] = entry.until

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.checked import as_whole, pick
-from rack.backplane.fault_table import NEVER, Entry, FaultEntry, Stage
+from rack.backplane.checked import as_named, as_whole, pick
+from rack.backplane.fault_table import NEVER, FaultEntry, Stage
 from rack.backplane.layout import Layout
 from rack.boards.faults.kind import kind_of
 
@@ -16,13 +16,13 @@ ALL_JOINTS = "all joints"
 
 def board_of(entry: FaultEntry, layout: Layout) -> str:
     """Return the task that a fault strikes; "clock" for the clock."""
-    return CLOCK if (at := entry[Entry.TASK]) < 0 else pick(layout.processes, at, "task").name
+    return CLOCK if (at := entry.task) < 0 else pick(layout.processes, at, "task").name
 
 
 def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
     """Return the mailbox or the joint that a fault affects; empty if it affects its task alone."""
-    if entry[Entry.MAILBOX] >= 0:
-        return pick(layout.mailboxes, entry[Entry.MAILBOX], "mailbox").name
+    if entry.mailbox >= 0:
+        return pick(layout.mailboxes, entry.mailbox, "mailbox").name
     joint = kind_of(entry).values(entry).get("joint")
     return "" if joint is None else joint_name(as_whole(joint), joints)
 
@@ -37,26 +37,23 @@ def joint_name(at: int, joints: Sequence[str]) -> str:
 def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
     """Return an entry as plain data. Unknown ticks are -1, an unknown `until` is None."""
     kind = kind_of(entry)
-    stage = entry.stage
-    mailbox = ""
-    if entry[Entry.MAILBOX] >= 0:
-        mailbox = pick(layout.mailboxes, entry[Entry.MAILBOX], "mailbox").name
+    stage = as_named(Stage, entry.stage)
     until = None
-    if stage in (Stage.ACTIVE, Stage.OVER) and entry[Entry.UNTIL] != NEVER:
-        until = entry[Entry.UNTIL]
+    if stage in (Stage.ACTIVE, Stage.OVER) and entry.until != NEVER:
+        until = entry.until
     return {
         "fault": entry.index,
         "kind": kind.name,
         "board": board_of(entry, layout),
-        "mailbox": mailbox,
+        "mailbox": subject_of(entry, layout, joints) if entry.mailbox >= 0 else "",
         "parameters": kind.values(entry),
         "text": describe(entry, layout, joints),
         "stage": stage.name.lower(),
-        "begins": entry[Entry.FROM],
+        "begins": entry.tick,
         "until": until,
-        "ticks": entry[Entry.TICKS],
-        "struck_tick": entry[Entry.STRUCK_TICK],
-        "acted": entry[Entry.COUNT],
+        "ticks": entry.ticks,
+        "struck_tick": entry.struck_tick,
+        "acted": entry.count,
     }
 
 
@@ -72,6 +69,4 @@ def describe(
             unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"
             about.append(f"{parameter.name} {value:g}{unit}")
     details = ", ".join(text for text in about if text)
-    if details:
-        return f"{kind.name}{target} ({details})"
-    return f"{kind.name}{target}"
+    return f"{kind.name}{target}" + f" ({details})" * bool(details)

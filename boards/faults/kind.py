@@ -20,7 +20,7 @@ from typing import Literal
 from zlib import crc32
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.fault_table import PARAMETERS, Entry, FaultEntry, Injection
+from rack.backplane.fault_table import PARAMETERS, FaultEntry, Injection
 from rack.backplane.layout import Layout
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks, struck_mailboxes
@@ -244,4 +244,4 @@ KINDS = Kinds()
 
 def kind_of(entry: FaultEntry) -> Kind:
     """Return the kind of a fault in the fault table."""
-    return KINDS[entry[Entry.KIND]]
+    return KINDS[entry.kind]

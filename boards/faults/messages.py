@@ -14,7 +14,7 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.fault_table import FaultEntry
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.mailbox.protocols import LockWriter
 from rack.backplane.mailbox.slots import Slots, claim
@@ -61,7 +61,7 @@ class MessageStep:
         self.writer = writer
         self.onward: Send
         self.held: list[Held] = []
-        self._seed = f"{entry[Entry.SEED]} {index}"
+        self._seed = f"{entry.seed} {index}"
 
     def send(self, message: Outgoing) -> None:
         """Take a message and pass on the result."""
@@ -169,7 +169,7 @@ class HoldLock(MessageStep):
         """Stop or die while holding the lock; a stopped process releases it when it continues."""
         writer = self.writer
         is_killed = bool(self.entry.parameters[0])
-        if isinstance(writer, LockWriter) and not self.entry[Entry.COUNT] and writer.lock.acquire():
+        if isinstance(writer, LockWriter) and not self.entry.count and writer.lock.acquire():
             self.acts(message)
             number = signal.SIGKILL if is_killed else signal.SIGSTOP
             os.kill(os.getpid(), number)

@@ -8,10 +8,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import monotonic_ns
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.fault_table import FaultEntry, FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.process import pin
 from rack.backplane.segment import Segment
@@ -58,7 +58,7 @@ ns."""
 def overrun(load: ExtraComputing, tick: int, now: int) -> int:
     """Make an executor take `by` cycles longer, or a random part of that."""
     by, is_random, *_ = load.entry.parameters
-    part = random.Random(load.entry[Entry.SEED] + tick).random() if is_random else 1.0
+    part = random.Random(load.entry.seed + tick).random() if is_random else 1.0
     return now + load.cycles_ns(part * by)
 
 
@@ -68,22 +68,21 @@ def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
     return max(now, slice_end) + load.cycles_ns(load.entry.parameters[0])
 
 
-class Outputs(Protocol):
-    """The ports through which a task writes."""
-
-    def apply(self, faults: Sequence[FaultEntry]) -> None:
-        """Apply these faults to writes from now on."""
-
-
 class TaskFaults:
-    """Applies a task's active faults. `loads` are those of its computing time."""
+    """Applies a task's active faults: those of its writes by `apply`. `loads` are those of its
+    computing time."""
 
     def __init__(
-        self, segment: Segment, spec: TaskSpec, outputs: Outputs, level: Executor | Planner
+        self,
+        segment: Segment,
+        spec: TaskSpec,
+        apply: Callable[[Sequence[FaultEntry]], None],
+        level: Executor | Planner,
     ) -> None:
         self._table = FaultTable(segment)
         self._spec = spec
-        self._outputs = outputs
+        self._index = segment.layout.processes.index(spec)
+        self._apply = apply
         self._level = level
         self._clock = SystemClock(segment)
         self._arm: list[FaultEntry] = []
@@ -96,20 +95,19 @@ class TaskFaults:
         next call. The generation is then -1.
         """
         generation = self._table.generation
-        found = [(kind_of(entry), entry) for entry in self._table.active(self._spec.name)]
-        active = [(kind, entry) for kind, entry in found if entry[Entry.FROM] <= tick]
+        entries = self._table.staged((Stage.ACTIVE,))
+        found = [(kind_of(entry), entry) for entry in entries if entry.task == self._index]
+        active = [(kind, entry) for kind, entry in found if entry.tick <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)
             for kind, entry in active
             if kind.where == "load" and callable(kind.step)
         ]
-        self._outputs.apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
+        self._apply([entry for kind, entry in active if kind.where in ("writer", "lock")])
         arm = [(kind, entry) for kind, entry in active if kind.where == "arm"]
         self._arm = [entry for _, entry in arm]
         if self._spec.role == "executor":
-            faults = [
-                Fault(k.name, k.values(e), e[Entry.SEED], e[Entry.FROM], k.step) for k, e in arm
-            ]
+            faults = [Fault(k.name, k.values(e), e.seed, e.tick, k.step) for k, e in arm]
             cast("Executor", self._level).inject(faults)
         return generation if len(active) == len(found) else -1
 
@@ -131,19 +129,19 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     Call it in a separate process. Raises `PermissionError` where real-time priorities are refused:
     an ordinary process cannot take a core from a board.
     """
-    task = segment.layout.tasks[entry[Entry.TASK]]
+    task = segment.layout.tasks[entry.task]
     block = segment.block(task.name)
     clock = SystemClock(segment)
     pin(block[Block.CORE])
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(99, block[Block.PRIORITY] + 1)))
     while entry.stage == Stage.WAITING and not clock.is_stopped:
-        wait_ns = clock.time_of(max(entry[Entry.FROM], clock.tick + 1)) - time.monotonic_ns()
+        wait_ns = clock.time_of(max(entry.tick, clock.tick + 1)) - time.monotonic_ns()
         # Wake on the clock's grid, at the first tick at which the fault can begin or at the next
         # one. If that tick has passed, or the run has not started, sleep briefly: at this priority
         # a busy wait would starve all others.
         wait_s = wait_ns * 1e-9 if wait_ns > 0 else LEAST_S
         time.sleep(min(wait_s, LOOK_S))
-    end = clock.time_of(entry[Entry.UNTIL])
+    end = clock.time_of(entry.until)
     entry.acted(clock.now())
     while time.monotonic_ns() < end and not clock.is_stopped:
         pass

@@ -12,7 +12,6 @@ from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.host_ring import HostWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
-from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import COMMAND_ID
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import done_semaphore, wake_semaphore
@@ -40,8 +39,8 @@ class HostBus:
         self._is_paced = self._words[System.LOCKSTEP] and layout.pacers(layout.task(wiring.board))
         self.block = segment.block(wiring.board)
         self._claim = _claim(segment, wiring.board)
-        self._inlets = {
-            port: HostInlet(segment, mailbox) for port, mailbox in wiring.inputs.items()
+        self._readers = {
+            port: DoubleBufferReader(segment, mailbox) for port, mailbox in wiring.inputs.items()
         }
         self._writers: dict[str, HostWriter] = {}
         try:
@@ -109,8 +108,11 @@ class HostBus:
 
     def read(self, port: str) -> Reading:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the
-        mailbox keeps them."""
-        return _of(self._inlets, port).read()
+        mailbox keeps them; the first read returns the newest alone."""
+        reader = _of(self._readers, port)
+        before = reader.serial
+        reading = reader.peek()
+        return reader.with_earlier(reading, before) if before else reading
 
     def send(self, port: str, **fields: Any) -> bool:
         """Send a message with these fields, all others 0; False when too many wait at the adapter.
@@ -171,24 +173,6 @@ class HostBus:
         for writer in self._writers.values():
             writer.close()
         self._claim.close()
-
-
-class HostInlet:
-    """Reads a mailbox of a bus adapter at any time: the newest whole message, and the unread ones
-    before it."""
-
-    def __init__(self, segment: Segment, mailbox: str) -> None:
-        self._reader = DoubleBufferReader(segment, mailbox)
-        self._slots = Slots(segment, self._reader.spec)
-
-    def read(self) -> Reading:
-        """Return the newest message, and the unread ones before it; the first read returns the
-        newest alone."""
-        before = self._reader.serial
-        reading = self._reader.peek()
-        if before and self._reader.serial > before + 1:
-            return reading._replace(earlier=tuple(self._slots.between(before, self._reader.serial)))
-        return reading
 
 
 def _claim(segment: Segment, board: str) -> ByteLock:

@@ -42,6 +42,7 @@ ENTRY = MessageType(
     ),
 )
 """One entry, in the status of its bridge."""
+_COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
 
 
 class EntryConfig(Table):
@@ -113,7 +114,7 @@ class EntryCount:
     def resume(self, record: Any, tick: int) -> None:
         """Continue with the counts in the status of an earlier cycle."""
         age = int(record["age"])
-        for name in ("passed", "refused", "superseded", "full", "waiting", "arrived"):
+        for name in _COUNTED:
             setattr(self, name, int(record[name]))
         self.written = NEVER if age == NEVER else tick - age
 
@@ -126,16 +127,7 @@ class EntryCount:
     def fill(self, record: Any, tick: int) -> None:
         """Write the counts into the status of a cycle."""
         age = NEVER if self.written == NEVER else tick - self.written
-        counts = (
-            self.passed,
-            self.refused,
-            self.superseded,
-            self.full,
-            self.waiting,
-            self.arrived,
-            age,
-        )
-        fill_counts(record, counts)
+        fill_counts(record, (*(getattr(self, name) for name in _COUNTED), age))
 
 
 class Crossing(Protocol):
@@ -154,8 +146,8 @@ class Inward:
         self._port = port
         self._table = table
         self._count = count
-        self._refused = count.refused
-        self._superseded = count.superseded
+        self._ring.refused = count.refused
+        self._ring.superseded = count.superseded
         self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:
@@ -174,8 +166,8 @@ class Inward:
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
             count.passes(tick, ring.written)
-        count.refused = self._refused + ring.refused
-        count.superseded = self._superseded + ring.superseded
+        count.refused = ring.refused
+        count.superseded = ring.superseded
         count.full = ring.full
         count.waiting = ring.waiting
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from itertools import chain, repeat
 from typing import Any
 
-from rack.backplane.mailbox.host_ring import ProperContent
+from rack.backplane.mailbox.host_ring import is_proper
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.slots import Slots, message_dtype
 from rack.backplane.message import Message, fill_counts
@@ -106,9 +106,9 @@ class Import:
         spec = segment.layout.mailbox(own)
         dtype = message_dtype(spec.fields, spec.size)
         self._kind = kind_of(spec.message, spec.version, dtype)
-        self._is_proper = ProperContent(spec.fields)
         self._buffer = Message(dtype)
         self._key = out_key(table.rack, table.mailbox)
+        self._fields = spec.fields
         self._max_age = spec.max_age
         self._delay = spec.delay
         self._peer = peer
@@ -232,7 +232,7 @@ class Import:
     def _is_next(self, head: Envelope, payload: bytes) -> bool:
         """Say whether a message is good and the newest so far, and if so keep its content."""
         message = Message(self._buffer.record.dtype, memoryview(bytearray(payload)))
-        if not self._is_proper(message):
+        if not is_proper(message.record, self._fields):
             self.count.refused += 1
             return False
         if not self._order.admits(head):

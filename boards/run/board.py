@@ -28,7 +28,6 @@ from rack.boards.errors import CANNOT_GO_ON, CANNOT_KEEP, CheckpointError
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.system_controller import run_clock
-from rack.boards.run.task import Task
 from rack.boards.wiring import KEEPING, ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
@@ -121,7 +120,11 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
             level.open()
-        task = _task(segment, wiring, level, attention)
+        task = (
+            VirtualControlLoop(segment, wiring, level, attention)
+            if isinstance(level, Executor)
+            else PlannerLoop(segment, wiring, level, attention)
+        )
         if wiring.keeping is not None:
             import_module(KEEPING).keep_task(segment, task, wiring.keeping)
         block[Block.STATE] = TaskState.READY
@@ -143,9 +146,3 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> in
     with cores_kept_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention)
     return 0
-
-
-def _task(segment: Segment, wiring: TaskWiring, level: Executor | Planner, attention: int) -> Task:
-    if isinstance(level, Executor):
-        return VirtualControlLoop(segment, wiring, level, attention)
-    return PlannerLoop(segment, wiring, level, attention)

@@ -8,7 +8,7 @@ stopwatch keeps time stamps, trace and counts; faults take effect between cycles
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from time import monotonic_ns
 
@@ -17,14 +17,11 @@ from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE, ExchangeRecord
-from rack.boards.run.interrupts import interrupted
-from rack.boards.run.task import ClockGuard, Task, slowed
+from rack.boards.run.task import ClockGuard, Task, in_turn, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 from rack.levels.messages import ARM_STATE
 
-_DEMAND = int(System.DEMAND)
-_CLOCK_SKIPPED = int(System.CLOCK_SKIPPED)
 _DEMANDS = tuple(Demand)
 
 
@@ -62,31 +59,13 @@ class VirtualControlLoop(Task):
         self._due = segment.layout.due(self.spec)
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
-        self.read_command_and_status = interrupted(
-            slowed(self._read(wiring), times.read_ns), self.interrupts
-        )
+        record = None
+        if wiring.exchange:
+            messages = self.outputs.messages
+            record = ExchangeRecord(self.inputs.taken, getattr(messages, EXCHANGE)).fill
+        reads = in_turn(self.inputs.read_command_and_status, record)
+        self.read_command_and_status = in_turn(self.serve, slowed(reads, times.read_ns))
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
-
-    def _read(self, wiring: TaskWiring) -> Callable[[int], None]:
-        """Return the reading of a cycle; a board with an exchange also notes which messages it
-        took."""
-        read = self.inputs.read_command_and_status
-        if not wiring.exchange:
-            return read
-        record = ExchangeRecord(self.inputs.taken, getattr(self.outputs.messages, EXCHANGE))
-
-        def read_and_note(tick: int) -> None:
-            read(tick)
-            record.fill(tick)
-
-        return read_and_note
-
-    def run(self) -> None:
-        """Cycle until the run is over."""
-        self.begin()
-        while (tick := self.wait_until_next_cycle()) is not None:
-            self.cycle(tick)
-        self.stopwatch.count_bus()
 
     def cycle(self, tick: int) -> None:
         """Do the cycle released at `tick`."""
@@ -96,7 +75,7 @@ class VirtualControlLoop(Task):
         if watch.is_late:
             self._handle_delay(tick)
         guard = self._guard
-        if guard is not None and self.words[_CLOCK_SKIPPED] != guard.reported:
+        if guard is not None and self.words[System.CLOCK_SKIPPED] != guard.reported:
             guard.report_skipped(tick)
         if self.inputs.reads_plan:
             self.exchange(tick)
@@ -122,7 +101,7 @@ class VirtualControlLoop(Task):
         """Let the level process, given the demand on the arm; then report its findings and the
         faults that acted."""
         executor = self.executor
-        executor.demand = _DEMANDS[self.words[_DEMAND]]
+        executor.demand = _DEMANDS[self.words[System.DEMAND]]
         executor.process(self.inputs.values, self.outputs.messages, tick)
         for complete_cycle in executor.complete_cycle:
             complete_cycle(self._arm_state)
@@ -158,17 +137,10 @@ class PlannerLoop(Task):
         super().__init__(segment, wiring, planner, attention)
         self.planner = planner
         self.slice = self.spec.slice
-        self.read = interrupted(self.inputs.read, self.interrupts)
+        self.read = in_turn(self.serve, self.inputs.read)
         self.write_plan = slowed(self.outputs.write, wiring.transfer.update_ns)
         self._critical_priority = wiring.critical_priority
         self._priority = self.block[Block.PRIORITY]
-
-    def run(self) -> None:
-        """Plan until the run is over."""
-        self.begin()
-        while (tick := self.wait_until_next_cycle()) is not None:
-            self.cycle(tick)
-        self.stopwatch.count_bus()
 
     def cycle(self, tick: int) -> None:
         """Plan in the cycle released at `tick`, if a plan is wanted."""

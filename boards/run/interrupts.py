@@ -8,9 +8,7 @@ waiting. In lockstep, where nothing waits for a processor, it takes no time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from time import process_time_ns
-from typing import Self
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.mailbox.interrupt import BoardInbox
@@ -18,11 +16,6 @@ from rack.backplane.process import compute_until
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.words import Block
-
-# Plain integers for the hot path.
-_COUNT = int(Block.INTERRUPTS)
-_LOST = int(Block.INTERRUPTS_LOST)
-_WAITING = int(Block.INTERRUPTS_WAITING)
 
 
 class InterruptHandler:
@@ -45,15 +38,6 @@ class InterruptHandler:
         self._lost = [line.lost for line in inbox.lines.values()]
         self._cycles = 0
 
-    @classmethod
-    def of(
-        cls, segment: Segment, task: str, inbox: BoardInbox | None, alarms: AlarmWriter
-    ) -> Self | None:
-        """Return the handler that a task runs; None: nothing interrupts its board, or another task
-        runs it."""
-        is_first = task == segment.layout.handler(segment.layout.task(task).slot)
-        return cls(segment, task, inbox, alarms) if inbox is not None and is_first else None
-
     def serve(self, tick: int) -> None:
         """Serve everything that has come up to the release at `tick`."""
         inbox = self._inbox
@@ -61,31 +45,17 @@ class InterruptHandler:
         self._cycles += 1
         inbox.advance(tick)
         if inbox.count != self._served:
-            self._block[_COUNT] += inbox.count - self._served
+            self._block[Block.INTERRUPTS] += inbox.count - self._served
             self._served = inbox.count
             if self._takes_time:
                 compute_until(begun_ns + inbox.service_ns - self._service_ns)
             self._service_ns = inbox.service_ns
-        if inbox.inbox.most_waiting > self._block[_WAITING]:
-            self._block[_WAITING] = inbox.inbox.most_waiting
+        if inbox.inbox.most_waiting > self._block[Block.INTERRUPTS_WAITING]:
+            self._block[Block.INTERRUPTS_WAITING] = inbox.inbox.most_waiting
         if inbox.inbox.lost != sum(self._lost):
             # Count the messages lost in the inbox, and raise an alarm for each mailbox.
             for at, (line, episodes) in enumerate(self._lines):
                 if lost := line.lost - self._lost[at]:
                     self._lost[at] = line.lost
-                    self._block[_LOST] += lost
+                    self._block[Block.INTERRUPTS_LOST] += lost
                     episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
-
-
-def interrupted(
-    read: Callable[[int], None], handler: InterruptHandler | None
-) -> Callable[[int], None]:
-    """Return `read`, after the handler has served what has come; `read` itself without one."""
-    if handler is None:
-        return read
-
-    def serve_and_read(tick: int) -> None:
-        handler.serve(tick)
-        read(tick)
-
-    return serve_and_read

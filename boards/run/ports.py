@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
-from rack.backplane.fault_table import Entry, FaultEntry
+from rack.backplane.fault_table import FaultEntry
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.queue import ALL, QueueWriter, taken_name
+from rack.backplane.message import sending
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
@@ -18,17 +19,11 @@ from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
 from rack.boards.faults.messages import FaultyWriter
-from rack.boards.run.queues import DemandPort, QueuePort, Write
 from rack.boards.wiring import Source
 from rack.levels.level import Ports, Reading, Verdict
 
 Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
 """One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
-
-
-def all_of(port: str) -> int:
-    """Return room for every message of a queue."""
-    return ALL
 
 
 class InputPorts:
@@ -44,7 +39,7 @@ class InputPorts:
         alarms: AlarmWriter,
         plan: str = "",
         *,
-        room: Callable[[str], int] = all_of,
+        room: Callable[[str], int] = lambda port: ALL,
         exchange: Mapping[str, ExchangeSpec] | None = None,
         inbox: BoardInbox | None = None,
     ) -> None:
@@ -80,16 +75,19 @@ class InputPorts:
                 setattr(self.values, port, by_board)
         self.reads_plan = bool(self._plan)
         self._readers = [entry.reader for entry in self.taken]
-        self._statistics = [reader.statistics for reader in self._readers]
-        self._counted = self._traffic
 
-    def follow(self, segment: Segment, queue: QueuePort, alarms: AlarmWriter) -> None:
+    def follow(self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter) -> None:
         """Read the position of the reader of a queue that the task writes, with the mailboxes of
         its ports."""
-        found = watched(segment, taken_name(queue.writer.spec.name), alarms, self.task)
-        self._rest.append(({}, "", queue.noting(found.read)))
+        found = watched(segment, taken_name(queue.spec.name), alarms, self.task)
+
+        def read_and_note(tick: int) -> Reading:
+            reading = found.read(tick)
+            queue.taken = int(reading.value.taken)
+            return reading
+
+        self._rest.append(({}, "", read_and_note))
         self._readers.append(found.reader)
-        self._statistics.append(found.reader.statistics)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
@@ -110,41 +108,115 @@ class InputPorts:
     @property
     def bus_errors(self) -> int:
         """Number of reads that timed out."""
-        return sum([statistics.bus_errors for statistics in self._statistics])
+        return sum(reader.statistics.bus_errors for reader in self._readers)
 
     @property
     def corrupt(self) -> int:
         """Number of reads that found a damaged message."""
-        return sum([statistics.corrupt for statistics in self._statistics])
-
-    def take_traffic(self) -> tuple[int, int]:
-        """Return the number of accesses and of bytes read since the last call."""
-        before = self._counted
-        self._counted = self._traffic
-        return self._counted[0] - before[0], self._counted[1] - before[1]
+        return sum(reader.statistics.corrupt for reader in self._readers)
 
     @property
-    def _traffic(self) -> tuple[int, int]:
+    def traffic(self) -> tuple[int, int]:
+        """Number of accesses and of bytes read so far."""
         accesses = sum(reader.accesses for reader in self._readers)
         return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
 
-class OldestOf:
-    """The basis of what rests on several mailboxes: the oldest of those that hold a message. As of
-    a `Reader`."""
+class OutputPort:
+    """One mailbox that a task writes; `message` is its outgoing message.
 
-    def __init__(self, readers: Sequence[Reader]) -> None:
-        self._readers = readers
+    It rests on the messages of `sources`: its basis is the oldest of theirs.
 
-    @property
-    def serial(self) -> int:
-        """Serial of one of the messages; 0: there is none."""
-        return max([reader.serial for reader in self._readers])
+    A level sends the messages of a queue itself, unless it does not (`sends`): its message is then
+    sent in every cycle in which it is written. A mailbox with a `max_age` is written on demand, in
+    the cycles in which the level has sent a message.
+    """
 
-    @property
-    def basis(self) -> int:
-        """Tick of the oldest information that the last good messages rest on."""
-        return min([reader.basis for reader in self._readers if reader.serial])
+    def __init__(
+        self,
+        segment: Segment,
+        writer: Writer,
+        alarms: AlarmWriter,
+        sources: Sequence[Reader],
+        sends: bool,
+    ) -> None:
+        spec = writer.spec
+        self.writer = writer
+        self.message = writer.message
+        self._sources = sources
+        self._is_on_demand = spec.max_age > 0
+        self._is_sent = not self._is_on_demand
+        self._basis: int | None = None
+        if self._is_on_demand:
+            self.message = sending(writer.message, self._send, lambda: 1)
+        self._is_queue = isinstance(writer, QueueWriter)
+        self._sends_itself = self._is_queue and not sends
+        # A message that is not written in every cycle becomes visible at multiples of its period,
+        # from its phase.
+        self._ahead = spec.ahead - spec.phase
+        self._every = spec.every
+        self._index = segment.layout.index(spec.name)
+        self._episodes = Episodes(segment, spec.name, alarms)
+        self._faulty: FaultyWriter | None = None
+        self._held_up = self._refused = 0
+
+    def _send(self, basis: int | None = None) -> bool:
+        self._is_sent = True
+        self._basis = basis
+        return True
+
+    def apply(self, faults: Sequence[FaultEntry]) -> None:
+        """Apply those of these faults that concern the mailbox; messages delayed by earlier ones go
+        out with the next write."""
+        chosen = [
+            entry
+            for entry in faults
+            if entry.mailbox in (-1, self._index)
+            and not (self._is_queue and kind_of(entry).not_queued)
+        ]
+        if chosen and self._faulty is None:
+            self._faulty = FaultyWriter(self.writer, self._index)
+        if self._faulty is not None:
+            self._faulty.apply(chosen)
+
+    def write(self, tick: int, now: int | None) -> bool:
+        """Write the message if that is due; return False if it was too late."""
+        writer = self.writer
+        if self._faulty is not None and self._faulty.is_over:
+            self._faulty = None
+        in_time = True
+        if (tick + self._ahead) % self._every or not self._is_sent:
+            self.flush(tick, now)
+        else:
+            basis = min([source.basis for source in self._sources if source.serial], default=tick)
+            if self._is_on_demand:
+                self._is_sent = False
+                basis = basis if self._basis is None else self._basis
+            elif self._sends_itself:
+                writer.message.send()
+            in_time = (self._faulty or writer).write(tick, now, basis)
+        if writer.intruder or writer.held_up or writer.refused:
+            self._report(tick)
+        return in_time
+
+    def flush(self, tick: int, now: int | None) -> None:
+        """Publish delayed messages that are due."""
+        if self._faulty is not None:
+            self._faulty.flush(tick, now)
+
+    def _report(self, tick: int) -> None:
+        """Raise an alarm for the writer's findings in its own mailbox."""
+        writer = self.writer
+        if writer.refused != self._refused:
+            refused = writer.refused - self._refused
+            self._refused = writer.refused
+            self._episodes.find(Alarm.QUEUE_FULL, writer.serial + writer.refused, tick, refused)
+        if writer.intruder:
+            self._episodes.find(Alarm.MASQUERADE, writer.serial, tick, writer.intruder)
+            writer.intruder = 0
+        if writer.held_up != self._held_up:
+            self._held_up = writer.held_up
+            self._episodes.find(Alarm.LOCKED, writer.serial, tick)
 
 
 class OutputPorts:
@@ -166,73 +238,25 @@ class OutputPorts:
         """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level
         sends by itself."""
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
-        self._demanded = {
-            port: DemandPort(writer) for port, writer in self.writers.items() if writer.spec.max_age
-        }
-        messages = {port: writer.message for port, writer in self.writers.items()}
-        self.messages = Ports(
-            **messages | {port: demanded.message for port, demanded in self._demanded.items()}
-        )
-        self._rests_on = {
-            port: _basis(w.spec.rests_on, inputs.readers) for port, w in self.writers.items()
-        }
-        self._episodes = {port: Episodes(segment, name, alarms) for port, name in mailboxes.items()}
-        self._layout = segment.layout
-        self._queues = {
-            port: QueuePort(writer, self._episodes[port], port in sent)
-            for port, writer in self.writers.items()
-            if isinstance(writer, QueueWriter)
-        }
-        for queue in self._queues.values():
-            inputs.follow(segment, queue, alarms)
-        self._faulty: dict[str, FaultyWriter] = {}
-        self._held_up = dict.fromkeys(self.writers, 0)
-        self._writers = list(self.writers.values())
-        self._counted = self._traffic
-        self._route()
+        self.messages = Ports()
+        self._ports: list[OutputPort] = []
+        for port, writer in self.writers.items():
+            sources = [inputs.readers[name] for name in writer.spec.rests_on]
+            output = OutputPort(segment, writer, alarms, sources, port in sent)
+            self._ports.append(output)
+            setattr(self.messages, port, output.message)
+            if isinstance(writer, QueueWriter):
+                inputs.follow(segment, writer, alarms)
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
-        """Apply these faults from now on; messages delayed by earlier ones go out with
-        the next write."""
-        for port, writer in self.writers.items():
-            index = self._layout.index(writer.spec.name)
-            chosen = [
-                entry
-                for entry in faults
-                if entry[Entry.MAILBOX] in (-1, index)
-                and not (port in self._queues and kind_of(entry).not_queued)
-            ]
-            if chosen or port in self._faulty:
-                self._faulty.setdefault(port, FaultyWriter(writer, index)).apply(chosen)
-        self._route()
-
-    def _route(self) -> None:
-        """Route each port to its writer, or to the faulty writer around it."""
-        self._lines = [
-            (
-                port,
-                w,
-                self._write_of(port),
-                self._rests_on[port],
-                w.spec.ahead - w.spec.phase,
-                w.spec.every,
-            )
-            for port, w in self.writers.items()
-        ]
-
-    def _write_of(self, port: str) -> Write:
-        faulty = self._faulty.get(port)
-        write: Write = self.writers[port].write if faulty is None else faulty.write
-        if port in self._demanded:
-            return partial(
-                self._demanded[port].write, write, _no_flush if faulty is None else faulty.flush
-            )
-        return partial(self._queues[port].write, write) if port in self._queues else write
+        """Apply these faults from now on."""
+        for port in self._ports:
+            port.apply(faults)
 
     @property
     def bus_errors(self) -> int:
         """Number of writes that timed out."""
-        return sum([writer.bus_errors for writer in self._writers])
+        return sum(writer.bus_errors for writer in self.writers.values())
 
     def write(self, tick: int, now: int | None) -> bool:
         """Write every mailbox that is due at `tick`; return False if a message was too late.
@@ -240,63 +264,18 @@ class OutputPorts:
         `now`: the clock's tick, if the cycle's end may have passed.
         """
         in_time = True
-        for port, writer, write, source, ahead, every in self._lines:
-            # A message that is not written in every cycle becomes visible at multiples of its
-            # period, from its phase.
-            if (tick + ahead) % every:
-                if port in self._faulty:
-                    self._faulty[port].flush(tick, now)
-                continue
-            if not write(tick, now, source.basis if source is not None and source.serial else tick):
+        for port in self._ports:
+            if not port.write(tick, now):
                 in_time = False
-            if writer.intruder or writer.held_up:
-                self._report(port, writer, tick)
-        if self._faulty:
-            self._drop_faulty_writers()
         return in_time
 
     def flush(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due, in a cycle that writes nothing."""
-        if self._faulty:
-            for faulty in self._faulty.values():
-                faulty.flush(tick, now)
-            self._drop_faulty_writers()
-
-    def _drop_faulty_writers(self) -> None:
-        """Write directly again where no fault and no delayed message is left."""
-        over = [port for port, faulty in self._faulty.items() if faulty.is_over]
-        for port in over:
-            del self._faulty[port]
-        if over:
-            self._route()
-
-    def _report(self, port: str, writer: Writer, tick: int) -> None:
-        """Raise an alarm for a writer's findings in its own mailbox."""
-        if writer.intruder:
-            self._episodes[port].find(Alarm.MASQUERADE, writer.serial, tick, writer.intruder)
-            writer.intruder = 0
-        if writer.held_up != self._held_up[port]:
-            self._held_up[port] = writer.held_up
-            self._episodes[port].find(Alarm.LOCKED, writer.serial, tick)
-
-    def take_traffic(self) -> tuple[int, int]:
-        """Return the number of messages and of bytes written since the last call."""
-        before = self._counted
-        self._counted = self._traffic
-        return self._counted[0] - before[0], self._counted[1] - before[1]
+        for port in self._ports:
+            port.flush(tick, now)
 
     @property
-    def _traffic(self) -> tuple[int, int]:
+    def traffic(self) -> tuple[int, int]:
+        """Number of messages and of bytes written so far, by former processes of the task too."""
         writers = self.writers.values()
         return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)
-
-
-def _no_flush(tick: int, now: int | None) -> None:
-    """Flush nothing: no fault delays messages."""
-
-
-def _basis(mailboxes: Sequence[str], readers: Mapping[str, Reader]) -> Reader | OldestOf | None:
-    """Return what gives the basis of a message that rests on these mailboxes; None: it rests on
-    nothing read."""
-    found = [readers[name] for name in mailboxes]
-    return OldestOf(found) if len(found) > 1 else next(iter(found), None)

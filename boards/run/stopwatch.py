@@ -18,21 +18,6 @@ from rack.backplane.words import Block, System
 from rack.boards.run.ports import InputPorts, OutputPorts
 
 # Plain integers for the hot path.
-_EPOCH = int(System.EPOCH_NS)
-_DONE, _RELEASED, _CYCLES, _MISSED, _SKIPPED, _LEVEL_STATE, _LEVEL_SINCE, _CORRUPT, _BUS_ERRORS = (
-    int(Block[name])
-    for name in (
-        "DONE",
-        "RELEASED",
-        "CYCLES",
-        "MISSED",
-        "SKIPPED",
-        "LEVEL_STATE",
-        "LEVEL_SINCE",
-        "CORRUPT",
-        "BUS_ERRORS",
-    )
-)
 _MISS, _SKIP, _BUS_ERROR, _DAMAGED = (
     int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT)
 )
@@ -55,6 +40,7 @@ class Stopwatch:
         self._clock = SystemClock(segment)
         self._inputs = inputs
         self._outputs = outputs
+        self._traffic = inputs.traffic + outputs.traffic
         self._reading = inputs.task
         self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
@@ -62,8 +48,8 @@ class Stopwatch:
             done_semaphore(segment.rack, task) if self._clock.is_lockstep else None
         )
         self._troubles = self._bus_errors = self._corrupt = 0
-        self._cycles = self._block[_CYCLES]
-        self._state = self._block[_LEVEL_STATE]
+        self._cycles = self._block[Block.CYCLES]
+        self._state = self._block[Block.LEVEL_STATE]
         self._processor_ns = 0  # processor time used before the current record
         self._closed_ns = 0  # end of the bookkeeping of the last cycle
         self._period_ns = self._clock.period_ns
@@ -88,7 +74,7 @@ class Stopwatch:
         self._skipped = skipped
         self.start_ns = self.plan_ns = release_ns = start_ns = monotonic_ns()
         if self._lockstep_done is None:
-            release_ns = self._words[_EPOCH] + tick * self._period_ns
+            release_ns = self._words[System.EPOCH_NS] + tick * self._period_ns
         self._release_ns = release_ns
         self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
@@ -114,14 +100,14 @@ class Stopwatch:
             flags |= self._count_troubles()
         if is_missed:
             flags |= _MISS
-            block[_MISSED] += 1
+            block[Block.MISSED] += 1
         if skipped:
             flags |= _SKIP | skipped << SKIPPED_SHIFT
-            block[_SKIPPED] += skipped
+            block[Block.SKIPPED] += skipped
         state = self._status[self._state_at]
         if state != self._state:
-            self._state = block[_LEVEL_STATE] = state
-            block[_LEVEL_SINCE] = tick
+            self._state = block[Block.LEVEL_STATE] = state
+            block[Block.LEVEL_SINCE] = tick
         used = thread_time_ns()
         before = self._processor_ns
         self._processor_ns = used
@@ -138,9 +124,9 @@ class Stopwatch:
             used - before,
             self._closed_ns,
         )
-        self._cycles = block[_CYCLES] = self._cycles + 1
-        block[_DONE] = done
-        if lockstep_done is not None and done >= block[_RELEASED]:
+        self._cycles = block[Block.CYCLES] = self._cycles + 1
+        block[Block.DONE] = done
+        if lockstep_done is not None and done >= block[Block.RELEASED]:
             # The last one of a batch.
             lockstep_done.release()
         if not self._cycles % BUS_COUNT_CYCLES:
@@ -154,8 +140,8 @@ class Stopwatch:
         """Close a cycle in which a planner had nothing to plan: count it, but do not trace it."""
         # Exclude its processor time from the next plan's record.
         self._processor_ns = thread_time_ns()
-        self._cycles = self._block[_CYCLES] = self._cycles + 1
-        self._block[_DONE] = self._tick
+        self._cycles = self._block[Block.CYCLES] = self._cycles + 1
+        self._block[Block.DONE] = self._tick
         self.notify_clock()
 
     def notify_clock(self) -> None:
@@ -172,20 +158,18 @@ class Stopwatch:
         new_corrupt = corrupt - self._corrupt
         self._bus_errors = bus_errors
         self._corrupt = corrupt
-        self._block[_BUS_ERRORS] += new_errors
-        self._block[_CORRUPT] += new_corrupt
+        self._block[Block.BUS_ERRORS] += new_errors
+        self._block[Block.CORRUPT] += new_corrupt
         return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
 
     def count_bus(self) -> None:
         """Update the bus counters of the control block; doing so in every cycle would cost too
         much."""
-        reads = self._inputs.take_traffic()
-        writes = self._outputs.take_traffic()
-        block = self._block
-        block[Block.READS] += reads[0]
-        block[Block.READ_BYTES] += reads[1]
-        block[Block.WRITES] += writes[0]
-        block[Block.WRITE_BYTES] += writes[1]
+        before = self._traffic
+        self._traffic = self._inputs.traffic + self._outputs.traffic
+        words = (Block.READS, Block.READ_BYTES, Block.WRITES, Block.WRITE_BYTES)
+        for word, count, counted in zip(words, self._traffic, before, strict=True):
+            self._block[word] += count - counted
 
 
 def _state_of(outputs: OutputPorts) -> tuple[int, memoryview]:

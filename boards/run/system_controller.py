@@ -24,7 +24,6 @@ from rack.backplane.operator_table import (
     OperatorTable,
     RequestEntry,
     RequestStage,
-    RequestWord,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
@@ -40,17 +39,6 @@ tick."""
 SILENT_NS = 1_000_000_000
 """Real time, at the clock's own speed, after which an operator within a lease is gone that was not
 heard."""
-# Plain integers for the hot path.
-_LOSSES, _EMERGENCY, _REQUESTED, _INJECTED, _PEER_STOP = (
-    int(word)
-    for word in (
-        System.LOSSES,
-        System.EMERGENCY_STOP,
-        System.REQUESTED,
-        System.INJECTED,
-        System.PEER_STOP,
-    )
-)
 
 
 class SystemController:
@@ -74,15 +62,15 @@ class SystemController:
         words = self._words
         faults = self._faults
         desk = self._desk
-        if tick >= faults.next_tick or words[_INJECTED] != faults.injected:
+        if tick >= faults.next_tick or words[System.INJECTED] != faults.injected:
             faults.advance(tick)
-        if tick >= desk.next_tick or words[_REQUESTED] != desk.requested:
+        if tick >= desk.next_tick or words[System.REQUESTED] != desk.requested:
             desk.advance(tick)
         if self._settled != (
-            words[_LOSSES],
+            words[System.LOSSES],
             self._driver.watchdog.losses,
-            words[_EMERGENCY],
-            words[_PEER_STOP],
+            words[System.EMERGENCY_STOP],
+            words[System.PEER_STOP],
         ):
             self._handle_losses(tick)
 
@@ -101,15 +89,15 @@ class SystemController:
         """Let restarted boards rejoin, latch for those given up, and set the demand for all other
         losses."""
         words = self._words
-        seen = words[_LOSSES], self._driver.watchdog.losses
+        seen = words[System.LOSSES], self._driver.watchdog.losses
         processes = self._driver.processes
         for task in processes:
             if task.is_lost:
                 self._handle_loss(task, tick)
         lost = [task for task in processes if task.is_lost]
         # Read before they are acted on: a change in between is handled at the next tick.
-        emergency = words[_EMERGENCY]
-        peer = words[_PEER_STOP]
+        emergency = words[System.EMERGENCY_STOP]
+        peer = words[System.PEER_STOP]
         self._set_demand(lost, tick)
         # So is a switch that lies ahead.
         self._settled = (*seen, emergency, peer) if not lost and peer >> 1 <= tick else None
@@ -130,7 +118,7 @@ class SystemController:
             task.rejoin()
         elif task.is_given_up:
             # Even if the latch is already set, as it is before the start.
-            self._words[_EMERGENCY] = 1
+            self._words[System.EMERGENCY_STOP] = 1
             # Time for the arm to come to rest before the run ends.
             ends = tick + self._wiring.linger
             self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
@@ -139,9 +127,9 @@ class SystemController:
         asked = [
             (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
         ]
-        if self._words[_EMERGENCY]:
+        if self._words[System.EMERGENCY_STOP]:
             asked.append((Demand.BRAKE, -1))
-        if is_on(self._words[_PEER_STOP], tick):
+        if is_on(self._words[System.PEER_STOP], tick):
             asked.append((Demand.STOP, PEER))
         demand, subject = max(asked, default=(Demand.NONE, -1))
         if demand != self._demand:
@@ -187,50 +175,49 @@ class OperatorDesk:
 
     def advance(self, tick: int) -> None:
         """Issue all commands due at `tick`."""
-        if self._words[_REQUESTED] != self.requested:
-            self.requested = self._words[_REQUESTED]
+        if self._words[System.REQUESTED] != self.requested:
+            self.requested = self._words[System.REQUESTED]
             self._waiting = self._table.waiting()
             self._leased = self._table.leased()
         for entry in list(self._leased):
             self._check_lease(entry, tick)
-        for entry in [entry for entry in self._waiting if entry[RequestWord.TICK] <= tick]:
+        for entry in [entry for entry in self._waiting if entry.tick <= tick]:
             self._waiting.remove(entry)
             # Mark first, then check that it still waits; a client that withdraws it uses the
             # opposite order.
-            entry.words[RequestWord.GIVEN_TICK] = tick
+            entry.given_tick = tick
             if self._table.is_waiting(entry):
                 self._give(entry, tick)
             else:
-                entry.words[RequestWord.GIVEN_TICK] = -1
-        due = [tick + 1] if self._leased else [entry[RequestWord.TICK] for entry in self._waiting]
+                entry.given_tick = -1
+        due = [tick + 1] if self._leased else [entry.tick for entry in self._waiting]
         self.next_tick = min(due, default=sys.maxsize)
 
     def _give(self, entry: RequestEntry, tick: int) -> None:
-        words = entry.words
-        writer = self._writers[entry[RequestWord.MAILBOX]]
-        if not words[RequestWord.SERIAL]:
+        writer = self._writers[entry.mailbox]
+        if not entry.serial:
             # If the clock dies after this line, its successor issues the command again, under the
             # same serial.
             self._words[System.COMMANDED] += 1
-            words[RequestWord.SERIAL] = self._words[System.COMMANDED]
+            entry.serial = self._words[System.COMMANDED]
         message = writer.message
         message.raw[:] = entry.message[: len(message.raw)]
-        message.id = words[RequestWord.SERIAL]
+        message.id = entry.serial
         writer.write(tick, self._clock.now())
-        words[RequestWord.STAGE] = RequestStage.GIVEN
+        entry.stage = RequestStage.GIVEN
         if message.what not in (*SETTINGS, *DRIVES):
-            self._newest[words[RequestWord.MAILBOX]] = message.id
-        self._alarms.ring(tick, Alarm.COMMANDED, entry.index, words[RequestWord.SERIAL])
-        if words[RequestWord.CLIENT] == Client.LEASES:
+            self._newest[entry.mailbox] = message.id
+        self._alarms.ring(tick, Alarm.COMMANDED, entry.index, entry.serial)
+        if entry.client == Client.LEASES:
             self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
         """Have a level hold whose operator has gone while the command is in force."""
-        mailbox = entry[RequestWord.MAILBOX]
+        mailbox = entry.mailbox
         if self._is_over(entry):
             self._table.release(entry)
-        if entry[RequestWord.CLIENT] == Client.LEASES:
-            heard = max(entry[RequestWord.GIVEN_TICK], entry[RequestWord.HEARD])
+        if entry.client == Client.LEASES:
+            heard = max(entry.given_tick, entry.heard)
             if self._table.client_lives(entry) and tick - heard <= self._silent:
                 return
             # At once, without a request: there may be no room for one.
@@ -246,8 +233,8 @@ class OperatorDesk:
     def _is_over(self, entry: RequestEntry) -> bool:
         """Return whether the level has refused the command, or accepted a newer one in its
         place."""
-        mailbox = entry[RequestWord.MAILBOX]
-        serial = entry[RequestWord.SERIAL]
+        mailbox = entry.mailbox
+        serial = entry.serial
         newest = self._newest.get(mailbox, 0)
         if mailbox not in self._statuses:
             return newest > serial
@@ -273,15 +260,16 @@ class EndOfRun:
         self._task_ends: int | None = None
         self._linger = wiring.linger
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
-        self._writer = segment.block(self._reader.spec.writer) if self._reader is not None else None
         self._silent = wiring.silent
         self._heard: int | None = None
         # By ticks, a message becomes visible at a boundary of its writer's period.
         self._every = 1
         self._phase = 0
-        if self._reader is not None and self._reader.spec.is_by_ticks:
-            self._every = self._reader.spec.every
-            self._phase = self._reader.spec.phase
+        if self._reader is not None:
+            self._writer = segment.block(self._reader.spec.writer)
+            if self._reader.spec.is_by_ticks:
+                self._every = self._reader.spec.every
+                self._phase = self._reader.spec.phase
         self._next = 0
 
     @property
@@ -295,12 +283,7 @@ class EndOfRun:
         """Return the tick at which the run stops, by the messages as of the tick before; None until
         it is known."""
         final = tick - 1
-        if (
-            final >= self._next
-            and self._task_ends is None
-            and self._reader is not None
-            and self._writer is not None
-        ):
+        if final >= self._next and self._task_ends is None and self._reader is not None:
             boundary = final - (final - self._phase) % self._every
             self._next = boundary + self._every
             reading = self._reader.read(boundary)

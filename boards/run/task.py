@@ -22,10 +22,6 @@ from rack.boards.run.stopwatch import Stopwatch
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
-# Plain integers for the hot path.
-_FAULTS, _TICK_NS, _TICK, _CLOCK_SKIPPED, _SKIPPED_FROM = (
-    int(System[name]) for name in ("FAULTS", "TICK_NS", "TICK", "CLOCK_SKIPPED", "SKIPPED_FROM")
-)
 PUNCTUAL_TICKS = 20
 """Number of punctual ticks that ends an episode of late ones."""
 _P = ParamSpec("_P")
@@ -51,7 +47,10 @@ class Task(ABC):
             segment, wiring.task, self.alarms if wiring.guards_clock else None
         )
         inbox = open_inbox(segment, wiring.task)
-        self.interrupts = InterruptHandler.of(segment, wiring.task, inbox, self.alarms)
+        self.serve: Callable[[int], None] | None = None
+        # The first task of a board serves its interrupts.
+        if inbox is not None and wiring.task == segment.layout.handler(spec.slot):
+            self.serve = InterruptHandler(segment, wiring.task, inbox, self.alarms).serve
         self.inputs = InputPorts(
             segment,
             wiring.inputs,
@@ -64,13 +63,8 @@ class Task(ABC):
         self.inputs.task.now = self.clock.now
         self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs, wiring.sent)
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
-        self.faults = TaskFaults(segment, spec, self.outputs, level)
+        self.faults = TaskFaults(segment, spec, self.outputs.apply, level)
         self._generation = 0
-
-    def begin(self) -> None:
-        """Mark the task as running on the backplane, and start to count its processor time."""
-        self.block[Block.STATE] = TaskState.RUNNING
-        self.stopwatch.begin()
 
     def wait_until_next_cycle(self) -> int | None:
         """Wait for the next release and return its tick; None when the run is over.
@@ -80,13 +74,21 @@ class Task(ABC):
         tick = self.next_cycle.wait()
         if tick is None:
             return None
-        if self.words[_FAULTS] != self._generation:
+        if self.words[System.FAULTS] != self._generation:
             self._generation = self.faults.refresh(tick)
         return tick
 
-    @abstractmethod
     def run(self) -> None:
         """Cycle until the run is over."""
+        self.block[Block.STATE] = TaskState.RUNNING
+        self.stopwatch.begin()
+        while (tick := self.wait_until_next_cycle()) is not None:
+            self.cycle(tick)
+        self.stopwatch.count_bus()
+
+    @abstractmethod
+    def cycle(self, tick: int) -> None:
+        """Do the cycle released at `tick`."""
 
 
 class ClockGuard:
@@ -110,26 +112,38 @@ class ClockGuard:
     def report_skipped(self, tick: int) -> None:
         """Report the ticks skipped since the last report, in the cycle released at `tick`."""
         words = self._words
-        since = words[_SKIPPED_FROM]
+        since = words[System.SKIPPED_FROM]
         # A task may begin so late that the clock has skipped ticks since its release: that is for
         # its next cycle.
         if tick >= since:
-            counted = words[_CLOCK_SKIPPED]
+            counted = words[System.CLOCK_SKIPPED]
             self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=counted - self.reported, since=since)
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
     def check_release(self, tick: int) -> None:
         """Check whether the clock was late, in a cycle released at `tick` that begins late."""
         words = self._words
-        late_ns = words[_TICK_NS] - self._clock.time_of(tick)
+        late_ns = words[System.TICK_NS] - self._clock.time_of(tick)
         # Checked after the read: the time is this tick's only if the clock has not advanced
         # meanwhile.
-        if self._clock.is_lockstep or words[_TICK] != tick:
+        if self._clock.is_lockstep or words[System.TICK] != tick:
             return
         if late_ns > self._late_ns:
             if tick >= self._quiet_from:
                 self._alarms.ring(tick, Alarm.CLOCK_LATE, value=late_ns)
             self._quiet_from = tick + PUNCTUAL_TICKS
+
+
+def in_turn(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
+    """Return a function that makes these accesses one after the other, as far as there are any; one
+    alone itself."""
+    found = [access for access in accesses if access is not None]
+
+    def make_all(tick: int) -> None:
+        for access in found:
+            access(tick)
+
+    return make_all if len(found) > 1 else found[0]
 
 
 def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:

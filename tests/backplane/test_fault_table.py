@@ -9,7 +9,7 @@ import pytest
 
 from rack.backplane.address_map import FAULT_ENTRIES
 from rack.backplane.errors import FaultTableError
-from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import NEVER, FaultTable, Injection, Stage
 from rack.backplane.words import System
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus
@@ -32,42 +32,25 @@ def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
     entry = FaultTable(segment).add(WHOLE)
     read = FaultTable(segment).entries[entry.index]
-    words = (
-        Entry.KIND,
-        Entry.TASK,
-        Entry.MAILBOX,
-        Entry.FROM,
-        Entry.TICKS,
-        Entry.PHASE,
-        Entry.SEED,
-    )
-    assert [read[word] for word in words] == [3, 1, 0, 40, 8, 250, 77]
-    assert [read[word] for word in (Entry.WHEN_BOX, Entry.WHEN_FIELD, Entry.WHEN_VALUE)] == [
-        0,
-        1,
-        2,
-    ]
+    assert read.words[1:5].tolist() == [3, 1, 0, 40]
+    assert read.words[6:12].tolist() == [8, 250, 77, 0, 1, 2]
     assert read.parameters[:3].tolist() == [0.5, -1.0, 3.25]
-    assert (read.stage, read[Entry.UNTIL], read[Entry.STRUCK_TICK]) == (Stage.WAITING, NEVER, -1)
+    assert (read.stage, read.until, read.struck_tick) == (Stage.WAITING, NEVER, -1)
     assert segment.words[System.INJECTED] == 1
 
 
 def test_a_fault_without_a_condition_waits_for_its_tick_alone(make_bus: MakeBus) -> None:
     entry = FaultTable(make_bus(mailbox())).add(replace(WHOLE, when=None))
-    assert entry[Entry.WHEN_BOX] == -1
+    assert entry.when_box == -1
 
 
-def test_a_task_finds_its_own_active_faults(make_bus: MakeBus) -> None:
+def test_entries_are_found_by_their_stages(make_bus: MakeBus) -> None:
     table = FaultTable(make_bus())
     entries = [table.add(Injection(0, task)) for task in (0, 1, 1, -1)]
-    assert table.active("reader") == []
+    assert table.staged((Stage.ACTIVE,)) == []
     for entry in entries[1:]:
-        entry.words[Entry.STAGE] = Stage.ACTIVE
-    found = {
-        name: [entry.index for entry in table.active(name)]
-        for name in ("writer", "reader", "clock")
-    }
-    assert found == {"writer": [], "reader": [1, 2], "clock": [3]}
+        entry.stage = Stage.ACTIVE
+    assert [entry.task for entry in table.staged((Stage.ACTIVE,))] == [1, 1, -1]
     assert [entry.index for entry in table.staged((Stage.WAITING,))] == [0]
 
 
@@ -76,14 +59,13 @@ def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(
 ) -> None:
     entry, before = FaultTable(make_bus()).add(Injection(0, 0)), monotonic_ns()
     entry.acted(9, shows=False)
-    first = entry[Entry.STRUCK_NS]
+    first = entry.struck_ns
     assert before <= first <= monotonic_ns()
-    assert (entry[Entry.STRUCK_TICK], entry[Entry.COUNT]) == (9, 0)
+    assert (entry.struck_tick, entry.count) == (9, 0)
     for tick in (12, 15):
         entry.acted(tick)
     entry.acted(16, shows=False)
-    words = (Entry.STRUCK_TICK, Entry.STRUCK_NS, Entry.HIDDEN, Entry.COUNT)
-    assert [entry[word] for word in words] == [9, first, 12 - 9, 2]
+    assert entry.words[12:16].tolist() == [9, first, 2, 12 - 9]
 
 
 def test_a_full_table_refuses(make_bus: MakeBus) -> None:
@@ -106,7 +88,7 @@ def test_two_who_inject_at_once_take_two_entries(make_bus: MakeBus) -> None:
     children = [fork(lambda seed=seed: inject(seed)) for seed in (1, 2, 3)]  # type: ignore[misc]
     assert [exit_status(child) for child in children] == [0, 0, 0]
     entries = FaultTable(segment).staged((Stage.WAITING,))
-    assert sorted(entry[Entry.SEED] for entry in entries) == sorted([1, 2, 3] * each)
+    assert sorted(entry.seed for entry in entries) == sorted([1, 2, 3] * each)
     assert segment.words[System.INJECTED] == 3 * each
 
 
@@ -117,11 +99,11 @@ def test_a_fault_that_waits_can_be_taken_back_and_one_that_has_begun_cannot(
     entry = table.add(Injection(1, 0, tick=40, when=(2, 1, 7)))
     table.disarm(entry)
     # Neither its tick nor its condition begins it.
-    assert (entry[Entry.FROM], entry[Entry.WHEN_BOX]) == (NEVER, -1)
+    assert (entry.tick, entry.when_box) == (NEVER, -1)
     assert table.free(entry)
     assert entry.stage == Stage.FREE
     begun = table.add(Injection(1, 0, tick=40))
-    begun.words[Entry.STAGE] = Stage.ACTIVE
+    begun.stage = Stage.ACTIVE
     assert not table.free(begun)
     assert begun.stage == Stage.ACTIVE
     assert table.staged((Stage.ACTIVE, Stage.OVER)) == [begun]

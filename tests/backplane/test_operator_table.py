@@ -10,14 +10,12 @@ from contextlib import ExitStack
 import pytest
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
-from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import OperatorTableError
 from rack.backplane.operator_table import (
     OperatorTable,
     Request,
     RequestEntry,
     RequestStage,
-    RequestWord,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -35,8 +33,8 @@ def segment(make_bus: MakeBus) -> Segment:
 
 def give(entry: RequestEntry, serial: int) -> None:
     """Do to an entry what the clock does."""
-    entry.words[RequestWord.SERIAL], entry.words[RequestWord.GIVEN_TICK] = serial, 10 * serial
-    entry.words[RequestWord.STAGE] = RequestStage.GIVEN
+    entry.serial, entry.given_tick = serial, 10 * serial
+    entry.stage = RequestStage.GIVEN
 
 
 def test_an_entry_holds_what_was_asked_for(segment: Segment) -> None:
@@ -44,8 +42,8 @@ def test_an_entry_holds_what_was_asked_for(segment: Segment) -> None:
     entry = OperatorTable(segment).add(Request(0, message, tick=40))
     read = OperatorTable(segment).entries[entry.index]
     assert bytes(read.message[: len(message)]) == message
-    assert [read[word] for word in (RequestWord.MAILBOX, RequestWord.TICK)] == [0, 40]
-    assert (read.stage, read[RequestWord.SERIAL], read[RequestWord.GIVEN_TICK]) == (
+    assert (read.mailbox, read.tick) == (0, 40)
+    assert (read.stage, read.serial, read.given_tick) == (
         RequestStage.WAITING,
         0,
         -1,
@@ -57,7 +55,7 @@ def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None
     added = [table.add(Request(0, b"", tick)) for tick in (9, 3, 5)]
     give(added[0], 1)
     added.append(table.add(Request(0, b"", 7)))
-    assert [entry[RequestWord.TICK] for entry in OperatorTable(segment).waiting()] == [3, 5, 7]
+    assert [entry.tick for entry in OperatorTable(segment).waiting()] == [3, 5, 7]
 
 
 def test_of_commands_issued_those_are_lacking_that_wait_for_no_tick_until_theirs(
@@ -83,7 +81,7 @@ def test_of_commands_issued_those_are_lacking_that_wait_for_no_tick_until_theirs
 def test_a_request_that_waits_can_be_taken_back(segment: Segment) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b"", 9))
-    assert table.withdraw(entry, entry[RequestWord.TICKET])
+    assert table.withdraw(entry, entry.ticket)
     assert table.waiting() == []
 
 
@@ -91,7 +89,7 @@ def test_a_request_that_was_given_stays_given(segment: Segment) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b"", 9))
     give(entry, 1)
-    assert not table.withdraw(entry, entry[RequestWord.TICKET])
+    assert not table.withdraw(entry, entry.ticket)
     assert entry.stage == RequestStage.GIVEN
 
 
@@ -100,7 +98,7 @@ def test_a_request_in_a_reused_entry_is_not_withdrawn_by_an_earlier_client(
 ) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b"", 9))
-    ticket = entry[RequestWord.TICKET]
+    ticket = entry.ticket
     table.withdraw(entry, ticket)
     again = table.add(Request(0, b"", 11))
     assert again.index == entry.index
@@ -160,7 +158,7 @@ def test_two_operators_at_once_fill_entries_of_their_own(segment: Segment) -> No
     assert [exit_status(pid) for pid in pids] == [0, 0]
     waiting = OperatorTable(segment).waiting()
     assert len(waiting) == 2 * half
-    assert len({entry[RequestWord.TICKET] for entry in waiting}) == 2 * half
+    assert len({entry.ticket for entry in waiting}) == 2 * half
 
 
 def test_a_request_leaves_no_file_open(segment: Segment) -> None:
@@ -169,16 +167,14 @@ def test_a_request_leaves_no_file_open(segment: Segment) -> None:
     table.add(Request(0, b"", 9))
     with table.claim(Request(0, b"", 9)):
         pass
-    claim = table.try_claim(Request(0, b"", 9))
-    assert claim is not None
+    claim = table.enter(Request(0, b"", 9))
     claim.leave()
     assert descriptors() == before
 
 
 def test_a_request_counts_as_its_clients_while_the_client_holds_it(segment: Segment) -> None:
     table = OperatorTable(segment)
-    claim = table.try_claim(Request(0, b"", 9))
-    assert claim is not None
+    claim = table.enter(Request(0, b"", 9))
     assert [entry.index for entry in table.waiting()] == [claim.entry.index]
     claim.leave()
     assert table.waiting() == []
@@ -192,27 +188,18 @@ def test_a_request_without_a_client_waits_in_an_entry_that_a_client_had(segment:
     assert [entry.index for entry in table.waiting()] == [first.index]
 
 
-def test_while_another_fills_an_entry_a_request_is_not_added(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    lock = ByteLock(segment.fd, segment.map.operator)
-    assert lock.take()
-    assert table.try_claim(Request(0, b"", 9)) is None
-    lock.close()
-    assert table.try_claim(Request(0, b"", 9)) is not None
-
-
 @pytest.mark.parametrize(("tick", "was_withdrawn"), [(-1, True), (0, False), (1, False)])
 def test_a_request_that_the_clock_is_just_giving_is_not_withdrawn(
     segment: Segment, tick: int, was_withdrawn: bool
 ) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b""))
-    assert entry[RequestWord.TICK] == -1
-    entry.words[RequestWord.GIVEN_TICK] = tick
-    assert table.withdraw(entry, entry[RequestWord.TICKET]) is was_withdrawn
+    assert entry.tick == -1
+    entry.given_tick = tick
+    assert table.withdraw(entry, entry.ticket) is was_withdrawn
 
 
 def test_tickets_count_the_requests(segment: Segment) -> None:
-    tickets = [OperatorTable(segment).add(Request(0, b"", 9))[RequestWord.TICKET] for _ in range(3)]
+    tickets = [OperatorTable(segment).add(Request(0, b"", 9)).ticket for _ in range(3)]
     assert tickets == [1, 2, 3]
     assert segment.words[System.REQUESTED] == 3

@@ -17,7 +17,6 @@ from rack.backplane.operator_table import (
     Request,
     RequestEntry,
     RequestStage,
-    RequestWord,
 )
 from rack.backplane.words import Run, System
 from rack.boards import Rack
@@ -220,7 +219,7 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
         hold = OperatorTable(rack.segment).entries[0]
         message = message_of(hold, rack.segment.layout)
         message.what, message.goal = Operation.GOTO, Goal.HOME
-        OperatorTable(rack.segment).add(Request(hold[RequestWord.MAILBOX], bytes(message.raw), 60))
+        OperatorTable(rack.segment).add(Request(hold.mailbox, bytes(message.raw), 60))
         assert rack.run(1.0).worked
         last = MailboxRing(rack.segment, f"{board}.status").drain().rows["message"][-1]
     assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
@@ -298,11 +297,11 @@ def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., Rac
         entry = rack.command("lower", "hold")
         await_giving(rack, entry)
         status = open_observer(rack.segment, "lower.status")
-        watch(rack, lambda: answered(status.peek(), entry[RequestWord.SERIAL]))
+        watch(rack, lambda: answered(status.peek(), entry.serial))
         later = rack.segment.words[System.TICK] + 40
         second = rack.command("lower", "resume", tick=later)
         await_giving(rack, second)
-        assert second[RequestWord.GIVEN_TICK] >= later
+        assert second.given_tick >= later
         rack.stop("tried")
         watch(rack, lambda: rack.segment.words[System.STATE] == Run.STOPPED)
 
@@ -315,9 +314,7 @@ def test_a_command_is_issued_only_while_its_client_lives(
 ) -> None:
     with Rack(commanded(commands("level='upper', what='hold', tick=50"))) as rack:
         table = OperatorTable(rack.segment)
-        wanted = Request(
-            table.entries[0][RequestWord.MAILBOX], bytes(table.entries[0].message), 100
-        )
+        wanted = Request(table.entries[0].mailbox, bytes(table.entries[0].message), 100)
 
         def wait() -> None:
             with OperatorTable(rack.segment).claim(wanted):

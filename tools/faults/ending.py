@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rack.backplane.checked import as_whole
-from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.layout import Layout
 from rack.backplane.message import State, reason_of, state_name
 from rack.backplane.segment import Segment
@@ -142,7 +142,7 @@ def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
     kind = kind_of(entry)
     values = kind.values(entry)
     board = board_of(entry, layout)
-    began = -1 if entry.stage == Stage.WAITING else entry[Entry.FROM]
+    began = -1 if entry.stage == Stage.WAITING else entry.tick
     joint = as_whole(values.get("joint", -1))
     joint_name = joints[joint] if 0 <= joint < len(joints) else ""
     return Strike(
@@ -150,21 +150,21 @@ def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
         kind=kind.name,
         board=board,
         began=began,
-        ends=entry[Entry.UNTIL],
-        tick=entry[Entry.STRUCK_TICK],
-        time_ns=entry[Entry.STRUCK_NS],
-        count=entry[Entry.COUNT],
-        hidden=entry[Entry.HIDDEN],
-        mailboxes=tuple(box.name for box in struck_mailboxes(layout, entry[Entry.MAILBOX], board)),
+        ends=entry.until,
+        tick=entry.struck_tick,
+        time_ns=entry.struck_ns,
+        count=entry.count,
+        hidden=entry.hidden,
+        mailboxes=tuple(box.name for box in struck_mailboxes(layout, entry.mailbox, board)),
         joint=joint_name,
         size=values.get("size"),
         injection=Injection(
-            kind=entry[Entry.KIND],
-            task=entry[Entry.TASK],
-            mailbox=entry[Entry.MAILBOX],
-            ticks=entry[Entry.TICKS],
-            phase=entry[Entry.PHASE],
-            seed=entry[Entry.SEED],
+            kind=entry.kind,
+            task=entry.task,
+            mailbox=entry.mailbox,
+            ticks=entry.ticks,
+            phase=entry.phase,
+            seed=entry.seed,
             parameters=tuple(values.values()),
         ),
     )

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Stage
+from rack.backplane.fault_table import NEVER, FaultEntry, FaultTable, Stage
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -175,27 +175,27 @@ class LiveRack:
 
     def _state(self, entry: FaultEntry) -> str:
         fault = self._described(entry)
-        first = entry[Entry.FROM]
-        last = entry[Entry.UNTIL] - 1
+        first = entry.tick
+        last = entry.until - 1
         if entry.stage == Stage.WAITING:
             how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
             awaited = self._awaited(entry)
             held = waits(self._segment) if awaited == NEXT_TICK else ""
             return f"{fault}: armed, {held or f'waits for {awaited}'}; {how}"
         if entry.stage == Stage.OVER:
-            acted = "once" if entry[Entry.COUNT] == 1 else f"{entry[Entry.COUNT]} times"
+            acted = "once" if entry.count == 1 else f"{entry.count} times"
             return f"{fault}: ticks {first} to {last}, acted {acted}"
-        end = "the end of the run" if entry[Entry.UNTIL] == NEVER else f"tick {last}"
+        end = "the end of the run" if entry.until == NEVER else f"tick {last}"
         return f"{fault}: from tick {first} to {end}"
 
     def _awaited(self, entry: FaultEntry) -> str:
         """Return the tick or the condition that a fault waits for."""
-        if entry[Entry.WHEN_BOX] < 0:
-            if entry[Entry.FROM] <= 0:
+        if entry.when_box < 0:
+            if entry.tick <= 0:
                 return NEXT_TICK
             now = self._segment.words[System.TICK]
-            return f"tick {entry[Entry.FROM]}; the rack is at tick {now}"
-        when = (entry[Entry.WHEN_BOX], entry[Entry.WHEN_FIELD], entry[Entry.WHEN_VALUE])
+            return f"tick {entry.tick}; the rack is at tick {now}"
+        when = (entry.when_box, entry.when_field, entry.when_value)
         return condition_text(when, self._segment.layout)
 
     def _document(self, entry: FaultEntry) -> Document:

@@ -15,7 +15,6 @@ from rack.backplane.operator_table import (
     Request,
     RequestEntry,
     RequestStage,
-    RequestWord,
 )
 from rack.backplane.words import System
 from rack.boards.config import read_stored
@@ -109,7 +108,7 @@ class LiveDesk:
             raise Failure(f"--lease: the rack is held: {held}")
         table = OperatorTable(segment)
         with table.claim(wanted, Client.LEASES) as entry:
-            ticket = entry[RequestWord.TICKET]
+            ticket = entry.ticket
             reply = self._await_reply(self._await_giving(entry, command.level), False, None)
             tell(reply)
             while reply.worked and table.hear(entry, ticket) and not segment.run_is_over:
@@ -147,14 +146,14 @@ class LiveDesk:
         return self.give(given, wait=False)
 
     def _await_giving(self, entry: RequestEntry, level: str) -> Reply:
-        ticket = entry[RequestWord.TICKET]
+        ticket = entry.ticket
         text = describe(message_of(entry, self._segment.layout))
         about = f"'{level}', {text}"
-        for is_over in self._looks(about, f"waiting for tick {max(0, entry[RequestWord.TICK])}"):
-            if entry[RequestWord.TICKET] != ticket:
+        for is_over in self._looks(about, f"waiting for tick {max(0, entry.tick)}"):
+            if entry.ticket != ticket:
                 break
             if entry.stage == RequestStage.GIVEN:
-                return Reply(entry[RequestWord.SERIAL], level, text, entry[RequestWord.GIVEN_TICK])
+                return Reply(entry.serial, level, text, entry.given_tick)
             if is_over:
                 raise Failure(f"{about}: the run ended before it was given")
         raise Failure(f"{about}: given, but its reply is lost: too many commands followed")

@@ -196,7 +196,10 @@ def run_rack(
             clock_skipped=segment.words[System.CLOCK_SKIPPED],
             tasks={
                 task.name: {
-                    **{name.lower(): segment.block(task.name)[Block[name]] for name in COUNTED},
+                    **{
+                        name.lower(): segment.block(task.name)[getattr(Block, name)]
+                        for name in COUNTED
+                    },
                     **segment.count_cycles(task, outcome.ticks)._asdict(),
                 }
                 for task in segment.layout.tasks

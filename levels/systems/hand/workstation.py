@@ -277,9 +277,9 @@ class Workstation(HostProgram):
 
     def boards(self, bus: Bus) -> dict[str, dict[str, int]]:
         """Return the counts of every task, from the words of its control block."""
-        counts = (Block.CYCLES, Block.MISSED, Block.SKIPPED)
+        counts = {"cycles": Block.CYCLES, "missed": Block.MISSED, "skipped": Block.SKIPPED}
         blocks = {task: bus.address(task) for task in bus.tasks}
         return {
-            task: {word.name.lower(): bus.words(address + WORD * word)[0] for word in counts}
+            task: {name: bus.words(address + WORD * word)[0] for name, word in counts.items()}
             for task, address in blocks.items()
         }

@@ -354,7 +354,7 @@ def test_an_executor_that_alone_is_due_gets_its_ticks_at_once(make_bus: MakeBus)
     ],
 )
 def test_a_batch_ends_where_the_run_ends_or_is_held(
-    make_bus: MakeBus, word: System, value: int, end: int
+    make_bus: MakeBus, word: int, value: int, end: int
 ) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
     driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)

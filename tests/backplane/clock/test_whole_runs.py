@@ -1,5 +1,5 @@
-"""The clock in whole racks in lockstep: what is released, awaited, held, lost and taken back stays
-as it was."""
+"""The clock in whole racks in lockstep that lose boards and ticks: what is released, awaited, held,
+lost and taken back stays as it was."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.boards.conftest import PLAIN, PLANNED, MakeConfig, config  # noqa: F4
 from tests.boards.fault_racks import DRIVEN, FOLLOWED
 from tests.boards.run.test_exchange import TEXT as EXCHANGE
 from tests.snapshots import Snapshots
-from tests.whole_runs import whole_run
+from tests.whole_runs import in_short, whole_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 SNAPSHOTS = Snapshots(__file__)
@@ -31,18 +31,13 @@ LOST: tuple[dict[str, Any], ...] = (
 )
 
 
-@pytest.mark.parametrize("lost", [False, True], ids=["whole", "lost"])
 @pytest.mark.parametrize("case", RACKS)
 def test_the_clock_of_a_rack_does_what_it_did(
     case: str,
-    lost: bool,
     config: MakeConfig,  # noqa: F811
 ) -> None:
     text, settings = RACKS[case]
     rack = config(*settings, text=text)
-    if lost:
-        faults = [
-            FaultConfig(**fault) for fault in LOST if fault["board"] in (*rack.board, "clock")
-        ]
-        rack = rack.model_copy(update={"fault": tuple(faults)})
-    SNAPSHOTS.check(f"{case}, {'lost' if lost else 'whole'}", whole_run(rack, SECONDS))
+    faults = [FaultConfig(**fault) for fault in LOST if fault["board"] in (*rack.board, "clock")]
+    rack = rack.model_copy(update={"fault": tuple(faults)})
+    SNAPSHOTS.check(case, in_short(whole_run(rack, SECONDS)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox.host_ring import HostReader, HostWriter, ProperContent
+from rack.backplane.mailbox.host_ring import HostReader, HostWriter, is_proper
 from rack.backplane.message import Field, Message, MessageType
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
@@ -96,14 +96,14 @@ def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(
 def test_numbers_that_are_not_finite_and_unknown_members_of_enums_are_improper(
     value: float,
 ) -> None:
-    check, message = ProperContent(field_specs(NUMBER, {})), Message(NUMBER.dtype({}))
-    assert check(message)
+    fields, message = field_specs(NUMBER, {}), Message(NUMBER.dtype({}))
+    assert is_proper(message.record, fields)
     message.value = np.finfo(float).max
-    assert check(message)
+    assert is_proper(message.record, fields)
     message.colour = 2
-    assert not check(message)
+    assert not is_proper(message.record, fields)
     message.colour, message.value = 1, value
-    assert not check(message)
+    assert not is_proper(message.record, fields)
 
 
 def test_lengths_beyond_those_declared_and_text_beyond_ascii_are_improper_empty_groups_not() -> (
@@ -116,22 +116,22 @@ def test_lengths_beyond_those_declared_and_text_beyond_ascii_are_improper_empty_
         1,
         (Field("ones", one, "1", "them", (3,)), Field("far", "f4", "m", "", (), (0.0, 5.0))),
     )
-    check, message = ProperContent(field_specs(kind, {})), Message(kind.dtype({}))
-    assert check(message)
-    for far, is_proper in ((5.0, True), (-5.0, True), (5.1, False), (-5.1, False), (0.0, True)):
+    fields, message = field_specs(kind, {}), Message(kind.dtype({}))
+    assert is_proper(message.record, fields)
+    for far, permitted in ((5.0, True), (-5.0, True), (5.1, False), (-5.1, False), (0.0, True)):
         message.far = far
-        assert check(message) is is_proper
+        assert is_proper(message.record, fields) is permitted
     first = message.ones[0]
     first["name"] = b"a"
-    assert not check(message)
+    assert not is_proper(message.record, fields)
     big = np.finfo(float).max
-    for turned, is_proper in (
+    for turned, permitted in (
         ((0.6, 0.8), True),
         ((1.0, 0.8), False),
         ((big, big), False),
         ((0.0, -1.0), True),
     ):
         first["turn"] = turned
-        assert check(message) is is_proper
+        assert is_proper(message.record, fields) is permitted
     first["name"] = b"\xff"
-    assert not check(message)
+    assert not is_proper(message.record, fields)

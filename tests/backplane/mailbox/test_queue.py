@@ -6,11 +6,10 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
-from itertools import product
 
 import pytest
 
-from rack.backplane.address_map import SLOT_HEAD_SIZE, slot_stride
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
@@ -224,9 +223,9 @@ def test_messages_of_other_mailboxes_cannot_be_sent(make_bus: MakeBus) -> None:
         writer.message.room()
 
 
-@pytest.mark.parametrize("word", Slot)
+@pytest.mark.parametrize("word", range(8))
 @pytest.mark.parametrize("at", [1, 3])
-def test_no_damage_to_a_slot_holds_up_the_queue(make_bus: MakeBus, word: Slot, at: int) -> None:
+def test_no_damage_to_a_slot_holds_up_the_queue(make_bus: MakeBus, word: int, at: int) -> None:
     segment = make_bus(*queue(3))
     writer, reader = ends(segment)
     send(writer, 0, 1, 2, 3)
@@ -234,8 +233,8 @@ def test_no_damage_to_a_slot_holds_up_the_queue(make_bus: MakeBus, word: Slot, a
     words[word] ^= 1 << 40
     found = ids(reader.read(1))
     # The checksum does not cover the time stamp.
-    assert found == [serial for serial in (1, 2, 3) if serial != at or word is Slot.STAMP_NS]
-    assert reader.statistics.bad_reads == (word is not Slot.STAMP_NS)
+    assert found == [serial for serial in (1, 2, 3) if serial != at or word == Slot.STAMP_NS]
+    assert reader.statistics.bad_reads == (word != Slot.STAMP_NS)
     assert reader.taken == 3
     writer.taken = reader.taken
     assert send(writer, 1, 4) == [True]
@@ -264,7 +263,7 @@ def bookkeeping(segment: Segment) -> Iterator[int]:
     both."""
     for name, serials in ((NAME, range(1, 6)), (taken_name(NAME), range(1, 3))):
         start = segment.map.mailboxes[name]
-        yield from range(start, start + 8 * len(Box))
+        yield from range(start, start + MAILBOX_HEAD_SIZE)
         for serial in serials:
             message = message_address(segment, serial, name)
             # The position is part of its message.
@@ -273,14 +272,18 @@ def bookkeeping(segment: Segment) -> Iterator[int]:
 
 
 @pytest.mark.slow
-def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(make_bus: MakeBus) -> None:
+@pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.thorough), 3])
+def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(
+    make_bus: MakeBus, step: int
+) -> None:
     segment = make_bus(*queue(8))
     writer = open_writer(segment, NAME)
     assert isinstance(writer, QueueWriter)
     send(writer, 0, 1, 2, 3, 4, 5)
     assert exit_status(fork(lambda: take_three(segment))) == -signal.SIGKILL
     before = bytes(segment.bytes)
-    for address, bit in product(bookkeeping(segment), range(8)):
+    bits = [(address, bit) for address in bookkeeping(segment) for bit in range(8)]
+    for address, bit in bits[::step]:
         segment.bytes[:] = before
         segment.bytes[address] ^= 1 << bit
         reader = open_reader(segment, NAME)

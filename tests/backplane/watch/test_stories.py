@@ -12,7 +12,15 @@ from tests.link import MakeLink, links, story
 from tests.snapshots import Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
-RATES = ((1, 1), (4, 1), (1, 8))
+ENDS = (
+    ((1, 1), True),
+    ((1, 1), False),
+    ((4, 1), True),
+    ((2, 4), False),
+    ((1, 8), True),
+    ((1, 8), False),
+)
+"""Rates of writer and reader, and whether the reader comes first."""
 FAULTS: dict[str, tuple[float, ...]] = {
     "mute": (),
     "drop": (0.4,),
@@ -31,15 +39,15 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-@pytest.mark.parametrize("rates", RATES, ids=str)
-# The writer first is in `make quick` by the stories of mailboxes.
-@pytest.mark.parametrize("reader_first", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_link_lives_through_faults_as_it_did(
-    link: MakeLink, fault: str, protocol: Protocol, rates: tuple[int, int], reader_first: bool
+    link: MakeLink, fault: str, protocol: Protocol
 ) -> None:
-    rack = link(protocol, rates, reader_first)
-    first = "reader" if reader_first else "writer"
     SNAPSHOTS.check(
-        f"{fault}, {protocol}, {rates[0]} to {rates[1]}, {first} first",
-        story(rack, fault, *FAULTS[fault]),
+        f"{fault}, {protocol}",
+        {
+            f"{rates[0]} to {rates[1]}, {'reader' if reader_first else 'writer'} first": story(
+                link(protocol, rates, reader_first), fault, *FAULTS[fault]
+            )
+            for rates, reader_first in ENDS
+        },
     )

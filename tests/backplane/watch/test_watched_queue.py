@@ -9,8 +9,7 @@ from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_queue import WatchedQueue
-from rack.backplane.watch.watched_reader import watched
+from rack.backplane.watch.watched_reader import WatchedQueue, watched
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, message_address, queue
 from tests.backplane.conftest import MakeBus

@@ -48,4 +48,4 @@ def test_the_bounds_of_a_shipped_rack_are_as_before(name: str) -> None:
             found += [kind.recovery_ticks(board, layout, restart) for restart in RESTARTS_S]
         parts[kind.name] = found
     parts["last reads"] = [last_read((box.name,), layout) for box in layout.mailboxes]
-    SNAPSHOTS.check(name, parts)
+    SNAPSHOTS.check(name, {"bounds": parts})

@@ -12,7 +12,7 @@ import pytest
 
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
-from rack.backplane.fault_table import NEVER, Entry, FaultEntry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import NEVER, FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.process import STOPPED, WAITING, is_alive, state_of
 from rack.backplane.segment import Segment
@@ -67,7 +67,7 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:  # n
         for tick, at in ((0, Stage.WAITING), (8, Stage.ACTIVE), (16, Stage.OVER))
         for _ in "ab"
     ]
-    assert (entry[Entry.FROM], entry[Entry.UNTIL]) == (3, 9)
+    assert (entry.tick, entry.until) == (3, 9)
 
 
 class Site:
@@ -123,12 +123,12 @@ def test_a_fault_lasts_from_its_tick_for_its_ticks(site: Site) -> None:
     assert site.stage.next_tick == 5
     assert site.advance(5) == [(Alarm.FAULT_BEGINS, 5, entry.index, 0.0)]
     assert site.stage.next_tick == 8
-    assert (entry[Entry.FROM], entry[Entry.UNTIL], entry.stage) == (5, 8, Stage.ACTIVE)
+    assert (entry.tick, entry.until, entry.stage) == (5, 8, Stage.ACTIVE)
     assert site.table.generation == generation + 1
     assert site.advance(6, 7) == []
-    entry.words[Entry.COUNT] = 2
+    entry.count = 2
     assert site.advance(8) == [(Alarm.FAULT_ENDS, 8, entry.index, 2.0)]
-    assert (entry[Entry.UNTIL], entry.stage) == (8, Stage.OVER)
+    assert (entry.until, entry.stage) == (8, Stage.OVER)
     assert site.table.generation == generation + 2
     assert (site.advance(9), site.stage.injected) == ([], 1)
 
@@ -136,15 +136,15 @@ def test_a_fault_lasts_from_its_tick_for_its_ticks(site: Site) -> None:
 def test_a_fault_without_an_end_lasts_to_the_end_of_the_run(site: Site) -> None:
     entry = site.add("mute", tick=5)
     site.advance(5, 6, 10**6)
-    assert (entry[Entry.UNTIL], entry.stage) == (NEVER, Stage.ACTIVE)
+    assert (entry.until, entry.stage) == (NEVER, Stage.ACTIVE)
 
 
 def test_a_fault_of_the_clock_that_strikes_once_is_over_a_tick_later(site: Site) -> None:
     entry = site.add("clock-skip", task=-1, tick=5)
     assert site.driver.skip == 0
     site.advance(5)
-    assert (entry[Entry.UNTIL], site.driver.skip) == (6, 1)
-    assert (entry[Entry.STRUCK_TICK], entry[Entry.COUNT]) == (5, 1)
+    assert (entry.until, site.driver.skip) == (6, 1)
+    assert (entry.struck_tick, entry.count) == (5, 1)
     (ended,) = [alarm for alarm in site.advance(6) if alarm[0] is Alarm.FAULT_ENDS]
     assert ended == (Alarm.FAULT_ENDS, 6, entry.index, 1.0)
 
@@ -214,7 +214,7 @@ def test_a_condition_holds_as_of_the_tick_before(site: Site) -> None:
 def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) -> None:
     absent = site.add("kill", tick=1)
     site.advance(1)
-    assert (absent[Entry.COUNT], absent.stage) == (0, Stage.ACTIVE)
+    assert (absent.count, absent.stage) == (0, Stage.ACTIVE)
     block = site.segment.block("writer")
     with forked(signal.pause) as pid:
         block[Block.PID] = pid
@@ -229,11 +229,11 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
         with in_thread(crate):
             site.advance(2)
         assert not is_alive(pid)
-        assert (entry[Entry.COUNT], entry[Entry.STRUCK_TICK]) == (1, 2)
+        assert (entry.count, entry.struck_tick) == (1, 2)
     # Its process is gone: there is nobody to strike.
     again = site.add("kill", tick=3)
     site.advance(3)
-    assert again[Entry.COUNT] == 0
+    assert again.count == 0
 
 
 def test_a_hanging_task_goes_on_when_its_fault_ends_and_if_it_is_lost_the_fault_is_over(
@@ -255,16 +255,16 @@ def test_a_hanging_task_goes_on_when_its_fault_ends_and_if_it_is_lost_the_fault_
         wait_until(lambda: state_of(pid) in STOPPED)
         block[Block.LOST] = 7
         site.advance(6)
-        assert (lasting.stage, lasting[Entry.UNTIL]) == (Stage.OVER, 6)
+        assert (lasting.stage, lasting.until) == (Stage.OVER, 6)
         assert state_of(pid) in STOPPED
 
 
 def test_in_lockstep_a_phase_does_not_matter(site: Site) -> None:
     entry = site.add("clock-skip", task=-1, tick=5, phase=500)
     site.advance(5)
-    assert entry[Entry.COUNT] == 1
+    assert entry.count == 1
     site.stage.within(5)
-    assert entry[Entry.COUNT] == 1
+    assert entry.count == 1
 
 
 def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -> None:
@@ -273,12 +273,12 @@ def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -
     site.stage = FaultStage(site.segment, site.driver)
     entry = site.add("clock-skip", task=-1, tick=5, phase=900)
     site.advance(5)
-    assert (entry[Entry.COUNT], entry.stage) == (0, Stage.ACTIVE)
+    assert (entry.count, entry.stage) == (0, Stage.ACTIVE)
     site.stage.within(5)
-    assert entry[Entry.COUNT] == 1
-    assert entry[Entry.STRUCK_NS] >= site.segment.words[System.EPOCH_NS] + 5.9 * 2_500_000
+    assert entry.count == 1
+    assert entry.struck_ns >= site.segment.words[System.EPOCH_NS] + 5.9 * 2_500_000
     site.stage.within(6)
-    assert entry[Entry.COUNT] == 1
+    assert entry.count == 1
 
 
 def test_a_babble_floods_the_rings_while_it_lasts(site: Site) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from rack.boards.faults.drawing import Drawing
 from rack.boards.faults.kind import KINDS, Kind, Parameter
+from rack.boards.faults.kinds import BUILT_IN
 from tests.snapshots import Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
@@ -35,13 +36,10 @@ def drawn(kind: Kind) -> list[list[float]]:
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_a_kind_declares_what_it_did(kind: Kind) -> None:
-    SNAPSHOTS.check(
-        kind.name,
-        {
-            "kind": declared(kind),
-            "parameters": [declared(parameter) for parameter in kind.parameters],
-            "bound": str(kind.bound),
-            "number": kind.number,
-            "drawn": drawn(kind),
-        },
-    )
+    parameters = [declared(parameter) for parameter in kind.parameters]
+    told = [declared(kind), parameters, str(kind.bound), kind.number]
+    SNAPSHOTS.check(kind.name, {"declared": told, "drawn": drawn(kind)})
+
+
+def test_every_kind_of_the_project_is_known() -> None:
+    assert SNAPSHOTS.known.keys() == BUILT_IN

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import NEVER, FaultTable, Injection, Stage
 from rack.boards.faults.describe import ALL_JOINTS, board_of, describe, document, subject_of
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME, mailbox, task
@@ -63,13 +63,13 @@ def test_parameters_have_their_units_and_ratios_none(table: FaultTable) -> None:
 def test_a_document_has_what_is_known_at_its_stage(table: FaultTable) -> None:
     entry = table.add(Injection(KINDS["mute"].number, 0, 0, tick=40, ticks=8))
     layout = table._segment.layout
-    entry.words[Entry.UNTIL] = 48
+    entry.until = 48
     waiting = document(entry, layout, JOINTS)
     assert (waiting["stage"], waiting["begins"], waiting["until"]) == ("waiting", 40, None)
     assert (waiting["struck_tick"], waiting["acted"], waiting["ticks"]) == (-1, 0, 8)
     assert (waiting["kind"], waiting["board"], waiting["mailbox"]) == ("mute", "writer", NAME)
     for stage in (Stage.ACTIVE, Stage.OVER):
-        entry.words[Entry.STAGE] = stage
+        entry.stage = stage
         assert document(entry, layout, JOINTS)["until"] == 48
-    entry.words[Entry.UNTIL] = NEVER
+    entry.until = NEVER
     assert document(entry, layout, JOINTS)["until"] is None

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.fault_table import NEVER, Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import NEVER, FaultTable, Injection, Stage
 from rack.backplane.message import State
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config import wire
@@ -162,14 +162,14 @@ def test_the_fault_table_returns_the_faults_added(config: MakeConfig, rack_name:
         table = FaultTable(segment)
         entries = [table.add(each) for each in injections(found, layout)]
         assert [entry.stage for entry in entries] == [Stage.WAITING] * 2
-        assert (entries[0][Entry.KIND], entries[0][Entry.FROM]) == (KINDS["corrupt"].number, 8)
+        assert (entries[0].kind, entries[0].tick) == (KINDS["corrupt"].number, 8)
         assert (
             describe(entries[0], layout, ())
             == "corrupt of wave (wave.status, probability 1, bits 5)"
         )
         assert describe(entries[1], layout, ("a", "b")) == "sensor-bias of driven (b, size 0.1 rad)"
         assert document(entries[0], layout, ())["until"] is None
-        entries[1].words[Entry.STAGE], entries[1].words[Entry.UNTIL] = Stage.ACTIVE, NEVER
+        entries[1].stage, entries[1].until = Stage.ACTIVE, NEVER
         entry = document(entries[1], layout, ("a", "b"))
         assert (entry["stage"], entry["until"], entry["parameters"]) == (
             "active",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.message import State
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block
@@ -68,7 +68,7 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
         layout = rack.segment.layout
         outcome = rack.run(2.0)
         (entry,) = FaultTable(rack.segment).staged((Stage.ACTIVE, Stage.OVER))
-        board = layout.tasks[entry[Entry.TASK]].name if entry[Entry.TASK] >= 0 else CLOCK
+        board = layout.tasks[entry.task].name if entry.task >= 0 else CLOCK
         rows = trace_ring(rack.segment, "watch").drain().rows
     bound = kind.bound_ticks(
         injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None
@@ -79,7 +79,7 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
         assert length == LENGTHS["one cycle"]
         found = FIRST
     assert bound is not None
-    assert found - max(FIRST, entry[Entry.STRUCK_TICK]) <= bound
+    assert found - max(FIRST, entry.struck_tick) <= bound
     if outcome.state == "error":
         latched = int(rows["tick"][rows["state"] == State.ERROR][0])
         assert not outcome.worked
@@ -88,7 +88,7 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
         return
     assert outcome.worked
     restart_s = rack.config.supervision.lockstep_restart_s
-    over = max(entry[Entry.UNTIL] if entry.stage == Stage.OVER else 0, found)
+    over = max(entry.until if entry.stage == Stage.OVER else 0, found)
     if kind.is_over_when_found:
         over = found
     after = rows[rows["tick"] >= over + kind.recovery_ticks(board, layout, restart_s)]
@@ -119,7 +119,7 @@ def test_a_fault_in_real_time_finally_ends_or_latches(
             assert rack.outcome.reason.startswith("nothing heard of the wave for")
         elif kind.where in ("clock", "lock"):
             # A task that has lost its core to others may take none of the cycles of its fault.
-            assert entry[Entry.COUNT] > 0
+            assert entry.count > 0
 
 
 def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> None:
@@ -132,7 +132,7 @@ def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> 
         entry, deadline = FaultTable(rack.segment).entries[0], time.monotonic() + BOUND_S
         while entry.stage != Stage.OVER and rack.watch(0.02):
             assert time.monotonic() < deadline
-        assert entry[Entry.STRUCK_TICK] > FIRST + 1
+        assert entry.struck_tick > FIRST + 1
         assert rack.watch(0.02)
 
 

@@ -11,7 +11,7 @@ from rack.boards.faults.kind import KINDS, Kind
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import DRIVEN, FOLLOWED, LOCKED, TARGETS
 from tests.snapshots import Snapshots
-from tests.whole_runs import whole_run
+from tests.whole_runs import in_short, whole_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 SNAPSHOTS = Snapshots(__file__)
@@ -53,7 +53,7 @@ CASES = [
 def test_a_fault_at_the_first_tick_strikes_as_later(kind: str, config: MakeConfig) -> None:
     fault = FaultConfig(kind=kind, board="wave", tick=0)
     struck = config(text=FOLLOWED).model_copy(update={"fault": (fault,)})
-    SNAPSHOTS.check(f"{kind} at the first tick", whole_run(struck, SECONDS))
+    SNAPSHOTS.check(f"{kind} at the first tick", in_short(whole_run(struck, SECONDS)))
 
 
 @pytest.mark.parametrize(("kind", "rack"), CASES)
@@ -63,4 +63,4 @@ def test_a_fault_strikes_as_it_did(kind: Kind, rack: str, config: MakeConfig) ->
     parts = dict(whole_run(struck, SECONDS))
     if kind.name in BY_ORDER:
         del parts["events"]
-    SNAPSHOTS.check(f"{kind.name}, {rack}", parts)
+    SNAPSHOTS.check(f"{kind.name}, {rack}", in_short(parts))

@@ -11,7 +11,7 @@ from typing import cast
 import pytest
 
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.process import processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
@@ -77,7 +77,7 @@ def test_extra_computing_takes_the_time_that_its_step_asks_for(
     begun = time.monotonic_ns()
     extra.burn(20)
     assert time.monotonic_ns() >= ends[0] >= begun + 20_000_000
-    assert (extra.entry[Entry.COUNT], extra.entry[Entry.STRUCK_TICK]) == (1, 20)
+    assert (extra.entry.count, extra.entry.struck_tick) == (1, 20)
 
 
 def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(
@@ -128,7 +128,7 @@ def test_a_task_has_the_faults_that_are_active_by_its_tick(
     table = FaultTable(segment)
     level = Level()
     outputs = Writes()
-    faults = TaskFaults(segment, segment.layout.task("level"), outputs, cast(Executor, level))
+    faults = TaskFaults(segment, segment.layout.task("level"), outputs.apply, cast(Executor, level))
     kinds = ("overrun", "drop", "sensor-bias", "hog")
     entries = [
         table.add(Injection(KINDS[kind].number, 0, tick=4, seed=9, parameters=(1.0,)))
@@ -137,16 +137,16 @@ def test_a_task_has_the_faults_that_are_active_by_its_tick(
     table.add(Injection(KINDS["drop"].number, 1, tick=4))
     assert (faults.refresh(3), faults.loads, outputs.applied) == (table.generation, [], [])
     for entry in entries:
-        entry.words[Entry.STAGE] = Stage.ACTIVE
-        entry.words[Entry.FROM] = 4
+        entry.stage = Stage.ACTIVE
+        entry.tick = 4
     # The clock works ahead: for this task they begin a tick later.
     assert (faults.refresh(3), faults.loads, outputs.applied) == (-1, [], [])
     assert faults.refresh(4) == table.generation
-    assert [load.entry[Entry.KIND] for load in faults.loads] == [KINDS["overrun"].number]
+    assert [load.entry.kind for load in faults.loads] == [KINDS["overrun"].number]
     assert outputs.applied == ["drop"]
     (struck,) = level.injected
     assert (struck.kind, struck.seed, struck.since) == ("sensor-bias", 9, 4)
     faults.count({0: True}, 6)
-    assert (entries[2][Entry.COUNT], entries[2][Entry.STRUCK_TICK]) == (1, 6)
+    assert (entries[2].count, entries[2].struck_tick) == (1, 6)
     faults.burn(7)
-    assert (entries[0][Entry.COUNT], entries[0][Entry.STRUCK_TICK]) == (1, 7)
+    assert (entries[0].count, entries[0].struck_tick) == (1, 7)

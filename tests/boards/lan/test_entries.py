@@ -23,7 +23,7 @@ from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import Arrived
 from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import PeerRack
-from rack.boards.run.queues import DemandPort
+from rack.boards.run.ports import OutputPort
 from tests.boards.lan.conftest import EVERY, LAUNCH, Network
 
 MAX_AGE = 40
@@ -58,7 +58,8 @@ class Importing:
         self.entry = Import(self.segment, "lan.other", self.table, self.peer, self.grid)
         self.entry.open(self.network, self.sealer)  # type: ignore[arg-type]
         self.writer = open_writer(self.segment, "lan.other")
-        self.port = DemandPort(self.writer)
+        alarms = AlarmWriter(self.segment, "lan")
+        self.port = OutputPort(self.segment, self.writer, alarms, (), False)
 
     def restart(self, tick: int) -> None:
         """Kill the adapter, and begin another one with what the first wrote."""
@@ -86,7 +87,7 @@ class Importing:
         """Do the adapter's cycle of `tick`."""
         self.entry.look(tick)
         self.entry.exchange(self.port.message, tick)
-        self.port.write(self.writer.write, lambda tick, now: None, tick, None, tick)
+        self.port.write(tick, None)
         self.entry.fill(self.status.import_other, tick)
 
     def read(self, tick: int) -> tuple[Verdict, int, bool]:

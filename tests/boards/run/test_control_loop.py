@@ -12,13 +12,13 @@ import pytest
 
 from rack.backplane import semaphores
 from rack.backplane.errors import MailboxError
-from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock, open_writer
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.process import die_with_parent, set_priority, take_processor
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import Flag, trace_ring
-from rack.backplane.words import Block, System
+from rack.backplane.words import Block, Slot, System
 from rack.boards.classes import find_class
 from rack.boards.config import Resolved, resolve
 from rack.boards.faults.kind import KINDS
@@ -161,7 +161,7 @@ def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -
     watch.cycle(8)
     slots = Slots(rack.segment, rack.segment.layout.mailbox("watch.status"))
     assert slots.fetch(1)
-    assert (slots.tick, slots.basis) == (8, 3)
+    assert (slots.tick, slots.words[Slot.BASIS]) == (8, 3)
 
 
 def test_the_update_of_a_plan_is_stamped_inside_the_critical_section(
@@ -281,9 +281,9 @@ def test_the_load_of_a_fault_is_computed_in_its_cycle(bench: MakeBench) -> None:
     at = [task.name for task in rack.segment.layout.processes].index("wave")
     kind = KINDS["overrun"]
     entry = FaultTable(rack.segment).add(Injection(kind.number, at, parameters=(0.0, 0.0)))
-    entry.words[Entry.STAGE] = Stage.ACTIVE
+    entry.stage = Stage.ACTIVE
     wave.faults.refresh(0)
     rack.to(0)
     wave.cycle(0)
-    assert entry[Entry.COUNT] == 1
-    assert entry[Entry.STRUCK_TICK] == 0
+    assert entry.count == 1
+    assert entry.struck_tick == 0

@@ -166,7 +166,7 @@ def test_messages_that_faults_strike_cost_the_same_on_every_run(config: MakeConf
 
 def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
     exact = run(config, SMALL)
-    for _ in range(3):
+    for _ in range(2):
         real = run(config, SMALL, "clock.mode=realtime", "clock.speed=0.5")
         same = real.written.first_miss(TICKS)
         assert real.written.until(same) == exact.written.until(same)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rack.backplane import semaphores
-from rack.backplane.fault_table import Entry, FaultEntry, FaultTable, Injection
+from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import FIELDS, TraceWriter
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
@@ -265,7 +265,7 @@ def test_a_fault_that_nothing_would_show_does_not_strike_a_queue(
     rack = link()
     entry = rack.fault(kind)
     rack.run(0, 8, lambda tick: 1)
-    assert (rack.taken, entry[Entry.COUNT]) == ([*range(1, 8)], 0)
+    assert (rack.taken, entry.count) == ([*range(1, 8)], 0)
 
 
 def forge(rack: QueueLink, tick: int) -> None:

@@ -15,7 +15,6 @@ from rack.backplane.operator_table import (
     OperatorTable,
     Request,
     RequestStage,
-    RequestWord,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
@@ -119,13 +118,12 @@ def test_a_command_whose_client_has_died_is_not_issued_and_says_so(
 ) -> None:
     segment = make_bus(mailbox(name="left.operator", writer="clock"), *BOARDS)
     rack, table = Controlled(segment), OperatorTable(segment)
-    claim = table.try_claim(Request(0, b"", tick=2))
-    assert claim is not None
+    claim = table.enter(Request(0, b"", tick=2))
     rack.controller.begin(1)
     claim.leave()
     rack.controller.begin(2)
-    assert claim.entry[RequestWord.GIVEN_TICK] == -1
-    assert claim.entry.stage is RequestStage.WAITING
+    assert claim.entry.given_tick == -1
+    assert claim.entry.stage == RequestStage.WAITING
     assert segment.words[System.COMMANDED] == 0
     # Left out for good: the clock has no more to do with it.
     assert not table.waiting()
@@ -146,8 +144,7 @@ def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     operator = open_observer(segment, "left.operator")
     goto = hold(box)
     goto.what = Operation.GOTO
-    claim = table.try_claim(Request(0, bytes(goto.raw)), Client.LEASES)
-    assert claim is not None
+    claim = table.enter(Request(0, bytes(goto.raw)), Client.LEASES)
     for tick in (1, 2, 3):
         rack.controller.begin(tick)
     assert operator.peek().value.what == Operation.GOTO

@@ -15,7 +15,7 @@ from tests.boards.test_modifications import TEXT as MODIFIED
 from tests.boards.test_queues import FAST, PLANNING, QUEUES
 from tests.boards.vector_racks import JOINTED
 from tests.snapshots import Snapshots
-from tests.whole_runs import whole_run
+from tests.whole_runs import in_short, whole_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 SNAPSHOTS = Snapshots(__file__)
@@ -42,8 +42,8 @@ CASES: dict[str, tuple[str, tuple[str, ...]]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_a_small_rack_leaves_what_it_left_before(case: str, config: MakeConfig) -> None:
     text, settings = CASES[case]
-    SNAPSHOTS.check(case, whole_run(config(*settings, text=text), SECONDS))
+    SNAPSHOTS.check(case, in_short(whole_run(config(*settings, text=text), SECONDS)))
 
 
 def test_a_rack_of_tables_leaves_what_it_left_before(config: MakeConfig, tmp_path: Path) -> None:
-    SNAPSHOTS.check("tables", whole_run(config(text=counting(tmp_path)), SECONDS))
+    SNAPSHOTS.check("tables", in_short(whole_run(config(text=counting(tmp_path)), SECONDS)))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, System
@@ -61,7 +61,7 @@ def test_a_fault_begins_at_the_next_tick_and_says_which(running: str) -> None:
     assert (answer["kind"], answer["board"]) == ("kill", "wave")
     # It comes back, for the next test.
     entry = FaultTable(segment).entries[answer["fault"]]
-    wait_until(lambda: entry[Entry.COUNT] and UtilityLines(segment).bad_inputs == [])
+    wait_until(lambda: entry.count and UtilityLines(segment).bad_inputs == [])
 
 
 @pytest.mark.slow
@@ -274,4 +274,4 @@ def test_a_clock_that_gives_out_no_tick_begins_no_fault(
                 {"board": "lower", "kind": "kill"}, wait=False
             )
         (entry,) = FaultTable(launched.segment).staged((Stage.WAITING,))
-        assert entry[Entry.FROM] == -1
+        assert entry.tick == -1

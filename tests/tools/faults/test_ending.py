@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from rack.backplane.fault_table import Entry, FaultTable, Injection, Stage
+from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import MessageType, State
@@ -117,7 +117,7 @@ def test_strikes_are_the_table_s_and_a_kill_from_outside_is_one_too(
     joint = tuple(1.0 if p.name == "joint" else 0.25 for p in bias.parameters)
     injected = Injection(bias.number, 1, tick=40, ticks=400, seed=7, parameters=joint)
     begun, waits = table.add(injected), table.add(Injection(mute.number, 0, mailbox=0, tick=90))
-    begun.words[Entry.STAGE] = Stage.ACTIVE
+    begun.stage = Stage.ACTIVE
     begun.acted(43)
     first, second = strikes(segment, JOINTS)
     assert (first.kind, first.board, first.began, first.tick, first.count) == (

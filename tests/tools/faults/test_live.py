@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.fault_table import NEVER, Entry, FaultTable, Stage
+from rack.backplane.fault_table import NEVER, FaultTable, Stage
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Run, System
 from rack.boards.config import load, resolve
@@ -32,16 +32,16 @@ class Running:
 
     def begin(self, number: int, until: int = TICK + 9) -> None:
         """Begin a fault, as the clock does."""
-        words = self.table.entries[number].words
-        words[Entry.FROM] = TICK + 1
-        words[Entry.UNTIL] = until
-        words[Entry.STAGE] = Stage.ACTIVE
+        entry = self.table.entries[number]
+        entry.tick = TICK + 1
+        entry.until = until
+        entry.stage = Stage.ACTIVE
 
     def end(self, number: int, acted: int = 3) -> None:
         """End it."""
-        words = self.table.entries[number].words
-        words[Entry.COUNT] = acted
-        words[Entry.STAGE] = Stage.OVER
+        entry = self.table.entries[number]
+        entry.count = acted
+        entry.stage = Stage.OVER
 
     def serve(self) -> None:
         """Begin the first fault as soon as it waits, and end it."""
@@ -98,7 +98,7 @@ def test_one_with_a_tick_to_come_is_armed_and_can_be_withdrawn(rack: Running) ->
     ticks = iter((TICK + 1, TICK + 2))
 
     def tick() -> None:
-        wait_until(lambda: rack.table.entries[0][Entry.FROM] == NEVER)
+        wait_until(lambda: rack.table.entries[0].tick == NEVER)
         for now in ticks:
             rack.segment.words[System.TICK] = now
 
@@ -114,7 +114,7 @@ def test_one_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
     rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
 
     def begin() -> None:
-        wait_until(lambda: rack.table.entries[0][Entry.FROM] == NEVER)
+        wait_until(lambda: rack.table.entries[0].tick == NEVER)
         rack.begin(0)
         rack.segment.words[System.TICK] = TICK + 2
 
@@ -177,12 +177,12 @@ def test_the_table_has_what_each_waits_for_and_no_numbers_that_are_not_known(
     for tick in (TICK + 1, TICK + 2):
         rack.live.inject({"board": "lower", "kind": "kill", "tick": tick}, False)
     rack.begin(1)
-    entry = rack.table.entries[1].words
-    entry[Entry.STRUCK_TICK] = 0
+    entry = rack.table.entries[1]
+    entry.struck_tick = 0
     _, first, second = map(str.rstrip, rack.live.text())
     numbers = first.removesuffix(f"  tick {TICK + 1}; the rack is at tick {TICK}").split()
     assert numbers[-5:] == ["waiting", str(TICK + 1), "-", "-", "0"]
     # Begins, first acted, until, acted.
     assert second.split()[-4:] == [str(TICK + 1), "0", str(TICK + 9), "0"]
     # Two faults of one run do not draw the same random numbers.
-    assert rack.table.entries[0][Entry.SEED] != rack.table.entries[1][Entry.SEED]
+    assert rack.table.entries[0].seed != rack.table.entries[1].seed

@@ -57,7 +57,7 @@ class ByHand(Display):
         self._given = [*given]
         self._client = client
         self._segment: Segment | None = None
-        self._claims: list[RequestClaim | None] = []
+        self._claims: list[RequestClaim] = []
 
     def show(self, snapshot: Snapshot) -> None:
         """Command what is due, and step the rack to the next command."""
@@ -68,12 +68,12 @@ class ByHand(Display):
             return
         if self._given and words[System.HELD] - 1 == self._given[0].tick:
             now = replace(self._given.pop(0), tick=-1)
-            self._claims.append(OperatorTable(self._segment).try_claim(now, self._client))
+            self._claims.append(OperatorTable(self._segment).enter(now, self._client))
         words[System.HOLD_AT] = self._given[0].tick + 1 if self._given else 0
 
     def close(self) -> None:
         """Leave the rack."""
-        for claim in filter(None, self._claims):
+        for claim in self._claims:
             claim.leave()
         if self._segment is not None:
             self._segment.close()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.fault_table import Entry, FaultTable, Stage
+from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import State
 from rack.backplane.segment import Segment, unlink
@@ -96,7 +96,7 @@ def test_a_fault_is_shown_while_it_is_active(segment: Segment) -> None:
     entry = FaultTable(segment).entries[0]
     seen = []
     for stage in (Stage.WAITING, Stage.ACTIVE, Stage.OVER):
-        entry.words[Entry.STAGE] = stage
+        entry.stage = stage
         seen.append(RackMonitor(segment).look().faults)
     assert seen == [(), ("mute of lower",), ()]
 

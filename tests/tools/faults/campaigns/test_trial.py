@@ -59,7 +59,7 @@ def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(
 ) -> None:
     with forked(lambda: time.sleep(BOUND_S)) as pid:
         segment = bus(make_bus, pid)
-        block, place = segment.block("level"), Block[word]
+        block, place = segment.block("level"), getattr(Block, word)
         sound, block[place] = block[place], TaskState.STARTING if word == "STATE" else 1
         killer = Killer(segment, [Kill(board="level", tick=0, phase=0.0)])
         killer.advance()
@@ -128,7 +128,7 @@ class Run:
     to, unless it is `stuck`."""
 
     def __init__(self, pace: int, now: list[float], stuck: bool = False) -> None:
-        self.words = [0] * (max(System) + 1)
+        self.words = [0] * (System.SYSFAIL + 1)
         self.segment = SimpleNamespace(words=self.words)
         self.config = SimpleNamespace(clock_ns=PERIOD_NS)
         self.stopped: list[str] = []
