@@ -22,9 +22,9 @@ import zenoh
 
 from rack.backplane.json_text import encode_json
 from rack.boards.lan.access import access_control
-from rack.boards.lan.config import Credential, LanTable
-from rack.boards.lan.endpoint import Endpoint
-from rack.boards.lan.envelope import MOST_ENVELOPE, Sealer
+from rack.boards.lan.config import LanTable
+from rack.boards.lan.endpoint import Endpoint, endpoints_of, has_tls
+from rack.boards.lan.envelope import MOST_ENVELOPE, Credential, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
 
@@ -211,10 +211,10 @@ def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
 def _settings(
     rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
-    timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
+    timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if has_tls(table) else ""
     shortest, longest = RETRY_MS
     protocols = {
-        SOCKET if endpoint.is_private else endpoint.protocol for _, endpoint in table.endpoints
+        SOCKET if endpoint.is_private else endpoint.protocol for endpoint in endpoints_of(table)
     }
     settings: dict[str, Any] = {
         "mode": "peer",
@@ -254,7 +254,7 @@ def _settings(
             table.lease_ms * 1e3
         ),
     }
-    if credentials is not None and table.has_tls:
+    if credentials is not None and has_tls(table):
         settings["transport/link/tls"] = _tls(credentials)
     config = zenoh.Config()
     for key, value in settings.items():
