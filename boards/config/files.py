@@ -88,20 +88,6 @@ def named_classes(tables: Tables) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
 
 
-def read(name_or_path: str | Path) -> Tables:
-    """Return the tables of a config, merged with those of the files that it extends.
-
-    A name means a bundled config, or else one in the current folder; text that contains '/' or ends
-    in '.toml' is a path, if it is no name as `names` lists them, or such a file exists. Raises
-    `ConfigError`.
-    """
-    mistakes: list[Mistake] = []
-    tables = _read(_path(name_or_path, "config", CONFIGS), (), {}, mistakes)
-    if mistakes:
-        raise ConfigError(mistakes)
-    return tables
-
-
 def with_faults(tables: Tables, name_or_path: str | Path, own: Path) -> Tables:
     """Return config tables with the faults of a script appended.
 

@@ -125,12 +125,28 @@ class LanLink:
         put = publisher.put
         return lambda payload, envelope: put(payload, attachment=envelope)
 
+    def _channel(
+        self, declare: Callable[..., Any], key: str, unread: int, **options: bool
+    ) -> Callable[[], Iterator[Any]]:
+        """Declare something whose messages wait in a channel; return a function that yields those
+        that have come since its last call, oldest first."""
+        channel = declare(key, zenoh.handlers.RingChannel(unread), **options)
+        self._kept.append(channel)
+
+        def waiting() -> Iterator[Any]:
+            # No more than may wait: a flood must not keep the cycle.
+            for _ in range(unread):
+                if (found := channel.try_recv()) is None:
+                    return
+                yield found
+
+        return waiting
+
     def subscribe(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Arrived]]:
         """Return a function that yields what has come under a key expression since the last call,
         oldest first."""
-        subscriber = self.session.declare_subscriber(key, zenoh.handlers.RingChannel(unread))
-        self._kept.append(subscriber)
-        return lambda: map(Arrived.of, _waiting(subscriber, unread))
+        waiting = self._channel(self.session.declare_subscriber, key, unread)
+        return lambda: map(Arrived.of, waiting())
 
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
         """Call a function in a thread of the network with everything that comes under a key
@@ -150,11 +166,10 @@ class LanLink:
 
         A question under several keys at once is dropped unanswered.
         """
-        queryable = self.session.declare_queryable(key, zenoh.handlers.RingChannel(unread))
-        self._kept.append(queryable)
+        waiting = self._channel(self.session.declare_queryable, key, unread)
 
         def questions() -> Iterator[Question]:
-            for query in _waiting(queryable, unread):
+            for query in waiting():
                 with query:
                     asked = str(query.key_expr)
                     content = _bytes_of(query.payload) or b""
@@ -173,13 +188,11 @@ class LanLink:
     def watch_alive(self, unread: int = UNREAD) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields rack, launch, and whether it has come or gone, of others,
         oldest first."""
-        subscriber = self.session.liveliness().declare_subscriber(
-            ALL_ALIVE, zenoh.handlers.RingChannel(unread), history=True
-        )
-        self._kept.append(subscriber)
+        declare = self.session.liveliness().declare_subscriber
+        waiting = self._channel(declare, ALL_ALIVE, unread, history=True)
 
         def changes() -> Iterator[tuple[str, int, bool]]:
-            for sample in _waiting(subscriber, unread):
+            for sample in waiting():
                 key = str(sample.key_expr)
                 if (found := launch_and_cycle(key)) is not None:
                     yield key.split("/")[1], found[0], sample.kind == zenoh.SampleKind.PUT
@@ -189,15 +202,6 @@ class LanLink:
     def close(self) -> None:
         """Leave the network: others see it at once."""
         self.session.close()  # type: ignore[no-untyped-call]
-
-
-def _waiting(channel: Any, most: int) -> Iterator[Any]:
-    """Yield what waits in a channel, oldest first."""
-    # No more than may wait: a flood must not keep the cycle.
-    for _ in range(most):
-        if (found := channel.try_recv()) is None:
-            return
-        yield found
 
 
 def _bytes_of(content: zenoh.ZBytes | None) -> bytes | None:

@@ -266,7 +266,7 @@ def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
 def credential_mistakes(config: RackConfig) -> Mistakes:
     """Yield what is wrong with the files of the credentials on this machine, now."""
     table = config.adapter.lan
-    if table is None or table.certificates is None or any(_endpoints(table)):
+    if table is None or table.certificates is None:
         return
     try:
         from rack.boards.lan.credentials import Credentials
@@ -274,7 +274,7 @@ def credential_mistakes(config: RackConfig) -> Mistakes:
         why = "cannot be checked without 'cryptography': install nasrem-rack[lan]"
         yield Mistake(f"{PLACE}.certificates", table.certificates, why)
         return
-    heard = [Endpoint.of(text) for text in table.listen]
+    heard = [end for end in endpoints_of(table) if str(end) in table.listen]
     addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
         # The file first: a long path is cut short.

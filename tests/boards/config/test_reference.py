@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rack.boards.config import CONFIGS, FAULTS, load, names
-from rack.boards.config.files import read, with_faults
+from rack.boards.config.files import assembled, with_faults
 from rack.boards.config.reference import Key, find_tables, key_tables
 from rack.boards.errors import ConfigError
 from rack.levels.servo.control import ServoParams
@@ -86,7 +86,7 @@ def general(place: str, known: Iterable[str]) -> str:
 @pytest.mark.parametrize("name", names())
 def test_the_reference_has_every_key_of_every_shipped_config(name: str) -> None:
     known = reference(name)
-    tables = read(name)
+    tables = assembled(name, (), None)
     assert {
         (at, key) for at, key in used(tables) if key not in known.get(general(at, known), {})
     } == set()

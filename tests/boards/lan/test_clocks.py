@@ -39,7 +39,6 @@ from rack.boards.lan.clocks import (
     ClockOffset,
     Clocks,
     PeerClock,
-    Responder,
     RoundTrip,
 )
 from rack.boards.lan.credentials import Credentials
@@ -251,13 +250,17 @@ class Answers:
         return lambda payload, envelope: self.sent.append(key)
 
 
+def clocks_of(segment: Segment) -> Clocks:
+    return Clocks(segment, Peers([]), 1, OwnGrid(segment, 1))
+
+
 def ping(asker: str, sealer: Sealer, to: str) -> Arrived:
     key = f"rack/{asker}/ping/{to}"
     return Arrived(key, sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b""), b"")
 
 
 def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
-    responder, network, sealer = Responder(segment, 1), Answers(), Sealer()
+    responder, network, sealer = clocks_of(segment), Answers(), Sealer()
     responder.open(network, sealer)  # type: ignore[arg-type]
     began = time.monotonic_ns()
     for _ in range(1000):
@@ -279,7 +282,7 @@ def test_a_ping_with_a_seal_of_another_rack_gets_no_answer(
     own, asker, stranger = (
         Sealer(Credentials(tmp_path, name)) for name in (segment.rack, "asker", "stranger")
     )
-    responder, network = Responder(segment, 1), Answers()
+    responder, network = clocks_of(segment), Answers()
     responder.open(network, own)  # type: ignore[arg-type]
     responder._on_ping(ping("asker", stranger, segment.rack))
     assert network.sent == []
