@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from enum import IntEnum
 
+from rack.backplane.bounded_toml import load_toml
 from rack.backplane.checked import as_named, pick
+from rack.backplane.errors import DamageError
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
@@ -42,10 +44,13 @@ def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
     for task in segment.layout.tasks:
         if word := segment.block(task.name)[Block.AWAITS]:
             # Only here: it takes a while to import.
-            from rack.boards.config.published import PublishedRack
+            from rack.boards.lan.config import LanTable
 
             why, place = divmod(word - 1, 1 << _PLACES)
-            level = PublishedRack.of_rack(segment).levels.get(task.board)
-            names = () if level is None else level.names
-            rack = pick(names, place, "rack")
+            table = load_toml(segment.config).get("adapter", {}).get(task.board)
+            if table is None:
+                raise DamageError(f"'{task.board}' waits for another rack and is no adapter")
+            keys = {field.alias or name for name, field in LanTable.model_fields.items()}
+            racks = LanTable.model_validate({key: table[key] for key in keys & table.keys()}).racks
+            rack = pick(racks, place, "rack")
             yield task.board, f"waits for rack '{rack}': {_TEXTS[as_named(Why, why)]}"

@@ -3,6 +3,7 @@ rules."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
@@ -14,6 +15,8 @@ from rack.levels.tables import Positive, Table
 
 FASTEST_HZ = 50.0
 """Fastest exchange over a network."""
+MOST_CHAIN = 8192
+"""Bytes of a rack's certificates in DER form, as they travel with its seals."""
 OnPeerLoss = Literal["hold", "stop", "go on"]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
@@ -25,6 +28,15 @@ TypeName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]
 ENDPOINT_NOTE = (
     "as in tls/192.168.1.5:7447, or on one machine unix/cell: a socket that only this user reaches"
 )
+
+
+class Credential(Exception):
+    """A file of `certificates` that cannot be used: its path, and why."""
+
+    def __init__(self, path: Path, why: str) -> None:
+        super().__init__(f"{path}: {why}")
+        self.path = path
+        self.why = why
 
 
 class ExportConfig(Table):

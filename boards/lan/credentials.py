@@ -48,7 +48,7 @@ from cryptography.x509.verification import (
 )
 
 from rack.backplane.regular_file import read_regular_file
-from rack.boards.lan.envelope import MOST_CHAIN, Credential
+from rack.boards.lan.config import MOST_CHAIN, Credential
 
 AUTHORITY = "authority.pem"
 MAX_CREDENTIAL_BYTES = 100_000

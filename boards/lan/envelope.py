@@ -17,34 +17,23 @@ from collections.abc import Iterable
 from enum import IntEnum
 from hashlib import sha256
 from hmac import compare_digest
-from pathlib import Path
 from struct import Struct
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
 
+from rack.boards.lan.config import MOST_CHAIN
 from rack.boards.lan.keys import sender_of
 
 if TYPE_CHECKING:
     from rack.boards.lan.credentials import Credentials
 
-MOST_CHAIN = 8192
-"""Bytes of a rack's certificates in DER form, as they travel with its seals."""
 _HEAD = Struct("<4sIHQQQQqqq")
 _MAGIC = b"RLN2"
 MOST_SEAL = 72
 """Bytes of the longest seal."""
 MOST_ENVELOPE = _HEAD.size + MOST_CHAIN + MOST_SEAL
-
-
-class Credential(Exception):
-    """A file of `certificates` that cannot be used: its path, and why."""
-
-    def __init__(self, path: Path, why: str) -> None:
-        super().__init__(f"{path}: {why}")
-        self.path = path
-        self.why = why
 
 
 class Envelope(NamedTuple):

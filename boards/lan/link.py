@@ -22,9 +22,9 @@ import zenoh
 
 from rack.backplane.json_text import encode_json
 from rack.boards.lan.access import access_control
-from rack.boards.lan.config import LanTable
+from rack.boards.lan.config import Credential, LanTable
 from rack.boards.lan.endpoint import Endpoint, endpoints_of, has_tls
-from rack.boards.lan.envelope import MOST_ENVELOPE, Credential, Sealer
+from rack.boards.lan.envelope import MOST_ENVELOPE, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
 

@@ -22,6 +22,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import NameOID
 
 from rack.backplane.rack_name import RACK_NAME
+from rack.boards.lan.config import Credential
 from rack.boards.lan.credentials import (
     AUTHORITY,
     OWNER_ONLY,
@@ -30,7 +31,6 @@ from rack.boards.lan.credentials import (
     load_private_key,
 )
 from rack.boards.lan.endpoint import Endpoint
-from rack.boards.lan.envelope import Credential
 from rack.tools.console.answer import Failure
 
 AUTHORITY_KEY = "authority-key.pem"

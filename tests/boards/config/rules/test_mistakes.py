@@ -52,17 +52,8 @@ MISTAKES = {
         "board.lower.above=uper",
         'board.lower.above = "uper": no other board has this name; boards: upper',
     ),
-    "circle below": (
-        "board.lower.below=upper",
-        (
-            'board.lower.below = "upper": the levels form a circle, upper -> lower -> upper; the'
-            " lowest level has no below"
-        ),
-    ),
-    "circle above": (
-        "board.upper.above=lower",
-        "a circle, upper -> lower -> upper; the highest level has no above",
-    ),
+    "circle below": ("board.lower.below=upper", "the levels form a circle, "),
+    "circle above": ("board.upper.above=lower", "the levels form a circle, "),
     "truth for a number": (
         "clock.period_ms=true",
         "clock.period_ms = true: should be a valid number; tick period, ms",
