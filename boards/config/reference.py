@@ -132,8 +132,8 @@ def _walk(schema: Schema, known: Schema, name: str, path: str, heading: str) -> 
             keys.append(_key(key, entry, key in schema.get("required", ())))
     if keys:
         yield KeyTable(name, heading, _summary(schema.get("description", "")), tuple(keys))
-    for found in inner:
-        yield from _walk(found[0], known, *found[1:])
+    for entry, at, below, title in inner:
+        yield from _walk(entry, known, at, below, title)
 
 
 def _inner(

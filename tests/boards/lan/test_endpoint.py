@@ -28,6 +28,7 @@ def test_an_endpoint_has_a_protocol_a_host_and_a_port(
     "text",
     [
         *("udp/a:1", "tcp/a", "tcp/a:", "tcp/a:0", "tcp/a:65536", "tcp/a:1 ", "tcp/:1", "tcp/ü:1"),
+        *("", "a:1", "tcp/a:1?rel=0", "tcp/a b:1", "tcp/2130706433:1"),
         *("unix/", "unix/../cell", "unix//tmp/cell", "unix/cell:1"),
         # Resolvers would take these for addresses.
         *("tcp/127.1:1", "tcp/300:1", "tcp/1.2.3.400:1", "tcp/[1::2::3]:1"),

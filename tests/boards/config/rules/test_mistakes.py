@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, names, resolve
+from rack.boards.config import load, resolve
 from rack.boards.errors import ConfigError, Mistake
 
 Write = Callable[[str, str], Path]
@@ -444,9 +444,3 @@ def test_a_users_own_level_declares_its_program(small: Path) -> None:
     assert [str(mistake) for mistake in found] == [
         "task.count[1] = -2: nothing to count; objects: none"
     ]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", names())
-def test_the_shipped_racks_have_no_mistakes(name: str) -> None:
-    assert resolve(load(name))
