@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.backplane.rack_name import RACK_NAME
-from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
+from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, portable, with_texts
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.toml import to_toml
@@ -523,9 +523,7 @@ class RackConfig(Table):
         tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:
             tables["robot"]["model"] = portable(self.robot.model)
-        tables["board"] = {
-            name: with_table_files(board, lambda file: portable(Path(file)))
-            for name, board in tables["board"].items()
-            if name != LAN or self.adapter.lan is None
-        }
+        if self.adapter.lan is not None:
+            tables["board"].pop(LAN, None)
+        tables = with_texts(tables, STATE_TABLES, lambda file: portable(Path(file)))
         return to_toml(tables)
