@@ -157,7 +157,8 @@ def anchor(tables: Tables, folder: Path) -> Tables:
     tables = with_texts(tables, ("adapter", ANY, "certificates"), lambda text: str(folder / text))
     racks = ("adapter", ANY, "launch")
     tables = with_texts(tables, racks, lambda text: str(_find(text, folder) or text))
-    return with_texts(tables, STATE_TABLES, find)
+    anchored: Tables = with_texts(tables, STATE_TABLES, find)
+    return anchored
 
 
 def with_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:

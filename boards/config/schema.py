@@ -210,8 +210,7 @@ class PlacedConfig(Table):
     core: Core = 0
     """core of the board; if the machine lacks it, another core is used"""
     priority: Priority = 0
-    """SCHED_FIFO priority of the executor; 0: ordinary scheduling; the network adapter's is above
-    the other boards' of its core"""
+    """SCHED_FIFO priority of the executor; 0: ordinary scheduling"""
     budget: BudgetConfig | None = None
     """worst-case processor times, for the timing model"""
     restarts: Restarts | None = None
