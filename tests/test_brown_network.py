@@ -143,7 +143,7 @@ def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_o
     assert run.values("shoulder.status", "reason", 2000, 2000).tolist() == [b"modified by pd"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_both_racks_repeat_bit_for_bit(run: Ran, name: str, tmp_path: Path) -> None:
     assert ran(name, tmp_path).digests == run.digests
 

@@ -40,8 +40,6 @@ from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.peer import PEER, peer_port
 from rack.levels.tables import read_params
 
-TOKENS = 1024
-"""Racks that may come or go between two cycles of the adapter."""
 _LAUNCH_MASK = (1 << 62) - 1
 
 
@@ -246,7 +244,7 @@ class LanAdapter(Adapter):
             barrier.open(link, self._launch)
             self._recall(barrier)
         self._peers.watch(
-            link.watch_alive(TOKENS) if barrier is None else barrier.changes, barrier is not None
+            link.watch_alive() if barrier is None else barrier.changes, barrier is not None
         )
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 UNREAD = 32
 """Messages of one import that wait for a cycle, at most; a newer one overwrites the oldest."""
+TOKENS = 1024
+"""Racks that may come or go between two cycles of an adapter."""
 RETRY_MS = (50, 200)
 """Shortest and longest time between two attempts to connect."""
 KEEP_ALIVES = 4
@@ -142,10 +144,10 @@ class LanLink:
 
         return waiting
 
-    def subscribe(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Arrived]]:
+    def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
         """Return a function that yields what has come under a key expression since the last call,
         oldest first."""
-        waiting = self._channel(self.session.declare_subscriber, key, unread)
+        waiting = self._channel(self.session.declare_subscriber, key, UNREAD)
         return lambda: map(Arrived.of, waiting())
 
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
@@ -185,11 +187,11 @@ class LanLink:
             self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
         )
 
-    def watch_alive(self, unread: int = UNREAD) -> Callable[[], Iterator[tuple[str, int, bool]]]:
+    def watch_alive(self) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields rack, launch, and whether it has come or gone, of others,
         oldest first."""
         declare = self.session.liveliness().declare_subscriber
-        waiting = self._channel(declare, ALL_ALIVE, unread, history=True)
+        waiting = self._channel(declare, ALL_ALIVE, TOKENS, history=True)
 
         def changes() -> Iterator[tuple[str, int, bool]]:
             for sample in waiting():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -82,8 +83,16 @@ def general(place: str, known: Iterable[str]) -> str:
     return next(filter(fits, known), place)
 
 
+ALIKE = re.compile(r".*three-poses|nasrem-1khz|fig[34].*|crossing|k1607|nist-state-table/direct")
+"""Racks whose boards other racks have as well."""
+EACH_RACK = [
+    pytest.param(name, marks=pytest.mark.thorough if ALIKE.fullmatch(name) else ())
+    for name in names()
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", EACH_RACK)
 def test_the_reference_has_every_key_of_every_shipped_config_with_meaning_and_unit(
     name: str,
 ) -> None:
