@@ -15,7 +15,7 @@ from rack.boards.config import load, resolve
 from rack.boards.errors import ConfigError
 from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.forger import FORGED, LATER
-from tests.boards.lan.racks import configs, endpoints, rack_text, started
+from tests.boards.lan.racks import LAUNCH_S, configs, endpoints, rack_text, started
 from tests.boards.lan.test_strangers import running
 from tests.processes import wait_until
 
@@ -53,7 +53,7 @@ def taken(rack: str) -> int:
 def test_racks_exchange_mailboxes(names: list[str], tmp_path: Path) -> None:
     with ExitStack() as stack:
         racks = [stack.enter_context(started(tmp_path / f"rack-{at}.toml")) for at in range(2)]
-        wait_until(lambda: all(taken(name) > 3 for name in names))
+        wait_until(lambda: all(taken(name) > 3 for name in names), LAUNCH_S)
         for rack in racks:
             rack.send(signal.SIGTERM)
         for rack in racks:
@@ -83,7 +83,7 @@ def test_a_rack_that_speaks_in_the_name_of_another_is_refused(
     with ExitStack() as stack:
         for k in range(2):
             stack.enter_context(started(tmp_path / f"rack-{k}.toml"))
-        wait_until(lambda: taken(names[1]) > ROUNDS)
+        wait_until(lambda: taken(names[1]) > ROUNDS, LAUNCH_S)
         members = [str(tmp_path / "certs"), "forger", names[0]]
         forger = stack.enter_context(running("forger", *members, *at))
         wait_until(lambda: forger.state()["forged"] > ROUNDS)
