@@ -9,7 +9,6 @@ the next lab removes.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -19,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from rack.backplane.process import is_alive, readable, start_time
 from rack.tools.console.answer import Failure
@@ -37,15 +36,6 @@ PATIENCE_S = 30.0
 LINK = "lan"
 """The network interface of every machine."""
 _NUMBERS = count()
-
-
-class Traffic(NamedTuple):
-    """What one machine has sent and received so far, Ethernet headers included."""
-
-    sent_bytes: int
-    received_bytes: int
-    sent_packets: int
-    received_packets: int
 
 
 class Lab:
@@ -153,24 +143,6 @@ class Lab:
     def plug(self, machine: int) -> None:
         """Plug the cable of a machine in again."""
         _ip([f"link set {_cable(machine)} up"], self._hub)
-
-    def traffic(self) -> list[Traffic]:
-        """Return what each machine has sent and received."""
-        links = {
-            link["ifname"]: link["stats64"]
-            for link in json.loads(_call(_SHOW.format(self._hub).split()))
-        }
-        # The bridge receives what the machine sends.
-        ways = [
-            (stats["rx"], stats["tx"])
-            for stats in (links[_cable(number)] for number in range(len(self)))
-        ]
-        return [
-            Traffic(out["bytes"], to["bytes"], out["packets"], to["packets"]) for out, to in ways
-        ]
-
-
-_SHOW = "ip -netns {} -json -stats link show"
 
 
 def _cable(machine: int) -> str:

@@ -21,6 +21,9 @@ FAULTS = CONFIGS / "faults"
 MAX_FILE_BYTES = 1_000_000
 LAN_ADAPTER = "rack.boards.lan.adapter:LanAdapter"
 """Class of the board that `[adapter.lan]` adds."""
+ANY = "*"
+STATE_TABLES = ("board", ANY, "params", "tables", ANY)
+"""Place of the files of levels' state tables; `ANY` stands for any key."""
 EXTENDS = "configs that this file extends, by name or path, in order; its own keys override theirs"
 """Meaning of `extends`, the one key that only files have."""
 
@@ -88,20 +91,6 @@ def named_classes(tables: Tables) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
 
 
-def read(name_or_path: str | Path) -> Tables:
-    """Return the tables of a config, merged with those of the files that it extends.
-
-    A name means a bundled config, or else one in the current folder; text that contains '/' or ends
-    in '.toml' is a path, if it is no name as `names` lists them, or such a file exists. Raises
-    `ConfigError`.
-    """
-    mistakes: list[Mistake] = []
-    tables = _read(_path(name_or_path, "config", CONFIGS), (), {}, mistakes)
-    if mistakes:
-        raise ConfigError(mistakes)
-    return tables
-
-
 def with_faults(tables: Tables, name_or_path: str | Path, own: Path) -> Tables:
     """Return config tables with the faults of a script appended.
 
@@ -157,54 +146,39 @@ def file_at(path: Path) -> Path | None:
 
 
 def anchor(tables: Tables, folder: Path) -> Tables:
-    """Return the tables with absolute paths, resolved from `folder`, or for a bundled model from
+    """Return the tables with absolute paths, resolved from `folder`, or for a bundled file from
     configs/."""
-    anchored = dict(tables)
-    robot = _table(tables, "robot")
-    own = tables.get("python_path")
-    if isinstance(model := robot.get("model"), str):
-        anchored["robot"] = {**robot, "model": str(_find(model, folder) or folder / model)}
-    if isinstance(own, list) and all(isinstance(item, str) for item in own):
-        anchored["python_path"] = [str((folder / item).resolve()) for item in own]
-    if adapters := _table(tables, "adapter"):
-        anchored["adapter"] = {
-            name: _with_files(adapter, folder) for name, adapter in adapters.items()
-        }
-    if boards := _table(tables, "board"):
-        anchored["board"] = {
-            name: with_table_files(board, lambda file: str(_find(file, folder) or folder / file))
-            for name, board in boards.items()
-        }
+
+    def find(text: str) -> str:
+        return str(_find(text, folder) or folder / text)
+
+    tables = with_texts(tables, ("robot", "model"), find)
+    tables = with_texts(tables, ("python_path",), lambda text: str((folder / text).resolve()))
+    tables = with_texts(tables, ("adapter", ANY, "certificates"), lambda text: str(folder / text))
+    racks = ("adapter", ANY, "launch")
+    tables = with_texts(tables, racks, lambda text: str(_find(text, folder) or text))
+    anchored: Tables = with_texts(tables, STATE_TABLES, find)
     return anchored
+
+
+def with_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:
+    """Return tables with `change` applied to the text at a place, or to each text of a list there;
+    whatever else is there stays."""
+    if keys and isinstance(value, dict):
+        key, *rest = keys
+        return {
+            name: with_texts(item, rest, change) if key in (name, ANY) else item
+            for name, item in value.items()
+        }
+    if not keys and isinstance(value, list):
+        return [with_texts(item, (), change) for item in value]
+    return change(value) if not keys and isinstance(value, str) else value
 
 
 def _table(tables: Tables, key: str) -> Tables:
     """Return the table of a key; an empty one if there is none, or something else."""
     found = tables.get(key)
     return found if isinstance(found, dict) else {}
-
-
-def _with_files(adapter: Any, folder: Path) -> Any:
-    """Return an adapter's table with the absolute paths of its certificates, and of the configs of
-    other racks, if it names any."""
-    if not isinstance(adapter, dict):
-        return adapter
-    found = dict(adapter)
-    if isinstance(own := adapter.get("certificates"), str):
-        found["certificates"] = str(folder / own)
-    if isinstance(racks := adapter.get("launch"), list):
-        found["launch"] = [str(_find(str(rack), folder) or rack) for rack in racks]
-    return found
-
-
-def with_table_files(board: Any, path: Callable[[str], str]) -> Any:
-    """Return a board's table with `path` applied to the files of its level's state tables, if it
-    has any."""
-    params = board.get("params") if isinstance(board, dict) else None
-    if not isinstance(params, dict) or not isinstance(files := params.get("tables"), dict):
-        return board
-    found = {name: path(file) if isinstance(file, str) else file for name, file in files.items()}
-    return {**board, "params": {**params, "tables": found}}
 
 
 def portable(model: Path) -> str:

@@ -270,7 +270,7 @@ class LayoutMaker:
             message=kind.name,
             version=kind.version,
             size=dtype.itemsize,
-            fields=_specs(kind, dtype),
+            fields=field_specs(kind, self._sizes),
             **times,
         )
 
@@ -278,11 +278,7 @@ class LayoutMaker:
 def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
     """Return the fields of a message type with offsets, shapes and numpy types, for tools that
     attach by name."""
-    return _specs(kind, kind.dtype(sizes))
-
-
-def _specs(kind: MessageType, of: np.dtype) -> tuple[FieldSpec, ...]:
-    offsets: Mapping[str, Any] = of.fields or {}
+    offsets: Mapping[str, Any] = kind.dtype(sizes).fields or {}
     specs = []
     for field in kind.fields:
         dtype, offset = offsets[field.name][:2]
@@ -291,7 +287,7 @@ def _specs(kind: MessageType, of: np.dtype) -> tuple[FieldSpec, ...]:
         inner: tuple[FieldSpec, ...] = ()
         if isinstance(field.kind, MessageType):
             type_name = f"V{scalar.itemsize}"
-            inner = _specs(field.kind, scalar)
+            inner = field_specs(field.kind, sizes)
         unit = field.unit
         values: tuple[tuple[str, int], ...] = ()
         if not isinstance(unit, str):

@@ -8,9 +8,9 @@ depend on the config.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
@@ -21,7 +21,7 @@ from rack.boards.config.rules.mailboxes import exchange, ports
 from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.wiring import Wiring
 from rack.boards.errors import ConfigError, shown
-from rack.boards.faults.kind import KINDS, Parameter
+from rack.boards.faults.kind import KINDS
 from rack.levels.tables import keys_of
 
 UNIT = re.compile(
@@ -31,8 +31,10 @@ UNIT = re.compile(
 )
 """The unit in a description: between a comma and the end, or further punctuation."""
 REQUIRED = "required"
-WHOLE = "rack"
-"""Name of the table for keys outside any table."""
+NAME = ".<name>"
+LEAST = {"minimum": "at least", "exclusiveMinimum": "above"}
+MOST = {"maximum": "at most", "exclusiveMaximum": "below"}
+"""Bounds of a number, as JSON schema calls them, and in words; the first one counts."""
 
 Schema = Mapping[str, Any]
 
@@ -59,23 +61,6 @@ class KeyTable:
     keys: tuple[Key, ...]
 
 
-class Place(NamedTuple):
-    """The place of a table in TOML: its path, whether it is an item of a list, and the key that
-    selects its variant."""
-
-    path: str
-    is_list: bool = False
-    variant: str = ""
-
-    @property
-    def heading(self) -> str:
-        """The heading of the table in TOML."""
-        if not self.path:
-            return "(top of the file)"
-        text = f"[[{self.path}]]" if self.is_list else f"[{self.path}]"
-        return f"{text} with {self.variant}" if self.variant else text
-
-
 class DescribedSchema(GenerateJsonSchema):
     """The JSON schema of a table, with the descriptions of its keys."""
 
@@ -93,15 +78,16 @@ def key_tables(config: RackConfig) -> list[KeyTable]:
     wiring = Wiring(config)
     if mistakes := [*ports(wiring), *exchange(wiring)]:
         raise ConfigError(mistakes)
-    whole, *found = _tables(RackConfig, WHOLE, Place(""))
+    whole, *found = _tables(RackConfig, "")
     extends = Key("extends", "list of strings", "", "", "", EXTENDS)
-    found = [replace(whole, keys=(extends, *whole.keys)), *found, *_fault_kinds()]
+    whole = KeyTable("rack", "(top of the file)", whole.meaning, (extends, *whole.keys))
+    found = [whole, *found, *_fault_kinds()]
     for program in wiring.programs:
-        found += _tables(program, "task", Place("task"))
+        found += _tables(program, "task")
     for board, params in wiring.params:
         # Of the network adapter's board the table is `[adapter.lan]`.
         if config.adapter.lan is None or board != f"board.{LAN}":
-            found += _tables(params, f"{board}.params", Place(f"{board}.params"))
+            found += _tables(params, f"{board}.params")
     return found
 
 
@@ -109,146 +95,120 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     """Return the table `name`, or all whose names begin with it. Raises `LookupError` with the
     existing tables."""
     known = {found.name: found for found in key_tables(config)}
-    wanted = name.strip("[]")
-    start, _, rest = wanted.partition(".")
-    board, _, rest = rest.partition(".")
-    is_own = bool(rest) and bool(_within(wanted, known))
-    if start in ("board", "host") and board in (*getattr(config, start), "<name>") and not is_own:
-        wanted = f"{start}.{rest}" if rest else start
-    found = [known[wanted]] if wanted in known else [known[name] for name in _within(wanted, known)]
-    if not found:
-        top = dict.fromkeys(name.partition(".")[0] for name in known)
-        raise LookupError(
-            f"no such table; tables: {', '.join(top)}, and others listed by 'rack schema'"
-        )
-    return found
+    parts = name.strip("[]").split(".")
+    tables = [".".join(parts)]
+    if (
+        parts[0] in ("board", "host")
+        and len(parts) > 1
+        and (parts[1] in (*getattr(config, parts[0]), "<name>"))
+    ):
+        # What all boards have in common is described once.
+        tables.append(".".join(parts[:1] + parts[2:]))
+    for table in tables:
+        if table in known:
+            return [known[table]]
+    if found := [known[name] for name in known if name.startswith(f"{tables[-1]}.")]:
+        return found
+    top = dict.fromkeys(name.partition(".")[0] for name in known)
+    raise LookupError(
+        f"no such table; tables: {', '.join(top)}, and others listed by 'rack schema'"
+    )
 
 
-def _within(name: str, known: Iterable[str]) -> list[str]:
-    """Return the names of a table and of those in it."""
-    return [other for other in known if f"{other}.".startswith(f"{name}.")]
-
-
-def _tables(model: type[BaseModel], name: str, place: Place) -> Iterator[KeyTable]:
+def _tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
     schema = model.model_json_schema(schema_generator=DescribedSchema)
-    yield from _walk(schema, schema.get("$defs", {}), name, place)
+    return _walk(schema, schema.get("$defs", {}), path, path, f"[{path}]")
 
 
-def _walk(schema: Schema, known: Schema, name: str, place: Place) -> Iterator[KeyTable]:
-    """Yield a table, then its subtables."""
-    properties = schema.get("properties", {})
-    required = schema.get("required", ())
-    inner = {key: list(_inner(entry, known, Place(key))) for key, entry in properties.items()}
-    keys = [
-        _key(key, properties[key], key in required) for key, found in inner.items() if not found
-    ]
+def _walk(schema: Schema, known: Schema, name: str, path: str, heading: str) -> Iterator[KeyTable]:
+    """Yield a table, then those in it."""
+    keys = []
+    inner = []
+    for key, entry in schema.get("properties", {}).items():
+        below = f"{path}.{key}".lstrip(".")
+        if found := list(_inner(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")):
+            inner += found
+        else:
+            keys.append(_key(key, entry, key in schema.get("required", ())))
     if keys:
-        yield KeyTable(name, place.heading, _summary(schema.get("description", "")), tuple(keys))
-    for key, found in inner.items():
-        for entry, at in found:
-            variant = at.variant.rpartition(" ")[2].strip('"')
-            parts = [key, variant] if name == WHOLE else [name, key, variant]
-            below = ".".join(filter(None, parts))
-            yield from _walk(
-                entry, known, below, at._replace(path=f"{place.path}.{at.path}".lstrip("."))
-            )
+        yield KeyTable(name, heading, _summary(schema.get("description", "")), tuple(keys))
+    for entry, at, below, title in inner:
+        yield from _walk(entry, known, at, below, title)
 
 
-def _inner(entry: Schema, known: Schema, at: Place) -> Iterator[tuple[Schema, Place]]:
-    """Yield the tables that a value may be or contain, each with its place."""
+def _inner(
+    entry: Schema, known: Schema, name: str, path: str, heading: str
+) -> Iterator[tuple[Schema, str, str, str]]:
+    """Yield the tables that a value may be or contain, each with its name, path and heading."""
     if "$ref" in entry:
-        yield known[entry["$ref"].rpartition("/")[2]], at
+        yield known[entry["$ref"].rpartition("/")[2]], name, path, heading
     for option in entry.get("anyOf", ()):
-        yield from _inner(option, known, at)
-    for value, ref in entry.get("discriminator", {}).get("mapping", {}).items():
-        variant = f'{entry["discriminator"]["propertyName"]} = "{value}"'
-        yield known[ref.rpartition("/")[2]], at._replace(variant=variant)
+        yield from _inner(option, known, name, path, heading)
+    kinds = entry.get("discriminator", {"mapping": {}})
+    for value, ref in kinds["mapping"].items():
+        chosen = f'{heading} with {kinds["propertyName"]} = "{value}"'
+        yield known[ref.rpartition("/")[2]], f"{name}.{value}", path, chosen
     if isinstance(entry.get("items"), dict):
-        yield from _inner(entry["items"], known, at._replace(is_list=True))
-    for held in (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values()):
-        if isinstance(held, dict):
-            yield from _inner(held, known, at._replace(path=f"{at.path}.<name>"))
+        yield from _inner(entry["items"], known, name, path, f"[[{path}]]")
+    for held in _named(entry):
+        yield from _inner(held, known, name, f"{path}{NAME}", f"[{path}{NAME}]")
+
+
+def _named(entry: Schema) -> Iterator[Schema]:
+    """Yield the schemas of the values of a table whose keys are names of the user's own."""
+    held = (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values())
+    yield from (found for found in held if isinstance(found, dict))
 
 
 def _key(name: str, entry: Schema, is_required: bool) -> Key:
     description = entry.get("description", "")
-    found = UNIT.search(description)
-    unit = found[1] if found else ""
+    unit = UNIT.search(description)
     given = entry.get("default")
     default = "" if given in (None, [], {}) else shown(given)
-    if is_required:
-        default = REQUIRED
+    options = [option for option in entry.get("anyOf", [entry]) if option.get("type") != "null"]
     return Key(
         name=name,
-        type=_type(entry),
-        unit=unit,
-        permitted=_permitted(entry),
-        default=default,
+        type=" or ".join(map(_type, options)),
+        unit=unit[1] if unit else "",
+        permitted=next(filter(None, map(_permitted, options)), ""),
+        default=REQUIRED if is_required else default,
         meaning=UNIT.sub("", description, count=1) + "; live: `rack set`" * ("live" in entry),
     )
 
 
-def _options(entry: Schema) -> list[Schema]:
-    return [option for option in entry.get("anyOf", [entry]) if option.get("type") != "null"]
+def _held(entry: Schema) -> Schema | None:
+    """Return the schema of the items of a list or table of like items; None for other types."""
+    places = (entry.get("items"), *entry.get("prefixItems", ()), *_named(entry))
+    return next((found for found in places if isinstance(found, dict)), None)
 
 
 def _type(entry: Schema) -> str:
-    return " or ".join(_type_of(option) for option in _options(entry))
-
-
-def _type_of(entry: Schema) -> str:
     kind = "path" if entry.get("format") == "path" else entry.get("type", "any")
     kind = {"array": "list", "object": "table"}.get(kind, kind)
     if (held := _held(entry)) is None:
         return kind
     count = f"{len(entry['prefixItems'])} " if "prefixItems" in entry else ""
-    return f"{kind} of {count}{_plural(held)}"
-
-
-def _held(entry: Schema) -> Schema | None:
-    """Return the schema of the items of a list or table of like items; None for other types."""
-    places = (entry.get("items"), *entry.get("prefixItems", ()), entry.get("additionalProperties"))
-    held = (*places, *entry.get("patternProperties", {}).values())
-    return next((found for found in held if isinstance(found, dict)), None)
-
-
-def _plural(entry: Schema) -> str:
-    first, _, rest = _type(entry).partition(" ")
-    return f"{first}s {rest}".rstrip()
+    options = held.get("anyOf", [held])
+    first, _, rest = " or ".join(map(_type, options)).partition(" ")
+    return f"{kind} of {count}{first}s {rest}".rstrip()
 
 
 def _permitted(entry: Schema) -> str:
-    return next((text for option in _options(entry) if (text := _range(option))), "")
-
-
-def _range(entry: Schema) -> str:
     """Return the permitted values of a type; for a list, those of its items."""
-    values = [entry["const"]] if "const" in entry else entry.get("enum")
-    if values:
-        return ", ".join(map(shown, values))
     if (held := _held(entry)) is not None:
-        count = (
-            f"{entry['minItems']} to {entry['maxItems']} items"
-            if "maxItems" in entry and "items" in entry
-            else ""
-        )
-        return "; ".join(filter(None, (count, _permitted(held))))
-    low, high, above, below = (
-        _number(entry[key]) if key in entry else ""
-        for key in ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum")
-    )
-    if low and high:
-        return f"{low} to {high}"
-    bounds = []
-    if low:
-        bounds.append(f"{low} or more")
-    elif above:
-        bounds.append(f"above {above}")
-    if high:
-        bounds.append(f"at most {high}")
-    elif below:
-        bounds.append(f"below {below}")
-    return ", ".join(bounds)
+        count = ""
+        if "maxItems" in entry and "items" in entry:
+            count = f"{entry['minItems']} to {entry['maxItems']} items"
+        return "; ".join(filter(None, (count, *map(_permitted, held.get("anyOf", [held])))))
+    if values := entry.get("enum", [entry["const"]] if "const" in entry else []):
+        return ", ".join(map(shown, values))
+    if {"minimum", "maximum"} <= entry.keys():
+        return f"{_number(entry['minimum'])} to {_number(entry['maximum'])}"
+    bounds = [
+        next((f"{word} {_number(entry[key])}" for key, word in kinds.items() if key in entry), "")
+        for kinds in (LEAST, MOST)
+    ]
+    return ", ".join(filter(None, bounds))
 
 
 def _number(value: float) -> str:
@@ -263,23 +223,21 @@ def _summary(docstring: str) -> str:
     return text[:1].lower() + text[1:]
 
 
-def _key_of(parameter: Parameter) -> Key:
-    kind = "integer" if parameter.is_whole else "number"
-    unit = "" if parameter.unit == "1" else parameter.unit
-    default = REQUIRED if parameter.default is None else _number(parameter.default)
-    permitted = f"{_number(parameter.least)} to {_number(parameter.most)}"
-    return Key(parameter.name, kind, unit, permitted, default, parameter.meaning)
-
-
 def _fault_kinds() -> Iterator[KeyTable]:
     """Yield a table for every kind of fault with parameters: the keys of its `[[fault]]` besides
     the common ones."""
     for kind in KINDS:
-        keys = [_key_of(parameter) for parameter in kind.parameters]
-        if keys:
-            yield KeyTable(
-                f"fault.{kind.name}",
-                f'[[fault]] with kind = "{kind.name}"',
-                kind.means,
-                tuple(keys),
+        keys = [
+            Key(
+                name=each.name,
+                type="integer" if each.is_whole else "number",
+                unit="" if each.unit == "1" else each.unit,
+                permitted=f"{_number(each.least)} to {_number(each.most)}",
+                default=REQUIRED if each.default is None else _number(each.default),
+                meaning=each.meaning,
             )
+            for each in kind.parameters
+        ]
+        if keys:
+            heading = f'[[fault]] with kind = "{kind.name}"'
+            yield KeyTable(f"fault.{kind.name}", heading, kind.means, tuple(keys))

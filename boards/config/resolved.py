@@ -533,12 +533,18 @@ def _broken(error: ValidationError) -> frozenset[str]:
     )
 
 
+def _without(tables: Tables, broken: frozenset[str]) -> Tables:
+    """Return tables without those with mistakes, as "robot" or "board.servo"."""
+    kept = {key: value for key, value in tables.items() if key not in broken}
+    for key in ("board", "host"):
+        own = kept.get(key, {})
+        kept[key] = {name: t for name, t in own.items() if f"{key}.{name}" not in broken}
+    return kept
+
+
 def _reduced(config: RackConfig, unsound: frozenset[str]) -> RackConfig:
     """Return a config without the boards and host boards that have mistakes."""
-    kept = {
-        key: {name: t for name, t in getattr(config, key).items() if f"{key}.{name}" not in unsound}
-        for key in ("board", "host")
-    }
+    kept = _without({"board": config.board, "host": config.host}, unsound)
     if "adapter" in unsound:
         kept["board"].pop(LAN, None)
     return config.model_copy(update=kept)
@@ -546,21 +552,9 @@ def _reduced(config: RackConfig, unsound: frozenset[str]) -> RackConfig:
 
 def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
     """Return a config made of the tables without mistakes."""
-    kept = {
-        key: value
-        for key, value in tables.items()
-        if key in RackConfig.model_fields and key not in broken
-    }
-    boards = {
-        name: table
-        for name, table in kept.get("board", {}).items()
-        if f"board.{name}" not in broken
-    }
-    hosts = {
-        name: table for name, table in kept.get("host", {}).items() if f"host.{name}" not in broken
-    }
+    kept = _without({key: tables[key] for key in RackConfig.model_fields if key in tables}, broken)
     # Stand-ins for required tables; nothing that depends on a broken table is checked.
     spare = {"name": "unnamed", "clock": {"period_ms": 1}}
     none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
-    config = RackConfig.model_validate({**spare, **kept, "board": boards or none, "host": hosts})
-    return config if boards else config.model_copy(update={"board": {}})
+    config = RackConfig.model_validate({**spare, **kept, "board": kept["board"] or none})
+    return config if kept["board"] else config.model_copy(update={"board": {}})

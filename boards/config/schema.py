@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.backplane.rack_name import RACK_NAME
-from rack.boards.config.files import LAN_ADAPTER, portable, with_table_files
+from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, portable, with_texts
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.toml import to_toml
@@ -202,21 +202,32 @@ class SupervisionConfig(Table):
         return self.lockstep_restart_s if lockstep else max(RESTART_S, self.lockstep_restart_s)
 
 
-class BoardConfig(Table):
-    """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
+class PlacedConfig(Table):
+    """Keys of a board in the crate, whether a level or the network adapter runs on it."""
 
     slot: Slot
     """slot in the crate; slot 1 is the clock's"""
     core: Core = 0
     """core of the board; if the machine lacks it, another core is used"""
+    priority: Priority = 0
+    """SCHED_FIFO priority of the executor; 0: ordinary scheduling"""
+    budget: BudgetConfig | None = None
+    """worst-case processor times, for the timing model"""
+    restarts: Restarts | None = None
+    """overrides supervision.restarts for this board's tasks"""
+    restarts_within_s: Positive | None = None
+    """overrides supervision.within_s for this board's tasks, s"""
+
+
+class BoardConfig(PlacedConfig):
+    """`[board.<name>]`: one processor of the rack, its level, and its wiring."""
+
     rate_hz: Positive | None = Field(None, ge=1e-6)
     """rate of the executor, Hz; must divide the clock rate; give either rate_hz or every"""
     every: int | None = Field(None, ge=1, le=LONGEST_EVERY)
     """instead of rate_hz: period of the executor, ticks"""
     phase: int = Field(0, ge=0)
     """first tick of the board, less than its period; its releases follow every period, ticks"""
-    priority: Priority = 0
-    """SCHED_FIFO priority of the executor; 0: ordinary scheduling"""
     wake: Wake | None = None
     """how this board waits for its next cycle; default: clock.wake"""
     above: Neighbours = ()
@@ -245,16 +256,10 @@ class BoardConfig(Table):
     """when the executor reads a port, by port; also records the ages of all its messages"""
     params: dict[str, Any] = {}
     """parameters of the level, declared by its class"""
-    budget: BudgetConfig | None = None
-    """worst-case processor times, for the timing model"""
     transfer: TransferConfig = TransferConfig()
     """emulation of a slower bus for this board"""
     ends_run: bool = False
     """end the run when this level's status is done or error"""
-    restarts: Restarts | None = None
-    """overrides supervision.restarts for this board's tasks"""
-    restarts_within_s: Positive | None = None
-    """overrides supervision.within_s for this board's tasks, s"""
     on_loss: OnLoss = "hold"
     """while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then
     brakes; brake: the arm brakes at once"""
@@ -264,24 +269,12 @@ LAN = "lan"
 """Name of the board that exchanges mailboxes with other racks."""
 
 
-class LanConfig(LanTable):
+class LanConfig(PlacedConfig, LanTable):
     """`[adapter.lan]`: the board that exchanges mailboxes with other racks: see
     `rack.boards.lan.adapter`."""
 
-    slot: Slot
-    """slot in the crate; slot 1 is the clock's"""
-    core: Core = 0
-    """core of the board; if the machine lacks it, another core is used"""
     rate_hz: Positive = Field(50.0, ge=1e-6)
     """rate of the board, Hz; must divide the clock rate"""
-    priority: Priority = 0
-    """SCHED_FIFO priority, above the other boards' of its core; 0: ordinary"""
-    budget: BudgetConfig | None = None
-    """worst-case processor times, for the timing model"""
-    restarts: Restarts | None = None
-    """overrides supervision.restarts for this board"""
-    restarts_within_s: Positive | None = None
-    """overrides supervision.within_s for this board, s"""
 
     def board(self) -> BoardConfig:
         """Return the board."""
@@ -529,9 +522,7 @@ class RackConfig(Table):
         tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:
             tables["robot"]["model"] = portable(self.robot.model)
-        tables["board"] = {
-            name: with_table_files(board, lambda file: portable(Path(file)))
-            for name, board in tables["board"].items()
-            if name != LAN or self.adapter.lan is None
-        }
+        if self.adapter.lan is not None:
+            tables["board"].pop(LAN, None)
+        tables = with_texts(tables, STATE_TABLES, lambda file: portable(Path(file)))
         return to_toml(tables)

@@ -10,10 +10,11 @@ too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 from rack.boards.lan.config import LanTable
+from rack.boards.lan.endpoint import has_tls
 from rack.boards.lan.keys import (
     ALL_ALIVE,
     any_alive,
@@ -34,25 +35,22 @@ ANYONE = "*"
 """Subject of rules for everyone; no rack may have this name."""
 
 
-class Permission(NamedTuple):
-    """Messages of some kinds under some keys, in one direction, that are allowed."""
-
-    flow: str
-    messages: Sequence[str]
-    keys: Sequence[str]
+Rule = tuple[str, Sequence[str], Sequence[str]]
+"""Messages of some kinds under some keys, in one direction, that are allowed."""
 
 
 def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, Any]:
     """Return zenoh's `access_control` for rack `own`, or for an operator of that name, who sets the
     emergency stop of other racks."""
-    by_subject: dict[str, list[Permission]] = {}
+    by_subject: dict[str, list[Rule]] = {}
+    is_known = has_tls(table)
     if is_operator:
-        by_subject[ANYONE] = list(_operator(own))
-    elif not table.has_tls:
+        by_subject[ANYONE] = _operator(own)
+    elif not is_known:
         exported = [out_key(own, entry.source) for entry in table.exports.values()]
-        by_subject[ANYONE] = [*_shown(own, exported), *_compared(own)]
+        by_subject[ANYONE] = [*_visible(own), *_shown(exported), *_compared(own)]
     for peer in dict.fromkeys([*table.racks, *table.estop_from]):
-        rules = by_subject.setdefault(peer if table.has_tls else ANYONE, [])
+        rules = by_subject.setdefault(peer if is_known else ANYONE, [])
         rules += _visible(own)
         if peer in table.racks:
             rules += _exchange(own, peer, table)
@@ -61,71 +59,82 @@ def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, An
     return _configured(by_subject)
 
 
-def _exchange(own: str, peer: str, table: LanTable) -> Iterator[Permission]:
-    """Yield the rules for a rack with which this one exchanges mailboxes."""
+def _exchange(own: str, peer: str, table: LanTable) -> list[Rule]:
+    """Return the rules for a rack with which this one exchanges mailboxes."""
     imports = [
         out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer
     ]
     exports = [out_key(own, entry.source) for entry in table.exports.values()]
     taken = [*imports, step_key(peer), ping_key(peer, own), pong_key(peer, own)]
-    given = [*exports, step_key(own), ping_key(own, peer), pong_key(own, peer)]
-    yield Permission(OUT, SUBSCRIBE, [*taken, ping_key("*", own), pong_key("*", own)])
-    yield Permission(IN, PUT, taken)
-    yield Permission(IN, SUBSCRIBE, [ping_key("*", peer), pong_key("*", peer)])
-    yield from _shown(own, given)
-    yield Permission(OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)])
-    yield Permission(IN, TOKEN, [any_alive(peer)])
+    return [
+        (OUT, SUBSCRIBE, [*taken, ping_key("*", own), pong_key("*", own)]),
+        (IN, PUT, taken),
+        (IN, SUBSCRIBE, [ping_key("*", peer), pong_key("*", peer)]),
+        *_shown([*exports, step_key(own), ping_key(own, peer), pong_key(own, peer)]),
+        (OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)]),
+        (IN, TOKEN, [any_alive(peer)]),
+    ]
 
 
-def _shown(own: str, keys: Sequence[str]) -> Iterator[Permission]:
-    """Yield the rules for keys to which others may subscribe."""
-    if keys:
-        yield Permission(IN, SUBSCRIBE, keys)
-        yield Permission(OUT, PUT, keys)
-    yield from _visible(own)
+def _shown(keys: Sequence[str]) -> list[Rule]:
+    """Return the rules for keys to which others may subscribe."""
+    return [(IN, SUBSCRIBE, keys), (OUT, PUT, keys)] if keys else []
 
 
-def _compared(own: str) -> Iterator[Permission]:
-    """Yield the rules for others that may compare their clocks with this rack's: messages of
+def _compared(own: str) -> list[Rule]:
+    """Return the rules for others that may compare their clocks with this rack's: messages of
     unknown age are no use."""
-    yield Permission(OUT, SUBSCRIBE, [ping_key("*", own)])
-    yield Permission(IN, PUT, [ping_key("*", own)])
-    yield Permission(IN, SUBSCRIBE, [pong_key("*", "*")])
-    yield Permission(OUT, PUT, [pong_key(own, "*")])
+    return [
+        (OUT, SUBSCRIBE, [ping_key("*", own)]),
+        (IN, PUT, [ping_key("*", own)]),
+        (IN, SUBSCRIBE, [pong_key("*", "*")]),
+        (OUT, PUT, [pong_key(own, "*")]),
+    ]
 
 
-def _visible(own: str) -> Iterator[Permission]:
-    """Yield the rules for others that may know that this rack is there."""
-    yield Permission(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(own)])
-    yield Permission(OUT, TOKEN, [any_alive(own)])
+def _visible(own: str) -> list[Rule]:
+    """Return the rules for others that may know that this rack is there."""
+    return [(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(own)]), (OUT, TOKEN, [any_alive(own)])]
 
 
-def _stopped_by(own: str, peer: str) -> Iterator[Permission]:
-    """Yield the rules for a peer that may set the emergency stop."""
-    yield Permission(OUT, ("declare_queryable",), [estop_key("*", own)])
-    yield Permission(IN, ("query",), [estop_key(peer, own)])
-    yield Permission(OUT, ("reply",), [estop_key(peer, own)])
+def _stopped_by(own: str, peer: str) -> list[Rule]:
+    """Return the rules for a peer that may set the emergency stop."""
+    return [
+        (OUT, ("declare_queryable",), [estop_key("*", own)]),
+        (IN, ("query",), [estop_key(peer, own)]),
+        (OUT, ("reply",), [estop_key(peer, own)]),
+    ]
 
 
-def _operator(own: str) -> Iterator[Permission]:
-    """Yield the rules for setting the emergency stop of any rack."""
-    yield Permission(IN, ("declare_queryable",), [estop_key("*", "*")])
-    yield Permission(OUT, ("query",), [estop_key(own, "*")])
-    yield Permission(IN, ("reply",), [estop_key(own, "*")])
-    yield Permission(OUT, WATCH_TOKENS, [ALL_ALIVE])
-    yield Permission(IN, TOKEN, [ALL_ALIVE])
+def _operator(own: str) -> list[Rule]:
+    """Return the rules for setting the emergency stop of any rack."""
+    return [
+        (IN, ("declare_queryable",), [estop_key("*", "*")]),
+        (OUT, ("query",), [estop_key(own, "*")]),
+        (IN, ("reply",), [estop_key(own, "*")]),
+        (OUT, WATCH_TOKENS, [ALL_ALIVE]),
+        (IN, TOKEN, [ALL_ALIVE]),
+    ]
 
 
-def _configured(by_subject: dict[str, list[Permission]]) -> dict[str, Any]:
-    rules: list[dict[str, Any]] = []
+def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
+    rules = []
     policies = []
-    subjects = []
+    subjects: list[dict[str, Any]] = []
     for subject, allowed in by_subject.items():
-        ids = [f"{subject}-{at}" for at in range(len(allowed))]
-        for name, (flow, messages, keys) in zip(ids, allowed, strict=True):
-            rule = {"id": name, "permission": "allow", "flows": [flow]}
-            rules.append({**rule, "messages": list(messages), "key_exprs": list(keys)})
-        policies.append({"rules": ids, "subjects": [subject]})
+        names = []
+        for at, (flow, messages, keys) in enumerate(allowed):
+            names.append(f"{subject}-{at}")
+            rules.append(
+                {
+                    "id": names[-1],
+                    "permission": "allow",
+                    "flows": [flow],
+                    "messages": list(messages),
+                    "key_exprs": list(keys),
+                }
+            )
+        policies.append({"rules": names, "subjects": [subject]})
         known = {} if subject == ANYONE else {"cert_common_names": [subject]}
         subjects.append({"id": subject, **known})
     return {

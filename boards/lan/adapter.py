@@ -13,48 +13,130 @@ In a replay there is no network: see `rack.boards.lan.replayed`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, MessageType, State, fill_counts
+from rack.backplane.message import Field, Message, MessageType, State, fill_counts, status
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.lan.clocks import Clocks
-from rack.boards.lan.config import LanParams
+from rack.boards.lan.config import LanTable
 from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, Carrier, LanLink
 from rack.boards.lan.lockstep import Barrier
-from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import Peers
 from rack.boards.lan.replayed import ReplayedNetwork
 from rack.boards.wiring import Entries
+from rack.levels.errors import LevelError
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
 from rack.levels.peer import PEER, peer_port
 from rack.levels.tables import read_params
 
-TOKENS = 1024
-"""Racks that may come or go between two cycles of the adapter."""
 _LAUNCH_MASK = (1 << 62) - 1
+
+
+def _counts(**meanings: str) -> tuple[Field, ...]:
+    """Return a field for each count: its name, and what is counted."""
+    return tuple(Field(name, "u4", "1", meaning) for name, meaning in meanings.items())
+
+
+EXPORT = MessageType(
+    "lan_export",
+    1,
+    (
+        *_counts(sent="messages sent"),
+        Field("serial", "i8", "1", "serial of the newest message sent; 0: none"),
+    ),
+)
+IMPORT = MessageType(
+    "lan_import",
+    1,
+    (
+        *_counts(
+            taken="messages passed to the backplane",
+            missing="messages sent that never came, or came after a later one",
+            disordered="messages that came after a later one, and were not passed",
+            repeated="messages that came twice",
+            late="messages older than max_age_ms when they came",
+            refused=(
+                "messages refused: malformed, unsigned, oversized, or not what its type permits"
+            ),
+            unknown_launch="messages of a launch that is over, or not there",
+            superseded="messages that a newer one overtook before the exchange",
+        ),
+        Field(
+            "launch",
+            "i8",
+            "1",
+            "number of the launch that wrote the newest message taken; 0: none, or in lockstep",
+        ),
+        Field("number", "i8", "1", "number of that message among those sent from its mailbox"),
+        Field("serial", "i8", "1", "its serial in its mailbox; 0: none"),
+        Field("age", "i8", "tick", "age of its information in this rack's ticks; -1: none yet"),
+        Field("age_s", "f8", "s", "the same in simulated time; -1: none yet"),
+    ),
+)
+FLAWS = MessageType(
+    "lan_flaws",
+    1,
+    _counts(
+        malformed="not of this protocol, or of another version of it; in lockstep always 0",
+        unsigned="changed on the way, under another key, or not sealed by whom it names; likewise",
+        oversized="longer than most_bytes; likewise",
+    ),
+)
+CLOCKS = MessageType(
+    "lan_clocks",
+    1,
+    _counts(
+        taken="round trips measured",
+        answered="pings of other racks answered",
+        withheld="pings not answered: they came too fast, or from too many racks",
+        refused="pings and answers refused: malformed, unsigned, or to nothing that was asked",
+    ),
+)
+DESK = MessageType(
+    "lan_desk",
+    1,
+    _counts(
+        answered="emergency stops from other machines that were set; in lockstep always 0",
+        refused="emergency stops refused: not permitted; likewise",
+        dropped="requests dropped: malformed, unsigned or oversized; likewise",
+    ),
+)
+
+
+def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
+    """Return the type of an adapter's status: a group for each export and import."""
+    return status(
+        "lan_status",
+        1,
+        Field("clocks", CLOCKS, "1", "round trips to compare clocks; none in lockstep"),
+        *(Field(f"export_{port}", EXPORT, "1", f"export {port}") for port in exports),
+        *(Field(f"import_{port}", IMPORT, "1", f"import {port}") for port in imports),
+        Field("desk", DESK, "1", "emergency stops from other machines"),
+        Field("flaws", FLAWS, "1", "all that came and was dropped unread, by cause"),
+    )
 
 
 class LanAdapter(Adapter):
     """Exchanges mailboxes with other racks. Its status shows every entry, a mailbox of its own each
     rack."""
 
-    params = LanParams
+    params = LanTable
     wired_by = "params.export"
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._table = table = read_params(LanParams, context.params)
+        self._table = table = read_params(LanTable, context.params)
         self._peers = Peers(table.racks, table.on_peer_loss == "go on")
         self._exports: dict[str, Export] = {}
         self._imports: dict[str, Import] = {}
@@ -67,14 +149,14 @@ class LanAdapter(Adapter):
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the other racks, and those who may set the emergency stop: alarms name them by
         number."""
-        table = LanParams.found_in(params)
+        table = _table_in(params)
         return () if table is None else tuple(dict.fromkeys([*table.racks, *table.estop_from]))
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
         """Return a port to read for each export, one to write for each import and rack, and the
         status."""
-        table = LanParams.found_in(params)
+        table = _table_in(params)
         if table is None:
             return MadePorts(is_whole=False)
         known = {port: entry for port, entry in table.exports.items() if entry.source in types}
@@ -92,7 +174,7 @@ class LanAdapter(Adapter):
     @classmethod
     def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
         """Return all that it writes: imports, racks, status."""
-        imports = read_params(LanParams, params).imports
+        imports = read_params(LanTable, params).imports
         return {port: port in imports for port in cls.made_ports(params, {}).outputs}
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
@@ -130,12 +212,12 @@ class LanAdapter(Adapter):
         names = self.names(self.context.params)
         subjects = {name: names.index(name) for name in table.estop_from}
         self._desk = Desk(segment, self._grid, subjects, self.findings)
-        status = open_observer(segment, f"{board}.{STATUS}")
-        if (before := status.peek()).is_there:
+        observer = open_observer(segment, f"{board}.{STATUS}")
+        if (before := observer.peek()).is_there:
             for port, export in self._exports.items():
                 export.resume(getattr(before.value, f"export_{port}"))
             for port, entry in self._imports.items():
-                entry.resume(getattr(before.value, f"import_{port}"), status.newest)
+                entry.resume(getattr(before.value, f"import_{port}"), observer.newest)
             self._desk.resume(before.value.desk)
             self._flaws = before.value.flaws.tolist()
         if self._grid.is_lockstep and table.racks:
@@ -162,7 +244,7 @@ class LanAdapter(Adapter):
             barrier.open(link, self._launch)
             self._recall(barrier)
         self._peers.watch(
-            link.watch_alive(TOKENS) if barrier is None else barrier.changes, barrier is not None
+            link.watch_alive() if barrier is None else barrier.changes, barrier is not None
         )
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
@@ -219,21 +301,21 @@ class LanAdapter(Adapter):
             self._words[System.PEER_STOP] = switch(since, must_stop)
 
     def _report(self, write: Ports, tick: int) -> None:
-        status: Message = write.status
-        self._clocks.count(status.clocks)
+        own: Message = write.status
+        self._clocks.count(own.clocks)
         for port, export in self._exports.items():
-            export.fill(getattr(status, f"export_{port}"))
+            export.fill(getattr(own, f"export_{port}"))
         for port, entry in self._imports.items():
-            entry.fill(getattr(status, f"import_{port}"), tick)
-        self._desk.fill(status.desk)
+            entry.fill(getattr(own, f"import_{port}"), tick)
+        self._desk.fill(own.desk)
         for peer in self._peers:
             out = getattr(write, peer_port(peer.rack))
             self._clocks.fill(out, peer.rack, tick)
             peer.fill(out, self._grid.is_lockstep)
         if self._link is not None and not self._grid.is_lockstep:
-            fill_counts(status.flaws, self._link.sealer.flaws.values())
-        status.reason = reason = self._trouble(tick)
-        status.state = State.HOLDING if reason else State.EXECUTING
+            fill_counts(own.flaws, self._link.sealer.flaws.values())
+        own.reason = reason = self._trouble(tick)
+        own.state = State.HOLDING if reason else State.EXECUTING
 
     def _trouble(self, tick: int) -> str:
         """Return what keeps the exchange from its work; empty: nothing."""
@@ -253,3 +335,11 @@ class LanAdapter(Adapter):
             self._barrier.close()
         if self._link is not None:
             self._link.close()
+
+
+def _table_in(params: Mapping[str, Any]) -> LanTable | None:
+    """Return the table in parameters; None if they have mistakes."""
+    try:
+        return read_params(LanTable, params)
+    except LevelError:
+        return None

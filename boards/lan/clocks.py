@@ -151,30 +151,46 @@ class PeerClock:
         )
 
 
-class Responder:
-    """Answers the pings of other racks from the network's threads, each rack's at a bounded
-    rate."""
+class Clocks:
+    """Compares the clocks of all peers with ours; not in lockstep, where all racks have one
+    simulated time.
 
-    def __init__(self, segment: Segment, launch: int) -> None:
+    Pings of other racks are answered from the network's threads, each rack's at a bounded rate.
+    """
+
+    def __init__(self, segment: Segment, peers: Peers, launch: int, grid: OwnGrid) -> None:
+        self._segment = segment
         self._rack = segment.rack
         self._launch = launch
-        self._words = segment.words
-        self._clock_ns = segment.layout.clock_ns
+        self._grid = grid
+        self._clocks = {peer.rack: PeerClock(peer) for peer in peers}
+        self._arrived: deque[tuple[int, Arrived]] = deque(maxlen=UNREAD)
+        self.taken = self.answered = self.withheld = self.refused = 0
         self._put: dict[str, Any] = {}
         self._again: dict[str, int] = {}
+        # Each link of the network has its own thread.
         self._lock = Lock()
-        self.answered = self.withheld = self.refused = 0
+        # Of no ping that an adapter before this one may have sent.
+        self._serial = monotonic_ns()
+        self._now_ns = 0
 
     def open(self, link: LanLink, sealer: Sealer) -> None:
-        """Answer from now on."""
+        """Answer other racks, and get ready to ask them."""
+        if self._grid.is_lockstep:
+            return
         self._link = link
         self._sealer = sealer
         link.on(ping_key("*", self._rack), self._on_ping)
+        # A tuple is whole or not there: no lock is needed.
+        link.on(
+            pong_key("*", self._rack), lambda pong: self._arrived.append((monotonic_ns(), pong))
+        )
+        for rack, clock in self._clocks.items():
+            clock.put = link.publish(ping_key(self._rack, rack))
 
     def _on_ping(self, ping: Arrived) -> None:
         received = monotonic_ns()
         asker = ping.key.split("/")[1]
-        # Each link of the network has its own thread.
         with self._lock:
             again = self._again.get(asker)
             if received < (again or 0) or (again is None and len(self._again) == MOST_ASKERS):
@@ -190,43 +206,13 @@ class Responder:
 
     def _answer(self, asker: str, ping: Envelope, received: int) -> None:
         key = pong_key(self._rack, asker)
-        words = self._words
+        words = self._segment.words
         if asker not in self._put:
             self._put[asker] = self._link.publish(key)
-        grid = words[System.EPOCH_NS], words[System.PERIOD_NS], self._clock_ns
+        grid = words[System.EPOCH_NS], words[System.PERIOD_NS], self._segment.layout.clock_ns
         payload = _PONG.pack(ping.launch, received, *grid)
         head = Envelope(_PONG_KIND, self._launch, ping.serial, ping.serial, 0, 0, monotonic_ns())
         self._put[asker](payload, self._sealer.seal(key, head, payload))
-
-
-class Clocks:
-    """Compares the clocks of all peers with ours; not in lockstep, where all racks have one
-    simulated time."""
-
-    def __init__(self, segment: Segment, peers: Peers, launch: int, grid: OwnGrid) -> None:
-        self._rack = segment.rack
-        self._launch = launch
-        self._grid = grid
-        self._clocks = {peer.rack: PeerClock(peer) for peer in peers}
-        self._arrived: deque[tuple[int, Arrived]] = deque(maxlen=UNREAD)
-        self.taken = self.refused = 0
-        # Of no ping that an adapter before this one may have sent.
-        self._serial = monotonic_ns()
-        self._now_ns = 0
-        self.responder = Responder(segment, launch)
-
-    def open(self, link: LanLink, sealer: Sealer) -> None:
-        """Answer other racks, and get ready to ask them."""
-        if self._grid.is_lockstep:
-            return
-        self._sealer = sealer
-        self.responder.open(link, sealer)
-        # A tuple is whole or not there: no lock is needed.
-        link.on(
-            pong_key("*", self._rack), lambda pong: self._arrived.append((monotonic_ns(), pong))
-        )
-        for rack, clock in self._clocks.items():
-            clock.put = link.publish(ping_key(self._rack, rack))
 
     def exchange(self) -> None:
         """Take the answers that have come, and ask again where it is time."""
@@ -238,7 +224,8 @@ class Clocks:
             if self._is_taken(*self._arrived.popleft()):
                 self.taken += 1
             else:
-                self.refused += 1
+                with self._lock:
+                    self.refused += 1
         self._now_ns = now = monotonic_ns()
         for rack, clock in self._clocks.items():
             if clock.peer.is_there and now >= clock.due_ns:
@@ -288,11 +275,7 @@ class Clocks:
 
     def count(self, record: Any) -> None:
         """Write the counts into the group of a status."""
-        answering = self.responder
-        fill_counts(
-            record,
-            (self.taken, answering.answered, answering.withheld, answering.refused + self.refused),
-        )
+        fill_counts(record, (self.taken, self.answered, self.withheld, self.refused))
 
     def fill(self, out: Any, rack: str, tick: int) -> None:
         """Write what is known of a rack's clock into its mailbox: see `rack.levels.peer`."""

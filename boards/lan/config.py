@@ -3,15 +3,13 @@ rules."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints
 
 from rack.backplane.message import MessageType
 from rack.backplane.rack_name import RACK_NAME
-from rack.boards.lan.endpoint import Endpoint, proper
 from rack.levels.references import module_and_name
 from rack.levels.tables import Positive, Table
 
@@ -22,7 +20,6 @@ MOST_CHAIN = 8192
 OnPeerLoss = Literal["hold", "stop", "go on"]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
-EndpointText = Annotated[str, AfterValidator(proper)]
 Local = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Remote = Annotated[
     str, StringConstraints(pattern=rf"^{RACK_NAME}/[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")
@@ -87,12 +84,10 @@ class LanTable(Table):
     """The keys of `[adapter.lan]` that concern the network; those of its board are declared with
     the boards'."""
 
-    listen: tuple[EndpointText, ...] = Field(
+    listen: tuple[str, ...] = Field(
         (), description=f"endpoints where other racks find this one, {ENDPOINT_NOTE}"
     )
-    connect: tuple[EndpointText, ...] = Field(
-        (), description=f"endpoints of other racks, {ENDPOINT_NOTE}"
-    )
+    connect: tuple[str, ...] = Field((), description=f"endpoints of other racks, {ENDPOINT_NOTE}")
     certificates: str | None = None
     """folder with this rack's certificate and key; see rack lan certificates --help"""
     insecure: bool = False
@@ -120,31 +115,6 @@ class LanTable(Table):
     """mailboxes of other racks, by port"""
 
     @property
-    def endpoints(self) -> Iterator[tuple[str, Endpoint]]:
-        """Yield each endpoint with its place in the table, as in listen[0]."""
-        for key in ("listen", "connect"):
-            yield from (
-                (f"{key}[{at}]", Endpoint.of(text)) for at, text in enumerate(getattr(self, key))
-            )
-
-    @property
-    def has_tls(self) -> bool:
-        """Whether the others are known by their certificates."""
-        return any(endpoint.has_tls for _, endpoint in self.endpoints)
-
-    @property
     def racks(self) -> tuple[str, ...]:
         """The racks with which this one works: those from which it imports, and `peers`."""
         return tuple(dict.fromkeys([*(entry.rack for entry in self.imports.values()), *self.peers]))
-
-
-class LanParams(LanTable):
-    """The parameters of the adapter's board: what its table says of the network."""
-
-    @classmethod
-    def found_in(cls, params: Mapping[str, Any]) -> LanParams | None:
-        """Return the parameters; None if they have mistakes."""
-        try:
-            return cls.model_validate(params)
-        except ValidationError:
-            return None

@@ -33,7 +33,7 @@ REQUESTS_A_CYCLE = 16
 
 @dataclass
 class DeskCount:
-    """Requests so far: see `rack.boards.lan.messages.DESK`."""
+    """Requests so far: see `rack.boards.lan.adapter.DESK`."""
 
     answered: int = 0
     refused: int = 0

@@ -8,6 +8,7 @@ from ipaddress import ip_address
 from typing import NamedTuple
 
 from rack.backplane.rack_name import RACK_NAME
+from rack.boards.lan.config import LanTable
 
 TLS = ("tls", "quic")
 UNIX = "unix"
@@ -76,7 +77,15 @@ class Endpoint(NamedTuple):
         return False
 
 
-def proper(text: str) -> str:
-    """Return an endpoint as it is. Raises `ValueError`: it is malformed."""
-    Endpoint.of(text)
-    return text
+def endpoints_of(table: LanTable) -> list[Endpoint]:
+    """Return the endpoints of a table; malformed ones are mistakes that are reported elsewhere."""
+    found = []
+    for text in (*table.listen, *table.connect):
+        with suppress(ValueError):
+            found.append(Endpoint.of(text))
+    return found
+
+
+def has_tls(table: LanTable) -> bool:
+    """Return True if the others are known by their certificates."""
+    return any(endpoint.has_tls for endpoint in endpoints_of(table))

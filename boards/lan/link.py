@@ -23,7 +23,7 @@ import zenoh
 from rack.backplane.json_text import encode_json
 from rack.boards.lan.access import access_control
 from rack.boards.lan.config import Credential, LanTable
-from rack.boards.lan.endpoint import Endpoint
+from rack.boards.lan.endpoint import Endpoint, endpoints_of, has_tls
 from rack.boards.lan.envelope import MOST_ENVELOPE, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 UNREAD = 32
 """Messages of one import that wait for a cycle, at most; a newer one overwrites the oldest."""
+TOKENS = 1024
+"""Racks that may come or go between two cycles of an adapter."""
 RETRY_MS = (50, 200)
 """Shortest and longest time between two attempts to connect."""
 KEEP_ALIVES = 4
@@ -125,12 +127,28 @@ class LanLink:
         put = publisher.put
         return lambda payload, envelope: put(payload, attachment=envelope)
 
-    def subscribe(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Arrived]]:
+    def _channel(
+        self, declare: Callable[..., Any], key: str, unread: int, **options: bool
+    ) -> Callable[[], Iterator[Any]]:
+        """Declare something whose messages wait in a channel; return a function that yields those
+        that have come since its last call, oldest first."""
+        channel = declare(key, zenoh.handlers.RingChannel(unread), **options)
+        self._kept.append(channel)
+
+        def waiting() -> Iterator[Any]:
+            # No more than may wait: a flood must not keep the cycle.
+            for _ in range(unread):
+                if (found := channel.try_recv()) is None:
+                    return
+                yield found
+
+        return waiting
+
+    def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
         """Return a function that yields what has come under a key expression since the last call,
         oldest first."""
-        subscriber = self.session.declare_subscriber(key, zenoh.handlers.RingChannel(unread))
-        self._kept.append(subscriber)
-        return lambda: map(Arrived.of, _waiting(subscriber, unread))
+        waiting = self._channel(self.session.declare_subscriber, key, UNREAD)
+        return lambda: map(Arrived.of, waiting())
 
     def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
         """Call a function in a thread of the network with everything that comes under a key
@@ -150,11 +168,10 @@ class LanLink:
 
         A question under several keys at once is dropped unanswered.
         """
-        queryable = self.session.declare_queryable(key, zenoh.handlers.RingChannel(unread))
-        self._kept.append(queryable)
+        waiting = self._channel(self.session.declare_queryable, key, unread)
 
         def questions() -> Iterator[Question]:
-            for query in _waiting(queryable, unread):
+            for query in waiting():
                 with query:
                     asked = str(query.key_expr)
                     content = _bytes_of(query.payload) or b""
@@ -170,16 +187,14 @@ class LanLink:
             self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
         )
 
-    def watch_alive(self, unread: int = UNREAD) -> Callable[[], Iterator[tuple[str, int, bool]]]:
+    def watch_alive(self) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields rack, launch, and whether it has come or gone, of others,
         oldest first."""
-        subscriber = self.session.liveliness().declare_subscriber(
-            ALL_ALIVE, zenoh.handlers.RingChannel(unread), history=True
-        )
-        self._kept.append(subscriber)
+        declare = self.session.liveliness().declare_subscriber
+        waiting = self._channel(declare, ALL_ALIVE, TOKENS, history=True)
 
         def changes() -> Iterator[tuple[str, int, bool]]:
-            for sample in _waiting(subscriber, unread):
+            for sample in waiting():
                 key = str(sample.key_expr)
                 if (found := launch_and_cycle(key)) is not None:
                     yield key.split("/")[1], found[0], sample.kind == zenoh.SampleKind.PUT
@@ -189,15 +204,6 @@ class LanLink:
     def close(self) -> None:
         """Leave the network: others see it at once."""
         self.session.close()  # type: ignore[no-untyped-call]
-
-
-def _waiting(channel: Any, most: int) -> Iterator[Any]:
-    """Yield what waits in a channel, oldest first."""
-    # No more than may wait: a flood must not keep the cycle.
-    for _ in range(most):
-        if (found := channel.try_recv()) is None:
-            return
-        yield found
 
 
 def _bytes_of(content: zenoh.ZBytes | None) -> bytes | None:
@@ -211,10 +217,10 @@ def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
 def _settings(
     rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
-    timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if table.has_tls else ""
+    timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if has_tls(table) else ""
     shortest, longest = RETRY_MS
     protocols = {
-        SOCKET if endpoint.is_private else endpoint.protocol for _, endpoint in table.endpoints
+        SOCKET if endpoint.is_private else endpoint.protocol for endpoint in endpoints_of(table)
     }
     settings: dict[str, Any] = {
         "mode": "peer",
@@ -254,7 +260,7 @@ def _settings(
             table.lease_ms * 1e3
         ),
     }
-    if credentials is not None and table.has_tls:
+    if credentials is not None and has_tls(table):
         settings["transport/link/tls"] = _tls(credentials)
     config = zenoh.Config()
     for key, value in settings.items():

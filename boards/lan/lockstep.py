@@ -22,11 +22,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from enum import IntFlag
 from queue import Empty, SimpleQueue
-from typing import NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import zenoh
+from xxhash import xxh3_64_intdigest as xxh3
+from zenoh.ext import Int64, ZDeserializeError, z_deserialize, z_serialize
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
@@ -35,8 +38,52 @@ from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle, step_key
 from rack.boards.lan.link import MOST_STEP, Arrived, LanLink
 from rack.boards.lan.peers import NONE
-from rack.boards.lan.step import STEP_KIND, Step, StepFlag, pack_step, unpack_step
 from rack.levels.errors import CannotGoOn
+
+STEP_KIND = xxh3(b"rack step 2")
+_CONTENT: Any = tuple[Int64, list[str], list[tuple[str, bytes, bytes]]]
+"""Length of the cycle, racks, and of each export the key, the envelope and the payload."""
+
+
+class StepFlag(IntFlag):
+    """What else a step says, in the flags of its envelope."""
+
+    FIRST = 1  # this process needs the newest step of the others
+    OVER = 2  # the run has ended, and this was its last step
+
+
+class Step(NamedTuple):
+    """One step of a rack. `cycle_ns`: length of its adapter's cycle; `racks`: those for which it
+    waits."""
+
+    launch: int
+    time_ns: int
+    flags: int
+    cycle_ns: int
+    racks: tuple[str, ...]
+    exports: tuple[Arrived, ...]
+
+
+def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[Arrived]) -> bytes:
+    """Return the content of a step."""
+    parts = [(export.key, export.envelope or b"", export.payload) for export in exports]
+    return z_serialize((Int64(cycle_ns), list(racks), parts)).to_bytes()
+
+
+def unpack_step(head: Envelope, content: bytes) -> Step | None:
+    """Return the step with this head; None if it is no step, or malformed."""
+    if head.kind != STEP_KIND:
+        return None
+    try:
+        cycle_ns, racks, parts = z_deserialize(_CONTENT, zenoh.ZBytes(content))
+    except ZDeserializeError:
+        return None
+    exports = tuple(Arrived(*part) for part in parts)
+    # What is left behind the last part would be ignored.
+    if pack_step(cycle_ns, racks, exports) != content:
+        return None
+    return Step(head.launch, head.time_ns, head.flags, cycle_ns, tuple(racks), exports)
+
 
 LOOK_S = 0.1
 """Time between two looks at the end of the run, while a rack is awaited."""

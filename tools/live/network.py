@@ -24,7 +24,7 @@ COUNTS = (
     "unknown_launch",
     "superseded",
 )
-"""What is counted of an import: see `rack.boards.lan.messages.IMPORT`."""
+"""What is counted of an import: see `rack.boards.lan.adapter.IMPORT`."""
 
 
 @dataclass(frozen=True)

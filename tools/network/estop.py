@@ -9,11 +9,10 @@ from __future__ import annotations
 import ipaddress
 import secrets
 import socket
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import zenoh
 
@@ -21,7 +20,7 @@ from rack.boards.lan.config import LanTable
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.desk import CHECK, ESTOP_KIND
 from rack.boards.lan.envelope import Envelope, Flaw
-from rack.boards.lan.keys import ALL_ALIVE, estop_answer_key, estop_key, launch_and_cycle
+from rack.boards.lan.keys import estop_answer_key, estop_key
 from rack.boards.lan.link import Arrived, LanLink
 from rack.levels.errors import LevelError
 from rack.tools.console.address import Operator, RackAddress
@@ -36,7 +35,7 @@ ANSWER_S = 1.0
 PATIENCE_S = 4.0
 """Time without an answer after which a rack counts as gone."""
 PAUSE_S = 0.02
-"""Time until a request is repeated that was dropped."""
+"""Time until a request is repeated that was dropped, and between two looks at who is there."""
 DENIED_S = 1.0
 """Time for which all requests come back at once without an answer until that counts as not
 permitted: the way to a rack that has just shown itself may not be there yet."""
@@ -61,11 +60,8 @@ class EstopSession:
             raise Failure(str(error).replace("adapter.lan: ", "")) from None
         self._session = secrets.randbits(63)
         self._number = 0
-        self._changed = threading.Condition()
         self._launches: dict[str, int] = {}
-        self._token = self._link.session.liveliness().declare_subscriber(
-            ALL_ALIVE, zenoh.handlers.Callback(self._note, indirect=False), history=True
-        )
+        self._changes = self._link.watch_alive()
 
     def __enter__(self) -> Self:
         return self
@@ -73,29 +69,28 @@ class EstopSession:
     def __exit__(self, *error: object) -> None:
         self._link.close()
 
-    def _note(self, sample: Any) -> None:
-        """Note who comes and goes; a token that is not one of a rack's adapter is nobody's."""
-        key = str(sample.key_expr)
-        if (found := launch_and_cycle(key)) is None:
-            return
-        rack = key.split("/")[1]
-        with self._changed:
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._launches[rack] = found[0]
-            elif self._launches.get(rack) == found[0]:
-                del self._launches[rack]
-            self._changed.notify_all()
+    def _await(self, condition: Callable[[], object], bound_s: float) -> None:
+        """Note who comes and goes, until a condition holds or the time is over."""
+        end_s = time.monotonic() + bound_s
+        while True:
+            for rack, launch, is_there in self._changes():
+                if is_there:
+                    self._launches[rack] = launch
+                elif self._launches.get(rack) == launch:
+                    del self._launches[rack]
+            if condition() or time.monotonic() > end_s:
+                return
+            time.sleep(PAUSE_S)
 
     def launch(self) -> int:
         """Return the number of the rack's launch. Raises `Failure` when it is not there: it names
         those that are."""
         rack = self._address.rack
-        with self._changed:
-            self._changed.wait_for(lambda: self._launches, CONNECT_S)
-            self._changed.wait_for(lambda: rack in self._launches, OTHERS_S)
-            if rack in self._launches:
-                return self._launches[rack]
-            there = ", ".join(sorted(self._launches))
+        self._await(lambda: self._launches, CONNECT_S)
+        self._await(lambda: rack in self._launches, OTHERS_S)
+        if rack in self._launches:
+            return self._launches[rack]
+        there = ", ".join(sorted(self._launches))
         with_tls = "one with TLS needs --certificates"
         if self._operator.certificates:
             with_tls = "its certificate and yours must be of one authority"
@@ -125,6 +120,7 @@ class EstopSession:
                 return tick
             now_s = time.monotonic()
             was_taken |= now_s - began_s > ANSWER_S / 2
+            self._await(lambda: True, 0.0)
             if self._launches.get(rack) != launch:
                 raise Failure(f"{at} has ended, or is out of reach")
             if not was_taken and now_s - first_s > DENIED_S:

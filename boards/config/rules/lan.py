@@ -22,7 +22,7 @@ from rack.boards.config.wiring import Wiring, is_taken
 from rack.boards.errors import Mistake, Mistakes
 from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
-from rack.boards.lan.endpoint import Endpoint
+from rack.boards.lan.endpoint import Endpoint, endpoints_of, has_tls
 from rack.levels.peer import peer_port
 
 PLACE = "adapter.lan"
@@ -195,9 +195,7 @@ def network(wiring: Wiring) -> Mistakes:
     table = wiring.config.adapter.lan
     if table is None:
         return
-    for key, endpoint in table.endpoints:
-        if why := _why_not(endpoint, table, connects=key.startswith("connect")):
-            yield Mistake(f"{PLACE}.{key}", str(endpoint), why)
+    yield from _endpoints(table)
     if table.estop_from and (at := _open(table)):
         could = "pass for any of them"
         if table.certificates is not None:
@@ -208,13 +206,13 @@ def network(wiring: Wiring) -> Mistakes:
             ", ".join(table.estop_from),
             f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
         )
-    if table.has_tls and table.certificates is None:
+    if has_tls(table) and table.certificates is None:
         yield Mistake(
             f"{PLACE}.certificates",
             None,
             "missing; TLS needs them: see rack lan certificates --help",
         )
-    if table.has_tls and table.exports and not table.racks:
+    if has_tls(table) and table.exports and not table.racks:
         yield Mistake(
             f"{PLACE}.peers",
             None,
@@ -222,11 +220,21 @@ def network(wiring: Wiring) -> Mistakes:
         )
 
 
+def _endpoints(table: LanTable) -> Mistakes:
+    for key in ("listen", "connect"):
+        for at, text in enumerate(getattr(table, key)):
+            try:
+                why = _why_not(Endpoint.of(text), table, connects=key == "connect")
+            except ValueError as error:
+                why = str(error)
+            if why:
+                yield Mistake(f"{PLACE}.{key}[{at}]", text, why)
+
+
 def _open(table: LanTable) -> list[str]:
     """Return the endpoints that others reach without a certificate: every user of this machine
     reaches those of loopback."""
-    ends = (endpoint for _, endpoint in table.endpoints)
-    return [str(end) for end in ends if not (end.has_tls or end.is_private)]
+    return [str(end) for end in endpoints_of(table) if not (end.has_tls or end.is_private)]
 
 
 def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
@@ -235,7 +243,7 @@ def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
             "zenoh checks no certificate for an address of IPv6; permitted: a host name, or an"
             " address of IPv4"
         )
-    if not endpoint.has_tls and table.has_tls:
+    if not endpoint.has_tls and has_tls(table):
         return (
             "without TLS, which others have: who comes here is not known; permitted: all with TLS,"
             " or none"
@@ -266,7 +274,7 @@ def credential_mistakes(config: RackConfig) -> Mistakes:
         why = "cannot be checked without 'cryptography': install nasrem-rack[lan]"
         yield Mistake(f"{PLACE}.certificates", table.certificates, why)
         return
-    heard = [Endpoint.of(text) for text in table.listen]
+    heard = [end for end in endpoints_of(table) if str(end) in table.listen]
     addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
     for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
         # The file first: a long path is cut short.
@@ -286,7 +294,7 @@ def network_notes(config: RackConfig) -> list[str]:
     if table.certificates is not None:
         may = "read what is exchanged, and feign that racks come and go"
     notes = [f"without TLS: whoever reaches {', '.join(far)} may {may}"] if far else []
-    if table.certificates is not None and table.has_tls:
+    if table.certificates is not None and has_tls(table):
         from rack.boards.lan.credentials import Credentials
 
         expires = Credentials(Path(table.certificates), config.name).expires

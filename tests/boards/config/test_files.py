@@ -23,9 +23,11 @@ def lines(error: pytest.ExceptionInfo[ConfigError]) -> list[str]:
 
 
 @pytest.mark.parametrize("name", names())
-def test_every_bundled_config_survives_as_text(name: str) -> None:
+def test_every_bundled_config_survives_as_text_and_is_of_the_newest_format(name: str) -> None:
     config = load(name)
     assert loads(config.text()) == config
+    assert config.changed == []
+    assert named_classes(assembled(name, (), None)) == classes(config)
 
 
 def test_text_names_a_bundled_model_without_its_folder() -> None:
@@ -106,11 +108,6 @@ def test_no_other_format_is_read(small: Path, given: str) -> None:
     assert line.startswith("format = ")
 
 
-@pytest.mark.parametrize("name", names())
-def test_the_shipped_racks_are_of_the_newest_format(name: str) -> None:
-    assert load(name).changed == []
-
-
 def test_bases_are_merged_in_order(small: Path, write: Write) -> None:
     write("first.toml", "seed = 1\n[clock]\nspeed = 3\n")
     write("second.toml", 'seed = 2\n[clock]\nmode = "realtime"\n')
@@ -187,12 +184,12 @@ def test_values_that_no_config_has_are_refused_in_files_and_settings(
 
 
 def test_an_endless_chain_of_files_is_refused(write: Write) -> None:
-    for at in range(1200):
+    for at in range(40):
         write(f"chain{at}.toml", f'extends = ["chain{at + 1}.toml"]\n')
     with pytest.raises(
         ConfigError, match=r"chain32.toml: extends: chain of extends too long; permitted: 32 files$"
     ):
-        load(write("chain1200.toml", "").with_name("chain0.toml"))
+        load(write("chain40.toml", "").with_name("chain0.toml"))
 
 
 def test_a_file_that_many_extend_is_read_once(small: Path, write: Write) -> None:
@@ -321,11 +318,6 @@ def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
     boards = {"one": named, "two": {"executor": "mine:Arm"}, "odd": 3, "wrong": {"executor": 7}}
     assert named_classes({"board": boards}) == ("mine:Arm", "mine:Planner")
     assert named_classes({"board": [1]}) == named_classes({}) == ()
-
-
-def test_the_classes_that_a_config_names_are_those_that_are_preloaded() -> None:
-    for name in names():
-        assert named_classes(assembled(name, (), None)) == classes(load(name))
 
 
 def test_every_export_exists_once() -> None:

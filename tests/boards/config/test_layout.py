@@ -160,21 +160,6 @@ def test_a_board_may_wait_otherwise_than_the_rack_and_a_planner_does_not_poll(sm
     }
 
 
-def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_gives_it_away(
-    small: Path,
-) -> None:
-    def core(mode: str, *settings: str) -> int:
-        return (
-            resolve(load(small, [f"clock.mode={mode}", "clock.core=0", *settings])).clock(None).core
-        )
-
-    assert (core("realtime", "board.lower.core=1"), core("lockstep", "board.lower.core=1")) == (
-        0,
-        1,
-    )
-    assert core("lockstep", "board.upper.core=0", *POLLING) == 0
-
-
 def test_a_queue_keeps_what_may_be_unread_and_what_a_recorder_may_be_behind() -> None:
     layout = wire(load("penn"))
     sizes = {box.name: (box.capacity, box.depth) for box in layout.mailboxes}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 
 from rack.boards.config import CONFIGS, FAULTS, load, names
-from rack.boards.config.files import read, with_faults
+from rack.boards.config.files import assembled, with_faults
 from rack.boards.config.reference import Key, find_tables, key_tables
 from rack.boards.errors import ConfigError
 from rack.levels.servo.control import ServoParams
@@ -82,32 +83,37 @@ def general(place: str, known: Iterable[str]) -> str:
     return next(filter(fits, known), place)
 
 
+ALIKE = re.compile(r".*three-poses|nasrem-1khz|fig[34].*|crossing|k1607|nist-state-table/direct")
+"""Racks whose boards other racks have as well."""
+EACH_RACK = [
+    pytest.param(name, marks=pytest.mark.thorough if ALIKE.fullmatch(name) else ())
+    for name in names()
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", names())
-def test_the_reference_has_every_key_of_every_shipped_config(name: str) -> None:
+@pytest.mark.parametrize("name", EACH_RACK)
+def test_the_reference_has_every_key_of_every_shipped_config_with_meaning_and_unit(
+    name: str,
+) -> None:
     known = reference(name)
-    tables = read(name)
+    tables = assembled(name, (), None)
     assert {
         (at, key) for at, key in used(tables) if key not in known.get(general(at, known), {})
     } == set()
-
-
-def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
-    known = reference("nasrem")["fault"]
-    scripts = [with_faults({}, name, CONFIGS)["fault"] for name in names(FAULTS)]
-    assert {key for script in scripts for fault in script for key in fault} <= set(known)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", names())
-def test_every_key_has_a_meaning_and_every_quantity_a_unit(name: str) -> None:
-    for place, found in reference(name).items():
+    for place, found in known.items():
         for key in found.values():
             assert key.meaning, f"{place}.{key.name}"
             if "number" in key.type and key.name not in DIMENSIONLESS:
                 assert key.unit, f"{place}.{key.name}: {key.meaning}"
             for suffix, unit in (("_ms", "ms"), ("_s", "s"), ("_hz", "Hz")):
                 assert not key.name.endswith(suffix) or key.unit == unit
+
+
+def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
+    known = reference("nasrem")["fault"]
+    scripts = [with_faults({}, name, CONFIGS)["fault"] for name in names(FAULTS)]
+    assert {key for script in scripts for fault in script for key in fault} <= set(known)
 
 
 def test_ranges_and_defaults_are_those_of_the_models() -> None:

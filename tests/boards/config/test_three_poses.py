@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import runpy
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from rack.boards.config import load
-from rack.boards.config.files import CONFIGS, read
+from rack.boards.config.files import CONFIGS, assembled
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell
 
@@ -15,12 +17,16 @@ TASKS = CONFIGS / "tasks"
 LIMITS = ("home", "velocity", "acceleration", "jerk")
 
 
-POSES = [action["joints"] for action in read(TASKS / "three-poses.toml")["task"]["action"]]
+def tables_of(path: Path) -> dict[str, Any]:
+    return assembled(path, (), None)
+
+
+POSES = [action["joints"] for action in tables_of(TASKS / "three-poses.toml")["task"]["action"]]
 RACKS = ("rccl", "chimera", "brown", "ibm", "nist-state-table", "penn")
 
 
 def test_every_form_of_the_motion_has_the_same_poses() -> None:
-    steps = read(TASKS / "three-motions.toml")["task"]["step"]
+    steps = tables_of(TASKS / "three-motions.toml")["task"]["step"]
     assert [step["joints"] for step in steps if step["do"] == "move"] == POSES
     moved: list[tuple[float, ...]] = []
     runpy.run_path(
@@ -28,8 +34,8 @@ def test_every_form_of_the_motion_has_the_same_poses() -> None:
     )
     assert [list(pose) for pose in moved] == POSES
     tables = CONFIGS / "nist-state-table" / "tables"
-    places = read(tables / "three_poses_move.toml")["plan"]["place"]
-    order = [step["place"] for step in read(tables / "three_poses_task.toml")["plan"]["step"]]
+    places = tables_of(tables / "three_poses_move.toml")["plan"]["place"]
+    order = [step["place"] for step in tables_of(tables / "three_poses_task.toml")["plan"]["step"]]
     config = load("nist-state-table/three-poses")
     assert config.robot is not None
     ik = InverseKinematics(build_cell(config.robot, config.scene, config.clock_ns), 0)

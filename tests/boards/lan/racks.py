@@ -31,6 +31,8 @@ from rack.tools.viewer.window import free_port
 from tests.processes import BOUND_S
 
 ROOT = Path(__file__).resolve().parents[3]
+LAUNCH_S = 60.0
+"""Bound of the launch of racks in processes of their own: on a loaded machine it takes 20 s."""
 BASE = f"""
 python_path = ["{Path(__file__).parent}"]
 

@@ -14,8 +14,7 @@ from rack.boards.config.resolved import loads, wire
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.keys import out_key, step_key
 from rack.boards.lan.link import Arrived
-from rack.boards.lan.lockstep import Barrier
-from rack.boards.lan.step import STEP_KIND, pack_step
+from rack.boards.lan.lockstep import STEP_KIND, Barrier, pack_step
 from tests.boards.lan.conftest import EVERY, LAUNCH
 from tests.boards.lan.racks import rack_text
 

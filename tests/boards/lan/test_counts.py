@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rack.boards.lan.counts import WINDOW, ImportCount, MessageOrder
+from rack.boards.lan.entries import WINDOW, ImportCount, MessageOrder
 from rack.boards.lan.envelope import Envelope
 
 

@@ -112,11 +112,6 @@ def test_what_is_not_pem_is_refused(folder: Path, name: str, content: bytes) -> 
     assert f"{name}: no {kind} in PEM form" in flaws(folder)
 
 
-def test_a_secret_of_earlier_versions_is_not_needed_and_in_nobodys_way(folder: Path) -> None:
-    (folder / "secret").write_bytes(bytes(32))
-    assert flaws(folder) == []
-
-
 def test_a_key_of_another_kind_is_refused(folder: Path) -> None:
     for key in (ec.generate_private_key(ec.SECP384R1()), Ed25519PrivateKey.generate()):
         form = serialization.PrivateFormat.PKCS8

@@ -15,13 +15,12 @@ from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
 from rack.backplane.words import Block
 from rack.boards.config.resolved import loads
-from rack.boards.lan.adapter import LanAdapter
+from rack.boards.lan.adapter import LanAdapter, status_of
 from rack.boards.lan.entries import Import
 from rack.boards.lan.envelope import Envelope, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import Arrived
-from rack.boards.lan.messages import status_of
 from rack.boards.lan.peers import PeerRack
 from rack.boards.run.ports import OutputPort
 from tests.boards.lan.conftest import EVERY, LAUNCH, Network

@@ -25,7 +25,15 @@ from rack.boards.config.resolved import loads
 from rack.boards.crate.clean import remove_dead
 from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence
-from tests.boards.lan.racks import ROOT, RackProcess, configs, endpoints, rack_text, started
+from tests.boards.lan.racks import (
+    LAUNCH_S,
+    ROOT,
+    RackProcess,
+    configs,
+    endpoints,
+    rack_text,
+    started,
+)
 from tests.machine import needs_fifo
 from tests.processes import BOUND_S, wait_until
 
@@ -33,7 +41,6 @@ pytestmark = pytest.mark.slow
 
 SECONDS = 120.0
 """Longest run of a rack: the tests end them long before."""
-LAUNCH_S = 60.0
 GENTLE = ("adapter.lan.lease_ms=1000",)
 """Longer than any pause of a loaded machine."""
 

@@ -7,11 +7,11 @@ from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.resolved import loads
+from rack.boards.lan.adapter import status_of
 from rack.boards.lan.entries import Export
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.messages import status_of
 from tests.boards.lan.conftest import EVERY, LAUNCH, Network
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from rack.boards.lan.awaited import Why, word_of
-from rack.boards.lan.lockstep import NEVER, Partner
+from rack.boards.lan.lockstep import NEVER, Partner, Step, StepFlag
 from rack.boards.lan.peers import NONE
-from rack.boards.lan.step import Step, StepFlag
 
 
 def step(time_ns: int, flags: int = 0) -> Step:

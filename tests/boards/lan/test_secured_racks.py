@@ -11,9 +11,11 @@ import pytest
 from rack.backplane.errors import BackplaneError
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
+from rack.boards.config import load, resolve
+from rack.boards.errors import ConfigError
 from rack.tools.network.certificates import make_credentials
-from tests.boards.lan.forger import FORGED
-from tests.boards.lan.racks import configs, endpoints, rack_text, started
+from tests.boards.lan.forger import FORGED, LATER
+from tests.boards.lan.racks import LAUNCH_S, configs, endpoints, rack_text, started
 from tests.boards.lan.test_strangers import running
 from tests.processes import wait_until
 
@@ -51,7 +53,7 @@ def taken(rack: str) -> int:
 def test_racks_exchange_mailboxes(names: list[str], tmp_path: Path) -> None:
     with ExitStack() as stack:
         racks = [stack.enter_context(started(tmp_path / f"rack-{at}.toml")) for at in range(2)]
-        wait_until(lambda: all(taken(name) > 3 for name in names))
+        wait_until(lambda: all(taken(name) > 3 for name in names), LAUNCH_S)
         for rack in racks:
             rack.send(signal.SIGTERM)
         for rack in racks:
@@ -61,8 +63,8 @@ def test_racks_exchange_mailboxes(names: list[str], tmp_path: Path) -> None:
 def test_a_rack_under_another_name_needs_another_certificate(
     names: list[str], tmp_path: Path
 ) -> None:
-    with started(tmp_path / "rack-0.toml", 1.0, f"name={names[0]}x") as process:
-        assert f"{names[0]}x.pem: missing" in process.outcome()["error"]
+    with pytest.raises(ConfigError, match=rf"{names[0]}x\.pem: missing"):
+        resolve(load(tmp_path / "rack-0.toml", [f"name={names[0]}x"]))
 
 
 def test_a_rack_that_speaks_in_the_name_of_another_is_refused(
@@ -81,7 +83,7 @@ def test_a_rack_that_speaks_in_the_name_of_another_is_refused(
     with ExitStack() as stack:
         for k in range(2):
             stack.enter_context(started(tmp_path / f"rack-{k}.toml"))
-        wait_until(lambda: taken(names[1]) > ROUNDS)
+        wait_until(lambda: taken(names[1]) > ROUNDS, LAUNCH_S)
         members = [str(tmp_path / "certs"), "forger", names[0]]
         forger = stack.enter_context(running("forger", *members, *at))
         wait_until(lambda: forger.state()["forged"] > ROUNDS)
@@ -99,6 +101,8 @@ def test_a_rack_that_speaks_in_the_name_of_another_is_refused(
         wait_until(lambda: int(status.peek().value.flaws["unsigned"]) >= did["forged"])
         assert did["opened"] == did["heard"]
         assert imported("refused") >= did["forged"]
-        assert imported("missing") == 0
+        # A message that was forged and taken would make all up to it missing. Some may be: of 32
+        # that wait, the newest stay, and that is 0.1 s of what the forger sends.
+        assert imported("missing") < LATER - 1
         assert 0 < heard.count < heard.total < FORGED
         assert heard.backward == 0

@@ -6,7 +6,7 @@ import pytest
 
 from rack.boards.lan.envelope import Envelope
 from rack.boards.lan.link import Arrived
-from rack.boards.lan.step import STEP_KIND, Step, StepFlag, pack_step, unpack_step
+from rack.boards.lan.lockstep import STEP_KIND, Step, StepFlag, pack_step, unpack_step
 
 HEAD = Envelope(STEP_KIND, 11, 1, 1, 40, 100_000_000, 0, StepFlag.OVER)
 EXPORTS = (

@@ -330,6 +330,7 @@ class Line(EstopSession):
     def __init__(self, *answers: int | None, wait_s: float = 0.0) -> None:
         self._address, self._operator = RackAddress("127.0.0.1", 7447, "cell"), Operator()
         self._launches = {"cell": 1}
+        self._changes = lambda: iter(())
         self._answers = [*answers]
         self._wait_s = wait_s
 

@@ -13,7 +13,7 @@ from functools import partial
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing, wire
 from rack.boards.config import names as bundled
-from rack.boards.config.files import CONFIGS, read
+from rack.boards.config.files import CONFIGS, assembled
 from rack.boards.config.schema import CommandConfig
 from rack.boards.config.wiring import commandable
 from rack.levels.operator import Operation
@@ -114,7 +114,10 @@ def systems() -> list[str]:
     rack, too, that is compared.
     """
     found = sorted(path for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name)
-    names = [path.stem if "adapter" not in read(path) else f"{path.stem}/{ALONE}" for path in found]
+    names = [
+        path.stem if "adapter" not in assembled(path, (), None) else f"{path.stem}/{ALONE}"
+        for path in found
+    ]
     known = bundled()
     return ["nasrem", *(name for name in names if name in known)]
 
