@@ -17,6 +17,7 @@ from rack.boards.config.schema import (
     LONGEST_EVERY,
     SHORTEST_MS,
     BoardConfig,
+    RackConfig,
     ScheduleConfig,
 )
 from rack.boards.config.timing import PLANNER_BUDGET, frames
@@ -111,13 +112,27 @@ def circles(wiring: Wiring) -> Mistakes:
             {name: [upper for upper, lower in links if lower == name] for name in config.board}
         ).prepare()
     except CycleError as error:
-        walk = error.args[1]
-        # The first link of the walk, at whichever of its boards names it.
-        first, second = walk[:2]
-        is_below = second in config.board[first].below
-        board, key, other = (first, "below", second) if is_below else (second, "above", first)
-        why = f"the levels form a circle, {' -> '.join(walk)}"
+        circle = error.args[1][:-1]
+        pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
+        # The link that only one of its boards names is the likely mistake.
+        upper, lower = min(reversed(pairs), key=lambda link: len(_named_by(config, *link)))
+        board, key, end = _named_by(config, upper, lower)[0]
+        at = circle.index(lower)
+        walk = " -> ".join([*circle[at:], *circle[:at], lower])
+        why = f"the levels form a circle, {walk}; the {end} level has no {key}"
+        other = upper if board == lower else lower
         yield Mistake(f"board.{board}.{key}", other, why)
+
+
+def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
+    """Return board and key of every table that puts one board above another, and the end of a
+    hierarchy without it."""
+    tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
+    return [
+        (board, key, end)
+        for board, key, end, other in tables
+        if other in getattr(config.board[board], key)
+    ]
 
 
 def slots(wiring: Wiring) -> Mistakes:

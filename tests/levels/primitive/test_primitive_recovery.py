@@ -276,6 +276,6 @@ def test_set_points_never_jump_however_often_boards_are_lost(seed: int) -> None:
 def test_motion_that_is_found_at_the_end_of_its_path_is_finished() -> None:
     for length in np.random.default_rng(4).uniform(0.1, 9.0, 200):
         line = BlendedPath([[0.0], [length]], [0.0, 0.0])
-        motion = PathMotion(line, Limits(*np.ones((5, 1))), bridging_s=0.5)
+        motion = PathMotion(line, Limits(*np.ones((4, 1))), bridging_s=0.5)
         motion.rest_near(np.array([length]), progress=1.0)
         assert motion.finished
