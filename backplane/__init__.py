@@ -1,18 +1,76 @@
 """The backplane: one shared-memory segment per rack, with its mailboxes, its clock, and the watches
 on them.
 
-A level's author finds what declares messages, and what reads give, in `rack.levels`. A program that
-looks into a running rack needs `segment` and `mailbox.protocols`:
+A level's author needs `Field`, `command` and `status` to declare messages, `State` for their
+statuses, and `Reading` with its `Verdict` for input ports. A program that looks into a running rack
+needs the rest:
 
-    from rack.backplane.mailbox.protocols import open_observer
-    from rack.backplane.segment import Segment
+    from rack.backplane import Segment, open_observer
 
     segment = Segment.attach("nasrem")
     print(open_observer(segment, "servo.status").peek().value)
 
-- `segment.Segment` is a rack's memory, `layout.Layout` its mailboxes and tasks as plain data.
-- `mailbox.protocols` opens a mailbox under its protocol; `open_observer` never takes its lock.
-- `clock.system_clock.SystemClock` reads the clock; `watch.alarms.Alarm` lists the kinds of alarms;
-  `words.Demand` is the demand of safety on the arm.
-- `errors.BackplaneError` is the root of all errors of this package.
+- `Segment` is a rack's memory, `Layout` its mailboxes and tasks as plain data (`MailboxSpec`,
+  `TaskSpec`).
+- `open_writer` and `open_reader` open a mailbox under its protocol; `open_observer` never takes its
+  lock.
+- `SystemClock` reads the clock; `Alarm` lists the kinds of alarms; `Demand` is the demand of safety
+  on the arm.
+- `BackplaneError` is the root of all errors of this package.
+
+Names are imported on first use: numpy takes a tenth of a second, which `rack list` and the like
+need not wait for.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rack.backplane.exports import on_first_use
+
+if TYPE_CHECKING:
+    from rack.backplane.clock.system_clock import SystemClock
+    from rack.backplane.errors import BackplaneError
+    from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+    from rack.backplane.mailbox.mailbox import Reading, Verdict
+    from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
+    from rack.backplane.message import Field, Message, MessageType, State, command, status
+    from rack.backplane.segment import Segment
+    from rack.backplane.watch.alarms import Alarm
+    from rack.backplane.words import Demand
+
+__all__ = [
+    "Alarm",
+    "BackplaneError",
+    "Demand",
+    "Field",
+    "Layout",
+    "MailboxSpec",
+    "Message",
+    "MessageType",
+    "Reading",
+    "Segment",
+    "State",
+    "SystemClock",
+    "TaskSpec",
+    "Verdict",
+    "command",
+    "open_observer",
+    "open_reader",
+    "open_writer",
+    "status",
+]
+_PLACES = {
+    "rack.backplane.clock.system_clock": ("SystemClock",),
+    "rack.backplane.errors": ("BackplaneError",),
+    "rack.backplane.layout": ("Layout", "MailboxSpec", "TaskSpec"),
+    "rack.backplane.mailbox.mailbox": ("Reading", "Verdict"),
+    "rack.backplane.mailbox.protocols": ("open_observer", "open_reader", "open_writer"),
+    "rack.backplane.message": ("Field", "Message", "MessageType", "State", "command", "status"),
+    "rack.backplane.segment": ("Segment",),
+    "rack.backplane.watch.alarms": ("Alarm",),
+    "rack.backplane.words": ("Demand",),
+}
+
+if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
+    __getattr__ = on_first_use(__name__, _PLACES)

@@ -66,7 +66,7 @@ MUTANTS = (
         "checksum",
         "corrupt",
         (
-            (SLOTS, "self.words[_CHECK] == xxh3(self.covered, self.words[_CHAIN])", "True"),
+            (SLOTS, "self.chain == xxh3(self.covered, self.words[_CHAIN])", "True"),
             ("backplane/mailbox/mailbox.py", "check != xxh3(self._covered, chain)", "False"),
             ("backplane/watch/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
             (
