@@ -15,11 +15,9 @@ from rack.tools.lab.reproduction.experiments import (
     response,
     sharing,
     switch,
-    systems,
     tables,
     tasks,
 )
-from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import (
     BEHIND,
     BUFFERED,
@@ -31,11 +29,10 @@ from rack.tools.lab.reproduction.experiments.figures import (
     OVERLOAD,
     SHORT_2,
     SHORT_3,
-    FigureRack,
     settings_of,
 )
-from rack.tools.lab.reproduction.experiments.nasrem import NASREM, NasremRun
-from rack.tools.lab.reproduction.page import Evidence, PaperClaim, Section
+from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, NasremRun
+from rack.tools.lab.reproduction.page import PaperClaim, Section
 from rack.tools.lab.reproduction.verdict import ClaimVerdict
 
 
@@ -59,28 +56,6 @@ def _equation(
     )
 
 
-def _figure(
-    name: str,
-    title: str,
-    quote: str,
-    why: str,
-    racks: tuple[FigureRack, ...],
-    judge: Callable[..., ClaimVerdict],
-    predict: Callable[[Workshop], tuple[Evidence, ...]] = lambda workshop: (),
-) -> PaperClaim:
-    """Return a claim on runs of figures, which the page shows."""
-    return PaperClaim(
-        name,
-        title,
-        quote,
-        why,
-        tuple(rack.experiment for rack in racks),
-        judge,
-        predict,
-        True,
-    )
-
-
 def _system(
     name: str,
     title: str,
@@ -95,6 +70,8 @@ def _system(
     return PaperClaim(name, title, quote, why, experiments, partial(judge, rates_hz))
 
 
+SYSTEMS = (NAME, tables.NAME, *tasks.TASKS)
+"""The racks that model systems."""
 HURRIED = ("timing.response_ms=1000",)
 """A response within 1 s is demanded of NASREM's four levels."""
 SECTIONS = (
@@ -116,13 +93,13 @@ SECTIONS = (
         "1",
         "Introduction",
         (
-            _figure(
+            PaperClaim(
                 "speedup",
                 "Speedup by processors",
                 "A robot controller will be characterized as a speedup-oriented multiprocessing"
                 " application.",
                 "A level makes more plans on two processors than on one.",
-                (FIG3, FIG4),
+                (FIG3.experiment, FIG4.experiment),
                 rules.judge_speedup,
             ),
             PaperClaim(
@@ -183,13 +160,13 @@ SECTIONS = (
                 (sharing.CHAINS,),
                 rules.judge_locks,
             ),
-            _figure(
+            PaperClaim(
                 "planner-and-executor",
                 "Planner and executor run at once",
                 "The planner and executor can run concurrently within a level, thus insuring a"
                 " predictable level response.",
                 "No cycle of an executor was late while its planner computed.",
-                (FIG2, FIG4),
+                (FIG2.experiment, FIG4.experiment),
                 rules.judge_both,
             ),
             PaperClaim(
@@ -289,13 +266,13 @@ SECTIONS = (
         "3.3",
         "Higher-Level Timing Requirements",
         (
-            _figure(
+            PaperClaim(
                 "background",
                 "Background input and output",
                 "Increased time at higher levels allows slower options to execute in the"
                 " background, such as secondary data storage.",
                 "Data stored in the background made no cycle late; stored in the cycle they do.",
-                (BEHIND, IN_LINE),
+                (BEHIND.experiment, IN_LINE.experiment),
                 rules.judge_background,
             ),
             PaperClaim(
@@ -338,13 +315,13 @@ SECTIONS = (
                 "fig3",
                 settings_of("fig3", 3.0),
             ),
-            _figure(
+            PaperClaim(
                 "update",
                 "The update of the plan is not preempted",
                 "Mutual exclusion requires a non-preemptable multitasking scheduler to prevent"
                 " preemption of the lower priority planner in its critical section.",
                 "An executor released during the update of its plan waited for the end of it.",
-                (FIG3,),
+                (FIG3.experiment,),
                 rules.judge_update,
             ),
             _equation(
@@ -354,13 +331,13 @@ SECTIONS = (
                 "fig2",
                 ("timing.small_share=0.1",),
             ),
-            _figure(
+            PaperClaim(
                 "slices-and-buffers",
                 "Time slices and double buffers",
                 "... interprocessor communication ... should use a scheme that incorporates time"
                 " slices or double-buffers for plan update.",
                 "With either no cycle of the executor was late.",
-                (FIG4, BUFFERED),
+                (FIG4.experiment, BUFFERED.experiment),
                 rules.judge_both,
             ),
         ),
@@ -369,55 +346,55 @@ SECTIONS = (
         "3.4",
         "Algorithm Timing Analysis",
         (
-            _figure(
+            PaperClaim(
                 "figure-2",
                 "Figure 2: one processor, 8 ms",
                 "All the functions can run tightly-coupled on one processor in one cycle, with"
                 " sufficient residual processing time.",
                 "It works, as the paper says (C: communicate, R: read, X: execute, W: write, P:"
                 " plan, U: update).",
-                (FIG2,),
+                (FIG2.experiment,),
                 rules.judge_working,
                 partial(predictions.predict_figure, FIG2),
             ),
-            _figure(
+            PaperClaim(
                 "figure-2-x",
                 "Figure 2 with X from 1 to 3 ms",
                 "X ... will range from 1 to 3 ms ... The planner runs at least 3 ms. each cycle"
                 " which implies that after two cycles 6 ms. will have been allotted to the"
                 " planner.",
                 "With the longest X both sentences exclude each other. Runs agree.",
-                (SHORT_2, LONG_2),
+                (SHORT_2.experiment, LONG_2.experiment),
                 rules.judge_sweep,
                 predictions.predict_sweep,
             ),
-            _figure(
+            PaperClaim(
                 "figure-3",
                 "Figure 3: one processor, 6 ms",
                 "A 6 ms. response time allows insufficient time for planning, so that within 3"
                 " cycles no updated plan exists.",
                 "It fails with every X, as the paper says.",
-                (FIG3, SHORT_3),
+                (FIG3.experiment, SHORT_3.experiment),
                 rules.judge_failing,
                 partial(predictions.predict_figure, FIG3),
             ),
-            _figure(
+            PaperClaim(
                 "figure-4",
                 "Figure 4: two processors, 6 ms",
                 "The control level effectively meets all timing constraints with some"
                 " computational waste.",
                 "It works, as the paper says.",
-                (FIG4,),
+                (FIG4.experiment,),
                 rules.judge_working,
                 partial(predictions.predict_figure, FIG4),
             ),
-            _figure(
+            PaperClaim(
                 "figure-4-overload",
                 "Figure 4 with X = 4 ms",
                 "If the function X is replaced by a newer version which requires 4 ms. a cycle,"
                 " then the above functional allocation across processors will not work.",
                 "It fails, as the paper says.",
-                (OVERLOAD,),
+                (OVERLOAD.experiment,),
                 rules.judge_failing,
                 partial(predictions.predict_figure, OVERLOAD),
             ),
@@ -481,8 +458,8 @@ SECTIONS = (
                 "These architectures share common characteristics with the concurrent,"
                 " hierarchical control model.",
                 "All systems do their tasks on one set of mechanisms, within their bounds.",
-                (*systems.SYSTEMS, *tasks.TASKS.values()),
-                rules.judge_systems,
+                (NASREM, tables.TABLES, *tasks.TASKS.values()),
+                partial(rules.judge_systems, SYSTEMS),
             ),
             PaperClaim(
                 "two-levels",
@@ -490,7 +467,7 @@ SECTIONS = (
                 "Most systems have at least a two-level hierarchy.",
                 "From the configs alone: no level is faster than one below it.",
                 (),
-                lambda: rules.judge_layers(predictions.promise_systems()),
+                partial(rules.judge_layers, [name for name in SYSTEMS if name != tasks.BROWN]),
             ),
             _system(
                 "rccl",
@@ -565,7 +542,6 @@ SECTIONS = (
                 " and 3.3.",
                 (response.RESPONSE,),
                 rules.judge_predictable,
-                is_pictured=True,
             ),
         ),
     ),

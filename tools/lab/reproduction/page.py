@@ -1,33 +1,30 @@
-"""The page: claims of the paper with predictions, measurements and rulings, as data, as Markdown
-next to its pictures, and as HTML with its pictures in it."""
+"""The page: claims of the paper with predictions, measurements and rulings, as data, as Markdown,
+and as HTML."""
 
 from __future__ import annotations
 
-import re
-from base64 import b64encode
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from jinja2 import Environment, FileSystemLoader
 from markdown_it import MarkdownIt
 from pydantic import TypeAdapter
 
 from rack.tools.console.answer import Document
-from rack.tools.lab.reproduction.experiments.experiment import Experiment, Kept, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Kept
 from rack.tools.lab.reproduction.verdict import Check, ClaimVerdict, Ruling, describe_unmet
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One thing shown for a claim: comparisons, text of fixed width, or a picture in the page's
-    folder. `source` is the command or the run that it comes from."""
+    """One thing shown for a claim: comparisons, or text of fixed width. `source` is the command
+    that it comes from."""
 
     source: str = ""
     checks: tuple[Check, ...] = ()
     text: str = ""
-    picture: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,6 @@ class PaperClaim:
         experiments: Experiments whose records `judge` takes, in this order.
         judge: Its rule.
         predict: Returns what follows from configs alone.
-        is_pictured: Whether the pictures of its experiments are shown.
     """
 
     name: str
@@ -64,12 +60,11 @@ class PaperClaim:
     why: str
     experiments: tuple[Experiment[Any], ...]
     judge: Callable[..., ClaimVerdict]
-    predict: Callable[[Workshop], tuple[Evidence, ...]] = lambda workshop: ()
-    is_pictured: bool = False
+    predict: Callable[[], tuple[Evidence, ...]] = lambda: ()
 
-    def judge_by(self, workshop: Workshop, results: Mapping[str, Kept | str]) -> JudgedClaim:
+    def judge_by(self, results: Mapping[str, Kept | str]) -> JudgedClaim:
         """Return the claim with its ruling; a text among the `results` says why there is none."""
-        unruled = JudgedClaim(self.name, self.title, self.quote, self.predict(workshop))
+        unruled = JudgedClaim(self.name, self.title, self.quote, self.predict())
         found = []
         for one in self.experiments:
             result = results.get(one.name, "not run yet")
@@ -79,33 +74,25 @@ class PaperClaim:
                 return replace(unruled, ruling=Ruling.UNTESTABLE, why=result.lacking)
             found.append(one.record(result.found))
         verdict = self.judge(*found)
-        shown = found if self.is_pictured else []
-        paths = [str(path) for run in shown for path in run.pictures.values()]
-        pictures = [Evidence(path, picture=path) for path in paths]
+        charts = [Evidence(text=run.chart) for run in found if isinstance(run, Charted)]
         return replace(
             unruled,
             ruling=verdict.ruling,
             why=describe_unmet(verdict.checks) or self.why,
-            measured=(*pictures, Evidence(checks=verdict.checks)),
+            measured=(*charts, Evidence(checks=verdict.checks)),
         )
 
 
-@dataclass(frozen=True)
-class Section:
-    """A section of the paper by its number, as in "3.1", or "abstract"."""
-
-    name: str
-    title: str
-    claims: tuple[PaperClaim, ...]
+C = TypeVar("C")
 
 
 @dataclass(frozen=True)
-class JudgedSection:
-    """A section of the page."""
+class Section(Generic[C]):
+    """A section of the paper by its number, as in "3.1", or "abstract", with its claims."""
 
     section: str
     title: str
-    claims: tuple[JudgedClaim, ...]
+    claims: tuple[C, ...]
 
 
 @dataclass(frozen=True)
@@ -114,7 +101,7 @@ class Page:
 
     facts: dict[str, str]
     rulings: dict[Ruling, int]
-    sections: tuple[JudgedSection, ...]
+    sections: tuple[Section[JudgedClaim], ...]
 
     def document(self) -> Document:
         """Return the page as plain data."""
@@ -133,19 +120,13 @@ LABELS = {
 
 
 def render_markdown(page: Page) -> str:
-    """Return the page as Markdown; pictures are linked by their paths in its folder."""
+    """Return the page as Markdown."""
     return _render("page.md.j2", page=page, labels=LABELS)
 
 
-def render_html(markdown: str, folder: Path) -> str:
-    """Return the page, given as Markdown, as HTML; pictures are read from `folder`."""
-
-    def embed(found: re.Match[str]) -> str:
-        data = b64encode((folder / found[1]).read_bytes()).decode()
-        return f'src="data:image/svg+xml;base64,{data}"'
-
-    body = MarkdownIt().enable("table").render(markdown)
-    return _render("page.html.j2", body=re.sub('src="([^"]+)"', embed, body))
+def render_html(markdown: str) -> str:
+    """Return the page, given as Markdown, as HTML."""
+    return _render("page.html.j2", body=MarkdownIt().enable("table").render(markdown))
 
 
 def _render(template: str, **values: Any) -> str:

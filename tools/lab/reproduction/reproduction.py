@@ -22,40 +22,44 @@ from rack.tools.lab.reproduction.experiments.experiment import (
 )
 from rack.tools.lab.reproduction.page import (
     LABELS,
-    JudgedSection,
     Page,
+    PaperClaim,
     Section,
     render_html,
     render_markdown,
 )
 from rack.tools.lab.reproduction.verdict import Ruling
 
+Sections = Sequence[Section[PaperClaim]]
 HTML = "index.html"
 MARKDOWN = "README.md"
 DATA = "paper.json"
 """Forms of the page, in its folder."""
 
 
-def select_sections(names: Sequence[str]) -> list[Section]:
+def select_sections(names: Sequence[str]) -> list[Section[PaperClaim]]:
     """Return the sections of these names, all for none.
 
     Raises:
         Failure: No section has a name.
     """
-    known = {section.name: section for section in SECTIONS}
+    known = {section.section: section for section in SECTIONS}
     if unknown := [name for name in names if name not in known]:
         raise Failure(f"--only {unknown[0]}: no such section; permitted: {', '.join(known)}", 2)
     return [known[name] for name in names or known]
 
 
-def list_experiments(sections: Sequence[Section]) -> list[Experiment[Any]]:
+def list_experiments(sections: Sections) -> list[Experiment[Any]]:
     """Return the experiments of these sections, each once."""
     claims = (claim for section in sections for claim in section.claims)
     return list({one.name: one for claim in claims for one in claim.experiments}.values())
 
 
 def reproduce(
-    wanted: Sequence[Section], workshop: Workshop, progress: Progress, again: bool = False
+    wanted: Sections,
+    workshop: Workshop,
+    progress: Progress,
+    again: bool = False,
 ) -> Page:
     """Make what is still to be made for these sections and write the page of all into the folder.
 
@@ -100,25 +104,21 @@ def _write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
         if isinstance(one, Kept):
             facts[name] = f"{one.made_at}, {one.took_s:g} s {one.lacking}"
     sections = tuple(
-        JudgedSection(
-            section.name,
-            section.title,
-            tuple(claim.judge_by(workshop, results) for claim in section.claims),
-        )
-        for section in SECTIONS
+        Section(one.section, one.title, tuple(claim.judge_by(results) for claim in one.claims))
+        for one in SECTIONS
     )
     rulings = [claim.ruling for section in sections for claim in section.claims]
     page = Page(facts, {ruling: rulings.count(ruling) for ruling in LABELS}, sections)
     markdown = render_markdown(page)
     write_file(workshop.folder / MARKDOWN, markdown)
-    write_file(workshop.folder / HTML, render_html(markdown, workshop.folder))
+    write_file(workshop.folder / HTML, render_html(markdown))
     write_json(workshop.folder / DATA, page.document())
     return page
 
 
-def has_worked(page: Page, wanted: Sequence[Section]) -> bool:
+def has_worked(page: Page, wanted: Sections) -> bool:
     """Return whether every claim of these sections was tested, and none that should hold failed."""
-    names = [section.name for section in wanted]
+    names = [section.section for section in wanted]
     return not any(
         claim.ruling in (Ruling.FAILS, Ruling.UNMADE)
         for section in page.sections

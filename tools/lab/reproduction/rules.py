@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from math import inf
+from collections.abc import Iterable, Mapping
+from math import ceil, inf
 
-from rack.boards.config import load, wire
+from rack.boards.config import load, rack_timing, wire
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.lab.reproduction.experiments import (
     deadline,
@@ -24,13 +23,12 @@ from rack.tools.lab.reproduction.experiments.figures import (
     MS,
     PLANNER,
     FigureRun,
-    Planning,
-    sweep,
+    settings_of,
 )
 from rack.tools.lab.reproduction.experiments.nasrem import NAME, NasremRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
-from rack.tools.lab.reproduction.experiments.systems import SystemFigures, SystemPrediction
+from rack.tools.lab.reproduction.experiments.systems import prediction
 from rack.tools.lab.reproduction.experiments.tasks import LATER_MS, NetworkRun, TaskRun
 from rack.tools.lab.reproduction.verdict import (
     STRAY,
@@ -62,6 +60,11 @@ NOMINAL = 0.01
 FEW = 0.01
 """Share of missed cycles or plans up to which they are stray ones."""
 ROUNDING_MS = 1e-6
+
+
+def check_done(*runs: TaskRun) -> list[Check]:
+    """Compare the tasks that were not done with none."""
+    return check_none(tasks_not_done=sum(run.ended != DONE for run in runs))
 
 
 def judge_determinism(found: determinism.ComparedRuns) -> ClaimVerdict:
@@ -127,12 +130,9 @@ def judge_replication() -> ClaimVerdict:
 def judge_communication(found: NasremRun, partitions: partition.Partitions) -> ClaimVerdict:
     """Compare the processor time of communication with what a second processor takes off one, ms a
     second."""
-    communication = sum(
-        (task.phases.exchange.p50 + task.phases.read.p50 + task.phases.write.p50) / task.slice_ms
-        for task in found.executors.values()
-    )
+    communication = sum(task.communication_us / task.slice_ms for task in found.executors.values())
     loads = {one.partition: one.loads.values() for one in partitions.partitions}
-    one, two = (loads[partition.Partition("tight", cores).name] for cores in (1, 2))
+    one, two = (loads[partition.Partition("tight", cores)] for cores in (1, 2))
     saved = 1e3 * (sum(one) - max(two))
     return rule_on(compare("communication_ms_per_s", communication, "<", saved))
 
@@ -140,22 +140,19 @@ def judge_communication(found: NasremRun, partitions: partition.Partitions) -> C
 def judge_flow(found: NasremRun) -> ClaimVerdict:
     """Compare the commands and statuses of the levels with what the ticks of their writers
     demand."""
-    ways = [
-        [box for box in found.mailboxes if box.mailbox.endswith(way)]
-        for way in (".command", ".status")
-    ]
+    ways = [[box for box in found.due if box.endswith(way)] for way in (".command", ".status")]
     boxes = [box for way in ways for box in way]
     # A run may end before the last one is written.
-    lacking = sum(max(0, box.due - 1 - box.messages) for box in boxes)
-    used = sum(any(box.messages for box in way) for way in ways)
-    due = sum(box.due for box in boxes)
+    lacking = sum(max(0, found.due[box] - 1 - found.messages[box]) for box in boxes)
+    used = sum(any(found.messages[box] for box in way) for way in ways)
+    due = sum(found.due[box] for box in boxes)
     return rule_strays("messages_lacking", lacking, due, compare("ways", used, "=", len(ways)))
 
 
 def judge_loop(found: NasremRun) -> ClaimVerdict:
     """Compare the cycles that missed their bound with all."""
     tasks = found.executors.values()
-    bad = sum(task.missed + task.skipped for task in tasks)
+    bad = sum(task.missed for task in tasks)
     return rule_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
@@ -204,14 +201,14 @@ def judge_equation(number: str, found: NasremRun) -> ClaimVerdict:
 def judge_sum(found: NasremRun) -> ClaimVerdict:
     """Compare the longest responses with the sum alone, ms; within bounds, with the sum and its
     waits, which a missed cycle may prolong."""
-    ways = {"command_ms": found.response.command, "status_ms": found.response.status}
-    delays = [one["delayed_by"] for way in ways.values() for one in way.beyond]
+    assert found.response is not None, "it is a hierarchy"
+    ways = found.response.ways
     checks = [
-        compare(name, way.measured_ms.max, "<=", found.response.sum_eq_3_3_ms)
+        compare(f"{name}_ms", way.longest_ms, "<=", found.response.sum_eq_3_3_ms)
         for name, way in ways.items()
-        if way.measured_ms is not None
+        if way.longest_ms is not None
     ]
-    unexplained = sum(not any("missed" in delay for delay in each) for each in delays)
+    unexplained = sum(way.unexplained for way in ways.values())
     return rule_on(
         *checks,
         here=check_none(beyond_grid_without_miss=unexplained),
@@ -234,23 +231,21 @@ def judge_background(behind: FigureRun, in_line: FigureRun) -> ClaimVerdict:
 def judge_loose(plain: NetworkRun, later: NetworkRun) -> ClaimVerdict:
     """Compare the servo rack's cycles, and when it responds to the machine above, with a network
     and with a slower one."""
-    runs = plain, later
     later_ms = 0.0
     if plain.response_ms is not None and later.response_ms is not None:
         later_ms = later.response_ms - plain.response_ms
     always = [
-        *check_none(tasks_not_done=sum(run.ended != DONE for run in runs)),
+        *check_done(plain, later),
         compare("response_off_expected_ms", abs(later_ms - LATER_MS), "<=", EXCHANGE_MS),
     ]
-    missed = max(run.servo_missed for run in runs)
+    missed = max(plain.servo_missed, later.servo_missed)
     share = compare("servo_missed_share", missed, "<=", STRAY)
     return rule_on(*check_none(servo_missed_share=missed), *always, here=[share, *always])
 
 
 def judge_waits(found: Waits) -> ClaimVerdict:
     """Compare how late cycles start after polling, and after blocking, us."""
-    blocks, polls = (found.late_us[wake]["p50"] for wake in ("signal", "poll"))
-    return rule_on(compare("polling_late_median_us", polls, "<", blocks))
+    return rule_on(compare("polling_late_median_us", found.polling_us, "<", found.blocking_us))
 
 
 def judge_update(found: FigureRun) -> ClaimVerdict:
@@ -292,19 +287,25 @@ def judge_failing(found: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
     return rule_on(usual, *shortest, here=[usual], needs=_undisturbed(found))
 
 
-def check_planning(one: Planning) -> tuple[Check, Check]:
-    """Compare a figure with one X with both sentences on its planner: at least `LEAST_P_MS` in each
-    cycle, and a plan in the cycles permitted."""
-    cycles = inf if one.cycles_once is None else one.cycles_once
+def check_planning(process_ms: float) -> tuple[Check, Check]:
+    """Compare figure 2 with this X, ms, with both sentences on its planner: at least `LEAST_P_MS`
+    in each cycle, and a plan in the cycles permitted."""
+    config = load(FIG2.config, settings_of(FIG2.config, process_ms))
+    level = rack_timing(config, wire(config)).level(LEVEL)
+    # As the pattern "RXWPU" reads, U too is in every cycle; for a plan to be done, it is once.
+    each_ms = (level.residual_ns - level.update_ns) * MS
+    work_ns = (level.plan_ns or 0) + level.update_ns
+    cycles = ceil(work_ns / level.residual_ns) if level.residual_ns > 0 else inf
+    permitted = level.within_cycles or 0
     return (
-        compare(f"X={one.process_ms:g} planner_ms_per_cycle", one.each_ms, ">=", LEAST_P_MS),
-        compare(f"X={one.process_ms:g} cycles_per_plan", cycles, "<=", one.permitted),
+        compare(f"X={process_ms:g} planner_ms_per_cycle", each_ms, ">=", LEAST_P_MS),
+        compare(f"X={process_ms:g} cycles_per_plan", cycles, "<=", permitted),
     )
 
 
 def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
     """Compare two sentences of the paper with each other, by computation and by two runs."""
-    odd = sum(bool(describe_unmet(check_planning(one))) for one in sweep(FIG2.config, PAPER_X))
+    odd = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X)
     return rule_on(
         compare("contradicting_X", odd, ">=", 1),
         _compare_late(short, "<=", "shortest_X_late_share"),
@@ -315,13 +316,10 @@ def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
 
 def judge_tables(found: tables.TableRuns) -> ClaimVerdict:
     """Compare the state transitions of a run with a disturbance with those of a run without."""
-    runs = found.disturbed, found.undisturbed
-    disturbed, usual = (
-        {(level, row.name) for level, rows in run.rows.items() for row in rows} for run in runs
-    )
+    answering = {*found.disturbed.rows} - {*found.undisturbed.rows}
     return rule_on(
-        *check_none(tasks_not_done=sum(not run.worked for run in runs)),
-        compare("answering_transitions", len(disturbed - usual), ">=", 1),
+        *check_done(found.disturbed, found.undisturbed),
+        compare("answering_transitions", len(answering), ">=", 1),
     )
 
 
@@ -329,13 +327,12 @@ def judge_levels(found: NasremRun) -> ClaimVerdict:
     """Compare the rates of the levels with the paper's, or else with the config's, and the gaps
     between their cycles with two periods: from there on a cycle was left out."""
     config = load(NAME)
-    rates = [compare("tasks_done", found.ended == DONE, "=", 1)]
+    rates = check_done(found)
     gaps = []
     for name, task in found.executors.items():
         every = config.every(name)
         own_hz = 1e9 / (every * config.clock_ns)
-        done = task.cycles + task.start_up + task.stalled
-        rate_hz = own_hz * done / -(-found.ticks // every)
+        rate_hz = own_hz * task.done / -(-found.ticks // every)
         nominal_hz = PAPER_HZ.get(name, own_hz)
         off = abs(rate_hz / nominal_hz - 1.0)
         rates.append(compare(f"{name}_off_{nominal_hz:g}_Hz_share", off, "<=", NOMINAL))
@@ -345,10 +342,9 @@ def judge_levels(found: NasremRun) -> ClaimVerdict:
 
 def judge_switch(found: SwitchRun) -> ClaimVerdict:
     """Compare this machine's switch with the paper's, and with what the config assumes, us."""
-    times_us = found.cost.switch_us
     return rule_on(
-        compare("switch_median_us", times_us["p50"], "<=", PAPER_US),
-        compare("switch_p99_us", times_us["p99"], "<=", found.assumed_us),
+        compare("switch_median_us", found.switch_us["p50"], "<=", PAPER_US),
+        compare("switch_p99_us", found.switch_us["p99"], "<=", found.assumed_us),
         holding=Ruling.BOUNDED,
     )
 
@@ -356,65 +352,57 @@ def judge_switch(found: SwitchRun) -> ClaimVerdict:
 def judge_figure_5(found: partition.Partitions) -> ClaimVerdict:
     """Compare what levels miss by partition: do slow levels do with multitasking, and do fast ones
     need more?"""
-    places = figure5.placed(load(NAME))
-    regions = {one.level: figure5.region_of(one.cycle_s).name for one in places}
-    due: Counter[str] = Counter()
-    bad: Counter[str] = Counter()
-    plans = []
-    for one in found.partitions:
-        for level in one.levels:
-            is_slow = regions.get(level.level) == "multitasking"
-            group = "slow" if is_slow else one.partition.partition(",")[0]
-            if level.planner is not None:
-                plans.append(level.planner.cycles)
-            for task in filter(None, (level.executor, level.planner)):
-                due[group] += task.cycles
-                bad[group] += task.missed + task.skipped
-    slow, tight, loose = (bad[group] / max(due[group], 1) for group in ("slow", "tight", "loose"))
-    slow_ones = compare("slow_levels_missed_share", slow, "<=", FEW)
+    is_slow = {
+        one.level: figure5.region_of(one.cycle_s).name == "multitasking"
+        for one in figure5.placed(load(NAME))
+    }
+    tasks = [
+        ("slow" if is_slow.get(task.board) else one.partition.coupling, task)
+        for one in found.partitions
+        for task in one.tasks
+    ]
+
+    def missed_share(group: str) -> float:
+        own = [task for name, task in tasks if name == group]
+        return sum(task.missed for task in own) / max(sum(task.cycles for task in own), 1)
+
+    slow_ones = compare("slow_levels_missed_share", missed_share("slow"), "<=", FEW)
+    most = missed_share("loose") + FEW
+    plans = min((task.cycles for _, task in tasks if task.role == "planner"), default=0)
     return rule_on(
         slow_ones,
-        compare("fast_levels_missed_share", tight, ">", loose + FEW),
+        compare("fast_levels_missed_share", missed_share("tight"), ">", most),
         here=[slow_ones],
-        needs=[compare("fewest_plans", min(plans, default=0), ">=", 1)],
+        needs=[compare("fewest_plans", plans, ">=", 1)],
     )
 
 
-def judge_systems(*each: SystemFigures | TaskRun) -> ClaimVerdict:
-    """Compare the responses of all systems with their bounds, ms; a missed cycle may prolong them.
-
-    Their whole tasks are done in real time.
-    """
-    found = [run for run in each if isinstance(run, SystemFigures)]
-    worked = check_none(
-        tasks_not_done=sum(isinstance(run, TaskRun) and run.ended != DONE for run in each),
-        **{f"{one.rack}_failed": not one.worked for one in found},
-    )
-    responses = [(one, list(_check_responses(one))) for one in found]
-    unexplained = sum(
-        one.realtime.missed == 0.0 and bool(describe_unmet(checks)) for one, checks in responses
-    )
+def judge_systems(names: Iterable[str], *found: TaskRun | tables.TableRuns) -> ClaimVerdict:
+    """Compare the responses in whole tasks of these systems with their bounds, ms; a missed cycle
+    may prolong them."""
+    runs = [run.disturbed if isinstance(run, tables.TableRuns) else run for run in found]
+    ways = {
+        f"{name}_{way}_ms": response
+        for name, run in zip(names, runs, strict=True)
+        if run.response is not None
+        for way, response in run.response.ways.items()
+        if response.longest_ms is not None
+    }
+    always = check_done(*runs)
+    late = sum(way.unexplained for way in ways.values())
     return rule_on(
-        *worked,
-        *(check for _, checks in responses for check in checks),
-        here=[*worked, *check_none(late_without_miss=unexplained)],
+        *always,
+        *(
+            compare(name, way.longest_ms or 0.0, "<=", way.bound_ms + ROUNDING_MS)
+            for name, way in ways.items()
+        ),
+        here=[*always, *check_none(late_without_miss=late)],
     )
 
 
-def _check_responses(one: SystemFigures) -> Iterator[Check]:
-    """Compare the longest responses of a run with those predicted, ms."""
-    ran, said = one.realtime, one.predicted
-    ways = {"command": (ran.command_ms, said.command_ms), "status": (ran.status_ms, said.status_ms)}
-    for way, (times, most_ms) in ways.items():
-        if times is not None:
-            yield compare(f"{one.rack}_{way}_ms", times["max"], "<=", most_ms + ROUNDING_MS)
-    if ran.hold is not None and ran.hold.measured_ms is not None:
-        most_ms = ran.hold.longest_ms + ROUNDING_MS
-        yield compare(f"{one.rack}_hold_ms", ran.hold.measured_ms, "<=", most_ms)
-
-
-def judge_layers(promised: Mapping[str, SystemPrediction]) -> ClaimVerdict:
-    """Count levels, and the systems in which a level is faster than one below it."""
+def judge_layers(names: Iterable[str]) -> ClaimVerdict:
+    """Count levels in configs, and the systems in which a level is faster than one below it."""
+    promised = {name: prediction(load(name)) for name in names}
     inverted = sum(sorted(said.rates_hz) != list(said.rates_hz) for said in promised.values())
     levels = (
         compare(f"{name}_levels", len(said.levels), ">=", 2) for name, said in promised.items()
@@ -442,7 +430,7 @@ def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
 
 def _check_links(rates_hz: Mapping[str, int], found: TaskRun) -> list[Check]:
     checks = [
-        compare("tasks_done", found.ended == DONE, "=", 1),
+        *check_done(found),
         compare("missed_share", found.missed, "<=", STRAY),
     ]
     for box, rate_hz in rates_hz.items():

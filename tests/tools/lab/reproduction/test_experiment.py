@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -25,10 +25,9 @@ from rack.tools.lab.reproduction.experiments.experiment import (
 
 @dataclass(frozen=True)
 class Times:
-    """How often an experiment was made, and its pictures."""
+    """How often an experiment was made."""
 
     times: int
-    pictures: dict[str, Path] = field(default_factory=dict)
 
 
 class Counted:
@@ -39,9 +38,7 @@ class Counted:
 
     def make(self, workshop: Workshop) -> Times:
         self.times += 1
-        path = workshop.picture("one").with_suffix(".svg")
-        path.write_text("<svg/>")
-        return Times(self.times, {"one": workshop.shown([path])})
+        return Times(self.times)
 
     def experiment(self) -> Experiment[Times]:
         return Experiment("counted", "counting", 1.0, Times, self.make)
@@ -64,13 +61,6 @@ def test_a_result_is_kept_until_the_program_changes(
     monkeypatch.setattr(experiment, "program", lambda: "another")
     assert kept(one, workshop.folder) is None
     assert made(one, workshop).found["times"] == 2
-
-
-def test_a_result_whose_picture_is_gone_is_made_again(workshop: Workshop) -> None:
-    one = Counted().experiment()
-    found = made(one, workshop)
-    (workshop.folder / found.found["pictures"]["one"]).unlink()
-    assert kept(one, workshop.folder) is None
 
 
 @pytest.mark.parametrize(

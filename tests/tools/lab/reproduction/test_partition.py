@@ -35,8 +35,8 @@ plan_ms = 8.0
 
 def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
     config = load("nasrem")
-    found = {partition.name: partition.of(config) for partition in PARTITIONS}
-    assert list(found) == ["tight, 1 core", "loose, 1 core", "tight, 2 cores", "loose, 2 cores"]
+    found = {f"{one.coupling}, {one.cores}": one.of(config) for one in PARTITIONS}
+    assert list(found) == ["tight, 1", "loose, 1", "tight, 2", "loose, 2"]
     for name, rack in found.items():
         planned = [board for board in rack.board.values() if board.planner is not None]
         assert {board.coupling for board in planned} == {name.partition(",")[0]}
@@ -50,8 +50,8 @@ def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
             if slot
         ]
         assert len(slots) == len(set(slots)) == len(rack.board) + 4 * name.startswith("loose")
-    assert found["loose, 2 cores"].board["servo"].planner_core == 0
-    assert found["tight, 2 cores"].board["world"].coupling == "none"
+    assert found["loose, 2"].board["servo"].planner_core == 0
+    assert found["tight, 2"].board["world"].coupling == "none"
 
 
 def test_a_board_that_polls_cannot_share_the_only_core() -> None:
@@ -80,15 +80,13 @@ def test_partitions_are_run_and_measured_one_after_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = partitioned(PLANNED, 0.3, tmp_path, monkeypatch)
-    assert [one.partition for one in found.partitions] == [one.name for one in PARTITIONS]
+    assert tuple(one.partition for one in found.partitions) == PARTITIONS
     for one in found.partitions:
-        wave, watch = one.levels
-        assert (wave.level, watch.level) == ("wave", "watch")
-        assert 0 < wave.executor.cycles <= 120
-        assert wave.plan_age_ms is not None
-        # A plan is read from the end of its slice on, four cycles after its release.
-        assert wave.plan_age_ms["min"] >= 10.0
-        assert (watch.planner, wave.executor.fits) == (None, None)
+        cycles = {(task.board, task.role): task.cycles for task in one.tasks}
+        assert cycles.keys() == {("wave", "executor"), ("wave", "planner"), ("watch", "executor")}
+        assert 0 < cycles["wave", "executor"] <= 120
+        assert 0 < cycles["wave", "planner"] < cycles["wave", "executor"]
+        assert all(0.0 < load < 1.0 for load in one.loads.values())
 
 
 @pytest.mark.slow
@@ -99,11 +97,13 @@ def test_predictions_from_budgets_agree_with_measurements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measured = partitioned(SLOW_PLANS, 0.6, tmp_path, monkeypatch)
-    found = {one.partition: one.levels[0] for one in measured.partitions}
-    tight, loose = found["tight, 2 cores"].planner, found["loose, 2 cores"].planner
-    assert tight is not None
-    assert loose is not None
-    assert (tight.fits, loose.fits) == (False, True)
+    found = {
+        one.partition: task
+        for one in measured.partitions
+        for task in one.tasks
+        if task.role == "planner"
+    }
+    tight, loose = (found[Partition(coupling, 2)] for coupling in ("tight", "loose"))
     # On its executor's core the planner needs four cycles and has three: plans are late, but for
     # those that the executor did not disturb. On its own core hardly one is.
     assert tight.cycles > 5

@@ -19,7 +19,7 @@ from rack.tools.lab.reproduction.experiments.response import (
     RUN_S,
     draw_commands,
     first_difference,
-    measure,
+    measure_response,
 )
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
@@ -55,7 +55,7 @@ def test_the_torque_of_a_run_differs_from_its_twins_at_the_predicted_ticks(
     monkeypatch.setattr(response, "RUN_S", 6.9)
     workshop = Workshop(tmp_path, share=True)
     workshop.prepare()
-    found = measure(workshop, "lockstep", twins=2)
+    found = measure_response(workshop, "lockstep", twins=2)
     assert found.response.held
     assert len(found.response.measured) == len(given)
     # 2243 is read at 2248, and at 2256; 2500 at 2600, 2704 and 2712.

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,25 +13,24 @@ from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
 from rack.tools.lab.reproduction.experiments.deadline import GotoRun, GotoRuns
 from rack.tools.lab.reproduction.experiments.determinism import ComparedRun, ComparedRuns
-from rack.tools.lab.reproduction.experiments.experiment import Kept, Workshop
+from rack.tools.lab.reproduction.experiments.experiment import Kept
 from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
-from rack.tools.lab.reproduction.experiments.nasrem import (
-    MeasuredVerdict,
-    NasremRun,
-    Percentiles,
-    SystemResponse,
-    WayResponse,
-)
+from rack.tools.lab.reproduction.experiments.nasrem import MeasuredVerdict, NasremRun
 from rack.tools.lab.reproduction.experiments.partition import (
-    LevelFigures,
+    Partition,
     PartitionFigures,
     Partitions,
     TaskFigures,
 )
 from rack.tools.lab.reproduction.experiments.sharing import ChainRun, Chains
-from rack.tools.lab.reproduction.experiments.switch import SwitchCost, SwitchRun
-from rack.tools.lab.reproduction.experiments.tables import FiredRow, TableRun, TableRuns
-from rack.tools.lab.reproduction.experiments.tasks import NetworkRun
+from rack.tools.lab.reproduction.experiments.switch import SwitchRun
+from rack.tools.lab.reproduction.experiments.systems import (
+    SystemResponse,
+    WayResponse,
+    response_from,
+)
+from rack.tools.lab.reproduction.experiments.tables import TableRun, TableRuns
+from rack.tools.lab.reproduction.experiments.tasks import TASKS, NetworkRun, TaskRun
 from rack.tools.lab.reproduction.reproduction import SECTIONS, list_experiments, select_sections
 from rack.tools.lab.reproduction.rules import DONE
 from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
@@ -43,13 +41,13 @@ CLAIMS = {claim.name: claim for section in SECTIONS for claim in section.claims}
 NUMBERS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
 EQUATIONS = [f"equation-3.{number}" for number in range(1, 11)]
 HOLDS, BOUNDED, FAILS = Ruling.HOLDS, Ruling.BOUNDED, Ruling.FAILS
-NO_TIMES = Percentiles(1.0, 3.0)
-WAY = WayResponse(NO_TIMES, ())
-RUN = NasremRun("task done", 800, (), {}, SystemResponse(4.0, WAY, WAY), ())
+WAY = WayResponse(3.0, 5.0, 0)
+RESPONSE = SystemResponse(4.0, {"command": WAY, "status": WAY})
+RUN = NasremRun(DONE, 2.0, 0.0, {}, RESPONSE, 800, (), {}, {})
 
 
 def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_order() -> None:
-    assert [section.name for section in SECTIONS] == NUMBERS
+    assert [section.section for section in SECTIONS] == NUMBERS
     assert sum(len(section.claims) for section in SECTIONS) == len(CLAIMS)
     assert [name for name in CLAIMS if name.startswith("equation-")] == EQUATIONS
     assert {f"figure-{n}" for n in range(1, 6)} <= CLAIMS.keys()
@@ -62,9 +60,9 @@ def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_or
 
 @pytest.mark.parametrize("name", EQUATIONS)
 def test_each_equation_holds_in_nasrem_and_fails_in_the_rack_that_is_to_show_it(
-    name: str, tmp_path: Path
+    name: str,
 ) -> None:
-    nasrem, failing = CLAIMS[name].predict(Workshop(tmp_path, share=True))
+    nasrem, failing = CLAIMS[name].predict()
     assert nasrem.checks
     assert describe_unmet(nasrem.checks) == ""
     if name == "equation-3.7":
@@ -107,24 +105,20 @@ def chains(lockstep: dict[int, int], realtime: dict[int, int]) -> Chains:
 
 def goto(refused: bool, done_s: float) -> GotoRuns:
     """Return runs with a time that is too early, and by 10 s."""
-    soft = GotoRun(None, 9.0, None, True, "task done", "")
-    early = replace(soft, by_s=4.0, done_s=None if refused else 5.0, moved=not refused)
-    return GotoRuns((0.0, 0.0, 0.0), soft, early, replace(soft, by_s=10.0, done_s=done_s))
+    early = GotoRun(4.0, None if refused else 5.0, None, not refused)
+    return GotoRuns(early, GotoRun(10.0, done_s, None, True))
 
 
-def tables(*rows: str, worked: bool = True) -> TableRuns:
+def tables(*rows: str, ended: str = DONE) -> TableRuns:
     """Return runs of which the undisturbed one fires the row "pick" alone."""
-    disturbed, calm = (
-        TableRun({"elemental_move": tuple(FiredRow(name, 1, 1.0) for name in names)}, done)
-        for names, done in ((rows, worked), (("pick",), True))
-    )
-    return TableRuns(disturbed, calm)
+    calm = TableRun(DONE, 9.0, 0.0, {}, None, ("pick",))
+    return TableRuns(replace(calm, ended=ended, rows=rows), calm)
 
 
 def background(late: int, blocks: int, in_line: int) -> tuple[FigureRun, FigureRun]:
     """Return a level of 100 cycles that stores blocks in the background, and in the cycle."""
     behind, line = (
-        FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, 0, 0, {})
+        FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, 0, 0)
         for bad in (late, in_line)
     )
     return behind, line
@@ -134,30 +128,27 @@ def networks(
     missed: float, response_ms: float | None, ended: str = DONE
 ) -> tuple[NetworkRun, NetworkRun]:
     """Return a run of two racks, and one with a network slower by 100 ms."""
-    plain = NetworkRun(DONE, 8.0, 0.0, {}, 0.0, 50.0)
+    plain = NetworkRun(DONE, 8.0, 0.0, {}, None, 0.0, 50.0)
     return plain, replace(plain, ended=ended, servo_missed=missed, response_ms=response_ms)
 
 
 def switch(assumed_us: float) -> SwitchRun:
     """Return a context switch of 5 us."""
     times = {"min": 4.0, "p50": 5.0, "p99": 9.0, "p99_9": 9.0, "max": 12.0}
-    return SwitchRun(SwitchCost(1, 1000, times, times, times), assumed_us)
+    return SwitchRun(times, assumed_us)
 
 
 def partitions(slow: int, fast: int, plans: int) -> Partitions:
     """Return what levels miss of 100 cycles: a slow one, and a fast one on one processor."""
 
-    def figures(partition: str, missed: dict[str, int]) -> PartitionFigures:
-        planner = TaskFigures(plans, 0, 0, None)
-        levels = (
-            LevelFigures(level, TaskFigures(100, bad, 0, None), planner, None)
-            for level, bad in missed.items()
-        )
-        return PartitionFigures(partition, tuple(levels), {0: 0.5})
+    def figures(partition: Partition, missed: dict[str, int]) -> PartitionFigures:
+        executors = [TaskFigures(level, "executor", 100, bad) for level, bad in missed.items()]
+        planners = [TaskFigures(level, "planner", plans, 0) for level in missed]
+        return PartitionFigures(partition, (*executors, *planners), {0: 0.5})
 
-    tight = figures("tight, 1 core", {"task": slow, "servo": fast})
-    loose = figures("loose, 2 cores", {"task": slow, "servo": 0})
-    return Partitions(4.0, (tight, loose))
+    tight = figures(Partition("tight", 1), {"task": slow, "servo": fast})
+    loose = figures(Partition("loose", 2), {"task": slow, "servo": 0})
+    return Partitions((tight, loose))
 
 
 def equation(holds: bool, mostly: bool) -> NasremRun:
@@ -167,12 +158,25 @@ def equation(holds: bool, mostly: bool) -> NasremRun:
     return replace(RUN, verdicts=(MeasuredVerdict(measured, mostly),))
 
 
-def response(*delays: str) -> NasremRun:
-    """Return a run in which commands took 6 ms instead of the 4 ms of equation 3.3, with responses
-    beyond the grid, if any, delayed by these."""
-    beyond = tuple({"delayed_by": [delay]} for delay in delays)
-    late = WayResponse(replace(NO_TIMES, max=6.0), beyond)
-    return replace(RUN, response=replace(RUN.response, command=late))
+def response(delay: str) -> NasremRun:
+    """Return a run in which commands took 6 ms instead of the 4 ms of equation 3.3, one of them
+    beyond the grid, delayed by this."""
+    way = {"measured_ms": {"max": 6.0}, "bound_ms": 5.0, "beyond": [{"delayed_by": [delay]}]}
+    found = {"command": way, "status": {"measured_ms": None, "bound_ms": 5.0, "beyond": []}}
+    late = response_from({**found, "sum_eq_3_3_ms": 4.0, "crosses_racks": False})
+    assert late is not None
+    return replace(RUN, response=replace(late, ways={**late.ways, "status": WAY}))
+
+
+def whole_tasks(longest_ms: float, unexplained: int, ended: str = DONE) -> list[Any]:
+    """Return the whole tasks of all systems, one of which responded within 5 ms at most, or
+    not."""
+    way = WayResponse(longest_ms, 5.0, unexplained)
+    answer = SystemResponse(4.0, {"command": way, "status": WAY})
+    run = TaskRun(ended, 8.0, 0.0, {}, answer)
+    network = NetworkRun(DONE, 8.0, 0.0, {}, None, 0.0, 50.0)
+    runs = [network, run, *[replace(run, response=None, ended=DONE)] * (len(TASKS) - 2)]
+    return [RUN, tables("pick"), *runs]
 
 
 RULINGS = [
@@ -193,7 +197,11 @@ RULINGS = [
     ("soft-and-real-time", [goto(False, 9.9)], FAILS),
     ("state-tables", [tables("pick", "aim again")], HOLDS),
     ("state-tables", [tables("pick")], FAILS),
-    ("state-tables", [tables("pick", "aim again", worked=False)], FAILS),
+    ("state-tables", [tables("pick", "aim again", ended="time over")], FAILS),
+    ("systems", whole_tasks(5.0, 0), HOLDS),
+    ("systems", whole_tasks(6.0, 0), BOUNDED),
+    ("systems", whole_tasks(6.0, 1), FAILS),
+    ("systems", whole_tasks(5.0, 0, "time over"), FAILS),
     ("background", background(0, 9, 99), HOLDS),
     ("background", background(2, 9, 99), BOUNDED),
     ("background", background(3, 9, 99), FAILS),
@@ -236,14 +244,13 @@ def test_what_is_not_met_is_said_with_its_numbers() -> None:
     assert unmet == "switch_p99_us 9, not <= 8"
 
 
-def test_what_was_not_made_or_cannot_be_is_said_in_place(tmp_path: Path) -> None:
-    workshop = Workshop(tmp_path, share=True)
+def test_what_was_not_made_or_cannot_be_is_said_in_place() -> None:
     lacking = Kept({}, 1.0, "now", "this machine has one processor")
     for results, ruling, why in (
         ({}, Ruling.UNMADE, "nasrem: not run yet"),
         ({"nasrem": "the rack did not run"}, Ruling.UNMADE, "nasrem: the rack did not run"),
         ({"nasrem": lacking}, Ruling.UNTESTABLE, "this machine has one processor"),
     ):
-        judged = CLAIMS["equation-3.1"].judge_by(workshop, results)
+        judged = CLAIMS["equation-3.1"].judge_by(results)
         assert (judged.ruling, judged.why) == (ruling, why)
         assert judged.predicted

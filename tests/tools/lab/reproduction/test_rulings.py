@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import TypeAdapter
 
-from rack.boards.config import load
 from rack.tools.lab.reproduction.experiments import (
     figures,
     nasrem,
@@ -29,10 +27,9 @@ from rack.tools.lab.reproduction.experiments import (
 )
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.figures import settings_of
-from rack.tools.lab.reproduction.experiments.nasrem import SystemResponse
 from rack.tools.lab.reproduction.experiments.sharing import WAITS
 from rack.tools.lab.reproduction.page import PaperClaim
-from rack.tools.lab.reproduction.rules import judge_layers
+from rack.tools.lab.reproduction.rules import judge_layers, judge_systems
 from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
 from rack.tools.timing.analysis.analysis import Analysis
 from tests.tools.lab.reproduction.breaking import CHAIN, BreakingWorkshop
@@ -171,11 +168,9 @@ def by_equation(rack: str, settings: tuple[str, ...] = IN_LOCKSTEP) -> Judge:
     def judge(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
         run = workshop.run(rack, workshop.config(rack, settings)).recording
         analysis = Analysis.of(run)
-        found = replace(RUN, verdicts=tuple(nasrem._verdicts(analysis)))
-        if analysis.response is not None:
-            response = TypeAdapter(SystemResponse).validate_python(analysis.response)
-            found = replace(found, response=response)
-        return claim.judge(found)
+        verdicts = tuple(nasrem.measured_verdicts(analysis))
+        response = systems.response_from(analysis.response)
+        return claim.judge(replace(RUN, verdicts=verdicts, response=response))
 
     return judge
 
@@ -184,14 +179,15 @@ def with_polling_later(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVe
     """Return the ruling on a run in which polling is given the later times: no rack makes it so,
     and on some machines it is so by itself."""
     found = WAITS.make(workshop)
-    sooner, later = sorted(found.late_us.values(), key=itemgetter("p50"))
-    return claim.judge(replace(found, late_us={"signal": sooner, "poll": later}))
+    sooner, later = sorted((found.blocking_us, found.polling_us))
+    return claim.judge(replace(found, blocking_us=sooner, polling_us=later))
 
 
 def by_one_system(name: str) -> Judge:
-    """Return a judge by the experiment of one system."""
+    """Return a judge by the whole task of one system."""
     return lambda workshop, claim: by_experiments(
-        workshop, replace(claim, experiments=(systems.system_experiment(name),))
+        workshop,
+        replace(claim, experiments=(tasks.TASKS[name],), judge=partial(judge_systems, [name])),
     )
 
 
@@ -341,7 +337,7 @@ ROWS = (
     Breaking("figure-5", "slow_levels_missed_share", {"nasrem": LATE_TASK}, alone=True),
     Breaking(
         "systems",
-        "_failed",
+        "tasks_not_done",
         {"condor": NO_RESTART + ONE_LOSS["kill-each-board"].replace("servo", "coordinator")},
         judge=by_one_system("condor"),
         alone=True,
@@ -383,7 +379,7 @@ ROWS = (
     Breaking(
         "two-levels",
         "fig2_levels",
-        judge=lambda workshop, claim: judge_layers({"fig2": systems.prediction(load("fig2"))}),
+        judge=lambda workshop, claim: judge_layers(["fig2"]),
     ),
     Breaking(
         "context-switch",
@@ -449,7 +445,7 @@ def test_a_task_that_takes_too_long_is_ended_and_not_done(
 ) -> None:
     monkeypatch.setattr(tasks, "PATIENCE", 0.5)
     found = tasks.TASKS["hic"].make(Workshop(tmp_path, share=True))
-    assert found.ended == "stopped"
+    assert found.ended == "time over"
     assert 0.0 < found.lasted_s < tasks.TASKS_S["hic"]
 
 

@@ -1,4 +1,4 @@
-"""Systems next to each other: figures of racks by config and run, whatever their levels are."""
+"""Systems next to each other: what their configs promise, whatever their levels are."""
 
 from __future__ import annotations
 
@@ -6,69 +6,27 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, wire
-from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.systems import (
-    hold_for,
-    prediction,
-    system_experiment,
-    systems,
-)
+from rack.boards.config import load, names
+from rack.boards.config.files import CONFIGS
+from rack.tools.lab.reproduction.claims import SYSTEMS
+from rack.tools.lab.reproduction.experiments.systems import prediction
 from tests.boards.conftest import PLAIN
-from tests.boards.vector_racks import JOINTED
 
 
-@pytest.mark.slow
-def test_the_default_is_nasrem_and_every_bundled_rack_with_a_folder() -> None:
-    assert systems()[0] == "nasrem"
-    assert len(set(systems())) == len(systems())
-    for name in systems():
-        assert wire(load(name)).tasks
+def test_the_systems_are_nasrem_and_every_bundled_rack_with_a_folder() -> None:
+    folders = {path.stem for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name}
+    assert {name.partition("/")[0] for name in SYSTEMS} == {"nasrem", *folders & {*names()}}
+    assert len(set(SYSTEMS)) == len(SYSTEMS)
 
 
 def test_what_a_config_promises_is_read_from_it_alone() -> None:
-    config = load("nasrem")
-    found = prediction(config)
+    found = prediction(load("nasrem"))
     assert found.levels == ("task", "elemental_move", "primitive", "servo")
     assert found.rates_hz == pytest.approx((1, 4, 50, 400))
-    # The sum of the cycles, 1272.5 ms, and 10 ms until the primitive level's next read.
-    assert (found.command_ms, found.status_ms) == (1282.5, 2280.0)
 
 
 def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: Path) -> None:
     path = tmp_path / "lone.toml"
     path.write_text(PLAIN.replace('below = "wave"', 'reads = { status = "wave.status" }'))
-    config = load(path)
-    found = prediction(config)
-    assert (found.levels, found.rates_hz, found.command_ms) == ((), (), 0)
-    assert hold_for(config, 10.0) is None
-
-
-def test_the_highest_level_that_responds_within_the_run_is_held() -> None:
-    config = load("nasrem")
-    long, short = (hold_for(config, seconds) for seconds in (10.0, 2.0))
-    assert long is not None
-    assert (long.level, long.what, long.tick) == ("task", "hold", 2000)
-    assert short is not None
-    assert short.level == "elemental_move"
-    assert hold_for(config, 0.1) is None
-
-
-@pytest.mark.thorough
-@pytest.mark.slow
-def test_a_rack_is_compared_by_its_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("jointed.toml").write_text(JOINTED)
-    workshop = Workshop(tmp_path, share=True)
-    workshop.prepare()
-    experiment = system_experiment("jointed.toml")
-    found = experiment.record(experiment.document(experiment.make(workshop)))
-    assert (found.rack, found.failure, found.worked) == ("jointed.toml", "", True)
-    assert found.predicted.levels == ("path", "joint1 ... joint3", "arm")
-    ran = found.realtime
-    assert ran.command_ms is not None
-    assert ran.command_ms["min"] == 25.0
-    assert ran.hold is not None
-    assert ran.hold.level == "path"
-    assert ran.hold.measured_ms is not None
-    assert ran.hold.measured_ms >= 25.0
+    found = prediction(load(path))
+    assert (found.levels, found.rates_hz) == ((), ())

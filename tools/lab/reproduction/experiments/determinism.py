@@ -36,7 +36,7 @@ class ComparedRuns:
     runs: tuple[ComparedRun, ...]
 
 
-def _run(workshop: Workshop) -> ComparedRuns:
+def _measure(workshop: Workshop) -> ComparedRuns:
     first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
     runs = [_compared(first, None), _compared(second, first.recording)]
     for attempt in range(1, ATTEMPTS + 1):
@@ -52,7 +52,8 @@ DETERMINISM = Experiment(
     "nasrem twice in lockstep, then in real time",
     LASTS_S,
     ComparedRuns,
-    _run,
+    _measure,
+    cores=0,
 )
 
 

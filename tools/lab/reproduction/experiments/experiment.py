@@ -2,8 +2,8 @@
 
 What an experiment found is kept as JSON with all that it depends on: the machine and the program,
 of which its configs and its own settings are parts. It is made again only if one of these has
-changed, a picture is gone, or it was not finished: a file appears whole or not at all, so even a
-killed command continues where it was.
+changed, or if it was not finished: a file appears whole or not at all, so even a killed command
+continues where it was.
 """
 
 from __future__ import annotations
@@ -35,12 +35,15 @@ from rack.tools.lab.benches.observed import UNVIEWED, Recorded, record
 
 KEPT = "parts"
 RUNS = "runs"
-PICTURES = "pictures"
-"""In the folder: results of experiments, recordings of their runs, pictures."""
+"""In the folder: results of experiments, and recordings of their runs."""
 PROGRAM = Path(__file__).resolve().parents[4]
 FLOORS = ("backplane", "levels", "boards", "tools", "configs")
 RACK = "reproduce"
 """What the names of racks in shared memory begin with."""
+NO_FIFO = (
+    "this machine refuses real-time priorities (SCHED_FIFO), so that an executor cannot preempt its"
+    " planner"
+)
 LIBRARIES = ("mujoco", "numpy", "numba", "ompl", "ruckig")
 
 Document = dict[str, Any]
@@ -67,7 +70,7 @@ class Workshop:
 
     def prepare(self) -> None:
         """Make the folders, and remove racks that a killed command has left in shared memory."""
-        for name in (KEPT, RUNS, PICTURES):
+        for name in (KEPT, RUNS):
             (self.folder / name).mkdir(parents=True, exist_ok=True)
         for rack in racks():
             if rack.startswith(f"{RACK}-"):
@@ -94,32 +97,36 @@ class Workshop:
         shutil.rmtree(folder, ignore_errors=True)
         return record(config, seconds, folder, self.share)
 
-    def picture(self, name: str) -> Path:
-        """Return the path of a picture without its suffix."""
-        return self.folder / PICTURES / name
 
-    def shown(self, paths: Sequence[Path]) -> Path:
-        """Return a picture that was drawn, by its path within the folder; the page shows SVG, and
-        needs no other."""
-        for path in paths:
-            if path.suffix != ".svg":
-                path.unlink()
-        return next(path for path in paths if path.suffix == ".svg").relative_to(self.folder)
+@dataclass(frozen=True, kw_only=True)
+class Charted:
+    """A record of which the page shows a chart in letters, or a table."""
+
+    chart: str = ""
 
 
 @dataclass(frozen=True)
 class Experiment(Generic[Found]):
-    """A measurement: `make` returns what it found as a record of `kind`, after about `seconds`.
+    """A measurement: `measure` returns what it found as a record of `kind`, after about `seconds`.
 
-    The names of its pictures, within the folder, are the record's `pictures`. `make` raises
-    `Lacking` and `Failure`.
+    `cores` are the processors that it needs for boards at real-time priorities; 0: it needs no
+    such priorities. `measure` raises `Failure`.
     """
 
     name: str
     about: str
     seconds: float
     kind: type[Found]
-    make: Callable[[Workshop], Found]
+    measure: Callable[[Workshop], Found]
+    cores: int = 1
+
+    def make(self, workshop: Workshop) -> Found:
+        """Return what is found. Raises `Lacking` on a machine that lacks what it needs."""
+        if self.cores and not permits_fifo():
+            raise Lacking(NO_FIFO)
+        if (there := len(os.sched_getaffinity(0))) < self.cores:
+            raise Lacking(f"it needs {self.cores} processors; this machine has {there}")
+        return self.measure(workshop)
 
     def record(self, document: Document) -> Found:
         """Return what was found, from plain data."""
@@ -154,9 +161,7 @@ def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
         result = TypeAdapter(Kept).validate_json(text)
     except (OSError, ValidationError):
         return None
-    pictures = result.found.get("pictures", {}).values()
-    is_whole = all((folder / path).is_file() for path in pictures)
-    return result if is_whole and result.depends == depends() else None
+    return result if result.depends == depends() else None
 
 
 def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
@@ -194,18 +199,6 @@ def machine() -> Document:
         "real-time priorities": permits_fifo(),
         "libraries": ", ".join(f"{name} {version(name)}" for name in LIBRARIES),
     }
-
-
-def need_real_time(cores: int = 1) -> None:
-    """Raise `Lacking` on a machine without real-time priorities, or without so many cores."""
-    if not permits_fifo():
-        why = (
-            "this machine refuses real-time priorities (SCHED_FIFO), so that an executor cannot"
-            " preempt its planner"
-        )
-        raise Lacking(why)
-    if (there := len(os.sched_getaffinity(0))) < cores:
-        raise Lacking(f"it needs {cores} processors; this machine has {there}")
 
 
 @cache

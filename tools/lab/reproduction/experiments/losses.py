@@ -9,11 +9,7 @@ from functools import partial
 from pydantic import TypeAdapter
 
 from rack.tools.faults.judge import Judgement, faults
-from rack.tools.lab.reproduction.experiments.experiment import (
-    Experiment,
-    Workshop,
-    need_real_time,
-)
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 NAME = "nasrem"
 LASTS_S = 34.0
@@ -27,24 +23,17 @@ class LossesRun:
     worked: bool
 
 
-def losses_of(script: str, about: str) -> Experiment[LossesRun]:
-    """Return a run of the rack's whole task in real time with a script of faults."""
-    return Experiment(
-        script,
-        about,
-        LASTS_S,
-        LossesRun,
-        partial(_run, script),
-    )
-
-
-def _run(script: str, workshop: Workshop) -> LossesRun:
-    need_real_time()
-    config = workshop.config(NAME, (), script)
-    result, recording = workshop.run(script, config)
+def _measure(script: str, workshop: Workshop) -> LossesRun:
+    """Run the rack's whole task in real time with a script of faults."""
+    result, recording = workshop.run(script, workshop.config(NAME, (), script))
     found = faults(recording.events, recording.layout)["faults"]
     return LossesRun(TypeAdapter(tuple[Judgement, ...]).validate_python(found), result.worked)
 
 
-KILLS = losses_of("kill-each-board", "every board of nasrem killed once")
-SENSORS = losses_of("bad-sensors", "the sensors of nasrem failing one way after another")
+KILLS, SENSORS = (
+    Experiment(script, about, LASTS_S, LossesRun, partial(_measure, script))
+    for script, about in (
+        ("kill-each-board", "every board of nasrem killed once"),
+        ("bad-sensors", "the sensors of nasrem failing one way after another"),
+    )
+)

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rack.backplane.layout import TaskSpec
 from rack.boards.config import RackConfig, loads, rack_timing, resolve
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
-from rack.boards.faults.bounds import counting
-from rack.levels.timing.trace_times import Distribution, counts, distribution, plans
-from rack.tools.lab.reproduction.experiments.experiment import (
-    Experiment,
-    Workshop,
-    need_real_time,
-)
+from rack.levels.timing.trace_times import counts, plans
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.recording.cycles import cycles_of
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import core_loads
-from rack.tools.timing.analysis.report import plan_ages_ms
 
 NAME = "nasrem"
 SECONDS = 12.0
@@ -32,11 +26,6 @@ class Partition:
 
     coupling: Coupling
     cores: int
-
-    @property
-    def name(self) -> str:
-        """The partition, in words."""
-        return f"{self.coupling}, {counting(self.cores, 'core')}"
 
     def of(self, config: RackConfig) -> RackConfig:
         """Return the rack in this partition, in real time.
@@ -73,27 +62,12 @@ PARTITIONS: tuple[Partition, ...] = tuple(
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """One task in a run: its cycles (a planner's plans), and those missed and skipped.
+    """A task in a run: its cycles, of a planner its plans, and those missed or skipped."""
 
-    `fits` says whether its worst-case response time, by the config's budgets, is within its time
-    slice; None without a budget.
-    """
-
+    board: str
+    role: str
     cycles: int
     missed: int
-    skipped: int
-    fits: bool | None
-
-
-@dataclass(frozen=True)
-class LevelFigures:
-    """One level in one partition. `plan_age_ms` is the age of the plans that its executor could
-    read."""
-
-    level: str
-    executor: TaskFigures
-    planner: TaskFigures | None
-    plan_age_ms: Distribution | None
 
 
 @dataclass(frozen=True)
@@ -101,29 +75,23 @@ class PartitionFigures:
     """The measurements of one partition; `loads` are the parts of each core's time that its tasks
     used."""
 
-    partition: str
-    levels: tuple[LevelFigures, ...]
+    partition: Partition
+    tasks: tuple[TaskFigures, ...]
     loads: dict[int, float]
 
 
 @dataclass(frozen=True)
 class Partitions:
-    """The measurements of all partitions, of runs of `seconds` each."""
+    """The measurements of all partitions."""
 
-    seconds: float
     partitions: tuple[PartitionFigures, ...]
 
 
-def _run(workshop: Workshop) -> Partitions:
-    need_real_time(cores=2)
+def _measure(workshop: Workshop) -> Partitions:
     config = workshop.config(NAME)
     # All of them are checked before the first one runs.
-    racks = {partition.name: partition.of(config) for partition in PARTITIONS}
-    runs = {
-        name: workshop.run(f"partition-{name.replace(', ', '-')}", rack, SECONDS).recording
-        for name, rack in racks.items()
-    }
-    return Partitions(SECONDS, tuple(_figures(name, run) for name, run in runs.items()))
+    racks = [(partition, partition.of(config)) for partition in PARTITIONS]
+    return Partitions(tuple(_figures(workshop, *one) for one in racks))
 
 
 PARTITION = Experiment(
@@ -131,28 +99,19 @@ PARTITION = Experiment(
     "nasrem with its planners on one core and on two",
     len(PARTITIONS) * (SECONDS + LAUNCH_S),
     Partitions,
-    _run,
+    _measure,
+    cores=2,
 )
 
 
-def _figures(partition: str, run: Recording) -> PartitionFigures:
-    rack = rack_timing(run.rack_config, run.layout)
-    fits = {response.task: response.holds for response in rack.responses}
-    levels = tuple(_level(name, run, fits) for name in run.rack_config.board)
-    return PartitionFigures(partition, levels, core_loads(run, cycles_of(run), rack))
+def _figures(workshop: Workshop, partition: Partition, rack: RackConfig) -> PartitionFigures:
+    label = f"partition-{partition.coupling}-{partition.cores}"
+    run = workshop.run(label, rack, SECONDS).recording
+    loads = core_loads(run, cycles_of(run), rack_timing(run.rack_config, run.layout))
+    return PartitionFigures(partition, tuple(_task(task, run) for task in run.layout.tasks), loads)
 
 
-def _level(board: str, run: Recording, fits: Mapping[str, bool]) -> LevelFigures:
-    tasks = {task.role: task for task in run.layout.tasks if task.board == board}
-    executor = _task(tasks["executor"], run, fits)
-    if "planner" not in tasks:
-        return LevelFigures(board, executor, planner=None, plan_age_ms=None)
-    is_known = f"{board}.plan" in run.mailboxes
-    age_ms = distribution(plan_ages_ms(run, board)) if is_known else None
-    return LevelFigures(board, executor, _task(tasks["planner"], run, fits), age_ms)
-
-
-def _task(task: TaskSpec, run: Recording, fits: Mapping[str, bool]) -> TaskFigures:
+def _task(task: TaskSpec, run: Recording) -> TaskFigures:
     rows = run.trace(task.name)
     # Releases without a plan are traced only if they were late; of them only the skipped releases
     # count.
@@ -160,4 +119,4 @@ def _task(task: TaskSpec, run: Recording, fits: Mapping[str, bool]) -> TaskFigur
     if task.role == "planner":
         rows = plans(rows)
     missed, _ = counts(rows)
-    return TaskFigures(len(rows), missed, skipped, fits.get(task.name))
+    return TaskFigures(task.board, task.role, len(rows), missed + skipped)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from random import Random
 
 import numpy as np
@@ -20,14 +19,9 @@ from rack.boards.config.schema import CommandConfig
 from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import with_commands
-from rack.tools.lab.reproduction.experiments.experiment import (
-    PICTURES,
-    Experiment,
-    Workshop,
-    need_real_time,
-)
+from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Workshop
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, plot, response_of
+from rack.tools.timing.operator_response import AnsweredCommand, OperatorResponse, response_of
 
 NAME = "nasrem"
 COMMANDS = 12
@@ -70,26 +64,26 @@ class ResponseFigures:
 
 
 @dataclass(frozen=True)
-class ResponseRun:
+class ResponseRun(Charted):
     """Commands of an operator in lockstep, with twins that show which torque rests on one, and in
     real time."""
 
     lockstep: ResponseFigures
     realtime: ResponseFigures
-    pictures: dict[str, Path]
 
 
-def _run(workshop: Workshop) -> ResponseRun:
-    need_real_time()
-    lockstep, realtime = measure(workshop, "lockstep", TWINS), measure(workshop, "realtime", 0)
-    drawn = workshop.shown(plot(realtime.response, workshop.folder / PICTURES))
-    return ResponseRun(lockstep, realtime, {"realtime": drawn})
+def _measure(workshop: Workshop) -> ResponseRun:
+    lockstep = measure_response(workshop, "lockstep", TWINS)
+    realtime = measure_response(workshop, "realtime", 0)
+    return ResponseRun(lockstep, realtime, chart=realtime.response.text())
 
 
-RESPONSE = Experiment("response", "holds and resumes by an operator", LASTS_S, ResponseRun, _run)
+RESPONSE = Experiment(
+    "response", "holds and resumes by an operator", LASTS_S, ResponseRun, _measure
+)
 
 
-def measure(workshop: Workshop, mode: str, twins: int) -> ResponseFigures:
+def measure_response(workshop: Workshop, mode: str, twins: int) -> ResponseFigures:
     """Run the rack in a mode with commands at random ticks, and the twins of at most so many
     holds. Raises `Failure` if no command had a response."""
     config = workshop.config(NAME, [f"clock.mode={mode}"])
@@ -136,11 +130,11 @@ def draw_commands(
 
 def find_holds(run: Recording, response: OperatorResponse) -> list[AnsweredCommand]:
     """Return the holds given to a moving arm: it was moving around the predicted tick."""
-    holds = [command for command in response.measured if command.what == "hold"]
     return [
-        hold
-        for hold in holds
-        if _is_moving(run, lowest_status(response, hold.level), hold.predicted)
+        command
+        for command in response.measured
+        if command.what == "hold"
+        and _is_moving(run, lowest_status(response, command.level), command.predicted)
     ]
 
 

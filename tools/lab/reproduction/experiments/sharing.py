@@ -7,18 +7,13 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from rack.backplane.layout import Wake
 from rack.boards.config import loads
-from rack.levels.timing.trace_times import Distribution, distribution
+from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.chain import Chain
 from rack.tools.lab.benches.observed import Recorded, count_cycles, lateness_us
-from rack.tools.lab.reproduction.experiments.experiment import (
-    Experiment,
-    Workshop,
-    need_real_time,
-)
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 LEVELS = 5
 """Levels of the pipeline: "it would take 5 control cycles"."""
@@ -27,7 +22,6 @@ RATE_HZ = 400
 SECONDS = 2.0
 LAUNCH_S = 2.0
 LOCKS = '\n[protocol]\ndefault = "lock"\n'
-WAYS: tuple[Wake, ...] = ("signal", "poll")
 
 
 @dataclass(frozen=True)
@@ -51,7 +45,7 @@ class Chains:
     grown: ChainRun
 
 
-def _chains(workshop: Workshop) -> Chains:
+def _measure_chains(workshop: Workshop) -> Chains:
     return Chains(
         lockstep=_chain("chain-lockstep", workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
         realtime=_chain("chain-realtime", workshop, Chain(LEVELS, RATE_HZ)),
@@ -81,31 +75,37 @@ CHAINS = Experiment(
     "a message down five levels, with locks too, and down ten",
     4 * (SECONDS + LAUNCH_S),
     Chains,
-    _chains,
+    _measure_chains,
+    cores=0,
 )
 
 
 @dataclass(frozen=True)
 class Waits:
-    """How late an empty board starts its cycles, us, by how it waits for them."""
+    """The median of how late an empty board starts its cycles, us, if it blocks until them, and if
+    it polls."""
 
-    late_us: dict[Wake, Distribution]
+    blocking_us: float
+    polling_us: float
 
 
-def _waits(workshop: Workshop) -> Waits:
-    need_real_time(cores=2)
-    late_us = {}
-    for wake in WAYS:
-        chain = Chain(1, RATE_HZ, wake=wake)
-        run = _run(f"waits-{wake}", workshop, chain)
-        late_us[wake] = distribution(lateness_us(run.recording, chain.names[0]))
-    return TypeAdapter(Waits).validate_python({"late_us": late_us})
+def _measure_waits(workshop: Workshop) -> Waits:
+    return Waits(_median_us(workshop, "signal"), _median_us(workshop, "poll"))
+
+
+def _median_us(workshop: Workshop, wake: Wake) -> float:
+    chain = Chain(1, RATE_HZ, wake=wake)
+    late_us = lateness_us(_run(f"waits-{wake}", workshop, chain).recording, chain.names[0])
+    if not len(late_us):
+        raise Failure(f"a board that waits by {wake} ran no cycle")
+    return float(np.median(late_us))
 
 
 WAITS = Experiment(
     "waits",
     "a board that blocks, and one that polls",
-    len(WAYS) * (SECONDS + LAUNCH_S),
+    2 * (SECONDS + LAUNCH_S),
     Waits,
-    _waits,
+    _measure_waits,
+    cores=2,
 )

@@ -24,11 +24,7 @@ from rack.backplane.process import die_with_parent, pin, set_priority
 from rack.levels.timing.trace_times import Distribution, distribution
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.harness import pinned
-from rack.tools.lab.reproduction.experiments.experiment import (
-    Experiment,
-    Workshop,
-    need_real_time,
-)
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 NAME = "nasrem"
 PAPER_US = 100.0
@@ -45,34 +41,22 @@ LAUNCH_S = 3.0
 
 
 @dataclass(frozen=True)
-class SwitchCost:
-    """Times in us over `wakes` wake-ups on `core`.
-
-    `in_us` is from planner to executor, `out_us` back; `switch_us`, t_cs, is half of both together.
-    """
-
-    core: int
-    wakes: int
-    in_us: Distribution
-    out_us: Distribution
-    switch_us: Distribution
-
-
-@dataclass(frozen=True)
 class SwitchRun:
-    """The context switch of this machine, and the one that the config assumes, us."""
+    """The context switch t_cs of this machine, us, half of both switches around each wake-up that
+    interrupted the planner; and the one that the config assumes, us."""
 
-    cost: SwitchCost
+    switch_us: Distribution
     assumed_us: float
 
 
-def _run(workshop: Workshop) -> SwitchRun:
-    need_real_time(cores=2)
+def _measure(workshop: Workshop) -> SwitchRun:
     assumed_us = 1e3 * workshop.config(NAME).timing.context_switch_ms
-    return SwitchRun(measure(), assumed_us)
+    return SwitchRun(measure_switch(), assumed_us)
 
 
-SWITCH = Experiment("switch", "the context switch", WAKES * PERIOD_S + LAUNCH_S, SwitchRun, _run)
+SWITCH = Experiment(
+    "switch", "the context switch", WAKES * PERIOD_S + LAUNCH_S, SwitchRun, _measure, cores=2
+)
 
 
 class _Shared(NamedTuple):
@@ -86,7 +70,7 @@ class _Shared(NamedTuple):
     start: Barrier
 
 
-def measure() -> SwitchCost:
+def measure_switch() -> Distribution:
     """Measure on the last core of this machine, woken from the first. Raises `Failure` if the
     processes cannot run at real-time priorities."""
     cores = sorted(os.sched_getaffinity(0))
@@ -117,7 +101,7 @@ def measure() -> SwitchCost:
             time.sleep(PERIOD_S - HEAD_START_S)
         for process in processes:
             process.join(READY_S)
-    return cost_of(cores[-1], np.reshape(gaps, (-1, 2)), np.reshape(awake, (-1, 2)))
+    return switch_times_us(np.reshape(gaps, (-1, 2)), np.reshape(awake, (-1, 2)))
 
 
 def _start(
@@ -164,11 +148,10 @@ def _plan(semaphore: Semaphore, shared: _Shared) -> None:
             last = now
 
 
-def cost_of(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
-    """Return the cost over the wake-ups that interrupted the planner.
+def switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:
+    """Return the time of a switch over the wake-ups that interrupted the planner, us.
 
     Args:
-        core: Core of both processes.
         gaps: Begin and end of the planner's longest gap by wake-up, ns, shape (n, 2).
         awake: Begin and end of the executor's time awake, ns, shape (n, 2).
 
@@ -176,11 +159,8 @@ def cost_of(core: int, gaps: np.ndarray, awake: np.ndarray) -> SwitchCost:
         Failure: If no wake-up interrupted the planner.
     """
     found = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
-    if not found.any():
+    lasted = np.diff(gaps - awake, axis=1)[found, 0] * 1e-3
+    times = distribution(lasted / 2)
+    if times is None:
         raise Failure("no wake-up interrupted the planner: the machine is too busy to measure")
-    into = (awake - gaps)[found, 0] * 1e-3
-    back = (gaps - awake)[found, 1] * 1e-3
-    in_us, out_us, switch_us = (
-        distribution(times) or {} for times in (into, back, (into + back) / 2)
-    )
-    return SwitchCost(core, int(found.sum()), in_us, out_us, switch_us)
+    return times

@@ -5,13 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pydantic import TypeAdapter
-
-from rack.tools.lab.reproduction.experiments.experiment import (
-    Experiment,
-    Workshop,
-    need_real_time,
-)
+from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.tasks import TaskRun, task_run
 from rack.tools.recording.history import fired_rows
 
 NAME = "nist-state-table"
@@ -21,20 +16,10 @@ LASTS_S = 55.0
 
 
 @dataclass(frozen=True)
-class FiredRow:
-    """A row of a state table that fired: in how many cycles, and when first, s."""
+class TableRun(TaskRun):
+    """A run of the task with the rows of state tables that fired, as "level: row"."""
 
-    name: str
-    cycles: int
-    first_s: float
-
-
-@dataclass(frozen=True)
-class TableRun:
-    """A run of the task: the rows that fired, by level, and whether the task was done."""
-
-    rows: dict[str, tuple[FiredRow, ...]]
-    worked: bool
+    rows: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -45,22 +30,17 @@ class TableRuns:
     undisturbed: TableRun
 
 
-def _run(workshop: Workshop) -> TableRuns:
-    need_real_time()
+def _measure(workshop: Workshop) -> TableRuns:
     return TableRuns(_task(workshop, NAME, ()), _task(workshop, f"{NAME}-undisturbed", UNDISTURBED))
 
 
 TABLES = Experiment(
-    NAME,
-    "state tables, with a disturbance and without",
-    LASTS_S,
-    TableRuns,
-    _run,
+    NAME, "state tables, with a disturbance and without", LASTS_S, TableRuns, _measure
 )
 
 
 def _task(workshop: Workshop, label: str, settings: Sequence[str]) -> TableRun:
-    config = workshop.config(NAME, settings)
-    result, recording = workshop.run(label, config)
-    rows = TypeAdapter(dict[str, tuple[FiredRow, ...]]).validate_python(fired_rows(recording))
-    return TableRun(rows, result.worked)
+    result, recording = workshop.run(label, workshop.config(NAME, settings))
+    fired = fired_rows(recording).items()
+    rows = (f"{level}: {row['name']}" for level, rows in fired for row in rows)
+    return TableRun(**vars(task_run(result, recording)), rows=tuple(rows))

@@ -4,34 +4,34 @@ joined by a network."""
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import chdir, closing, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import chdir
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from threading import Timer
 from typing import Any
 
 import numpy as np
 
-from rack.backplane.errors import SegmentError
-from rack.backplane.segment import Segment
-from rack.backplane.words import System
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import UNVIEWED, count_cycles
-from rack.tools.lab.reproduction.experiments.experiment import (
-    RUNS,
-    Experiment,
-    Workshop,
-    need_real_time,
-)
+from rack.tools.lab.reproduction.experiments.experiment import RUNS, Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.systems import SystemResponse, response_from
 from rack.tools.live.host_side import entries_of
 from rack.tools.live.launch import RunResult
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackGrid
+from rack.tools.timing.measured_response import system_response
 
-TASKS_S = {"rccl": 17.5, "hic": 14.2, "condor": 14.3, "ibm": 28.1, "chimera": 31.9, "penn": 26.2}
+TASKS_S = {
+    "brown/one-machine": 8.3,
+    "chimera": 31.9,
+    "condor": 14.3,
+    "hic": 14.2,
+    "ibm": 28.1,
+    "penn": 26.2,
+    "rccl": 17.5,
+}
 """The systems of one rack, with the simulated time of their tasks; experiments of their own run the
 tasks of NASREM and of the state tables."""
 BROWN = "brown"
@@ -51,13 +51,14 @@ MODIFICATION = "pd"
 
 @dataclass(frozen=True)
 class TaskRun:
-    """A system's whole task in real time: how it ended, the part of all cycles missed or skipped,
-    and the messages in each mailbox."""
+    """A system's whole task: how it ended, the part of all cycles missed or skipped, the messages
+    in each mailbox, and the response; None: it has none that is bounded."""
 
     ended: str
     lasted_s: float
     missed: float
     messages: dict[str, int]
+    response: SystemResponse | None
 
 
 @dataclass(frozen=True)
@@ -73,31 +74,13 @@ class NetworkRun(TaskRun):
     response_ms: float | None
 
 
-def _run(name: str, workshop: Workshop) -> TaskRun:
-    need_real_time()
-    with _patience(workshop, TASKS_S[name]):
-        return _found(*workshop.run(f"task-{name}", workshop.config(name)))
+def _measure(name: str, workshop: Workshop) -> TaskRun:
+    label = f"task-{name.replace('/', '-')}"
+    return task_run(*workshop.run(label, workshop.config(name), PATIENCE * TASKS_S[name]))
 
 
-@contextmanager
-def _patience(workshop: Workshop, lasts_s: float) -> Iterator[None]:
-    """End a rack whose task, which lasts so long, is not done in time."""
-    timer = Timer(LAUNCH_S + PATIENCE * lasts_s, _end, (workshop.rack,))
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-        timer.join()
-
-
-def _end(rack: str) -> None:
-    # It may have ended by itself, or not begun.
-    with suppress(SegmentError), closing(Segment.attach(rack)) as segment:
-        segment.words[System.STOP_REQUEST] = 1
-
-
-def _found(result: RunResult, *recordings: Recording) -> TaskRun:
+def task_run(result: RunResult, *recordings: Recording) -> TaskRun:
+    """Return what a whole task has left, in the recordings of its racks."""
     boxes = {box: one.signal(box, "serial") for one in recordings for box in one.mailboxes}
     messages = {box: len(np.unique(serials)) for box, serials in boxes.items()}
     first = recordings[0]
@@ -110,6 +93,7 @@ def _found(result: RunResult, *recordings: Recording) -> TaskRun:
         lasted_s=result.outcome.ticks * first.layout.clock_ns * 1e-9,
         missed=_missed(*recordings),
         messages=messages,
+        response=response_from(system_response(first)),
     )
 
 
@@ -117,17 +101,16 @@ def _missed(*recordings: Recording) -> float:
     return count_cycles(task for one in recordings for task in one.ended["tasks"].values()).share
 
 
-def _run_two(later_ms: int, workshop: Workshop) -> NetworkRun:
+def _measure_two(later_ms: int, workshop: Workshop) -> NetworkRun:
     """Run Brown's racks with a network that takes so much longer; up to three times, until all is
     recorded: two recorders share two cores with eight boards."""
-    need_real_time()
     lost: list[str] = []
     for attempt in range(1, ATTEMPTS + 1):
         result, general, servo = _two_recorded(later_ms, workshop, attempt)
         lost = [one.layout.rack for one in (general, servo) if one.lost]
         if not lost:
             return NetworkRun(
-                **vars(_found(result, general, servo)),
+                **vars(task_run(result, general, servo)),
                 servo_missed=_missed(servo),
                 response_ms=_response_ms(general, servo),
             )
@@ -140,9 +123,10 @@ def _two_recorded(
     label = f"task-{BROWN}-{later_ms}-{attempt}"
     path = workshop.folder / f"{label}-servo.toml"
     path.write_text(_servo(workshop, later_ms).text(), encoding="utf-8")
+    ways = f'adapter.lan.connect=["{_socket(workshop)}"]', f'adapter.lan.launch=["{path}"]'
     with chdir(workshop.folder):
         # What it launches records its run below where it is.
-        result, general = workshop.run(label, _general(workshop, path))
+        result, general = workshop.run(label, _renamed(workshop, BROWN, ways))
     (other,) = result.others
     assert other.folder is not None, "it is recorded, as the other is"
     folder = workshop.folder / RUNS / f"{label}-servo"
@@ -161,11 +145,6 @@ def _servo(workshop: Workshop, later_ms: int) -> RackConfig:
         delay = given.board["supervisor"].params["delay"] + 1e-3 * later_ms
         more += [f"board.supervisor.params.delay={delay}", f"fault=[{', '.join(faults)}]"]
     return _renamed(workshop, SERVO, more)
-
-
-def _general(workshop: Workshop, launched: Path) -> RackConfig:
-    ways = f'adapter.lan.connect=["{_socket(workshop)}"]', f'adapter.lan.launch=["{launched}"]'
-    return _renamed(workshop, BROWN, ways)
 
 
 def _socket(workshop: Workshop) -> str:
@@ -208,21 +187,21 @@ def _first_ns(recording: Recording, box: str, field: str) -> int | None:
 def _two_racks(later_ms: int, about: str) -> Experiment[NetworkRun]:
     name = f"task-{BROWN}-later" if later_ms else f"task-{BROWN}"
     lasts_s = BROWN_S + 2 * LAUNCH_S
-    return Experiment(name, about, lasts_s, NetworkRun, partial(_run_two, later_ms))
+    return Experiment(name, about, lasts_s, NetworkRun, partial(_measure_two, later_ms))
 
 
 NETWORK = _two_racks(0, "the whole task of brown's two racks in real time")
 LATER = _two_racks(LATER_MS, f"the same, with a network slower by {LATER_MS} ms")
 TASKS: dict[str, Experiment[Any]] = {
+    BROWN: NETWORK,
     **{
         name: Experiment(
-            f"task-{name}",
+            f"task-{name.replace('/', '-')}",
             f"the whole task of {name} in real time",
             lasts_s + LAUNCH_S,
             TaskRun,
-            partial(_run, name),
+            partial(_measure, name),
         )
         for name, lasts_s in TASKS_S.items()
     },
-    BROWN: NETWORK,
 }
