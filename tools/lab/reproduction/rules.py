@@ -364,7 +364,8 @@ def judge_figure_5(found: partition.Partitions) -> ClaimVerdict:
 
     def missed_share(group: str) -> float:
         own = [task for name, task in tasks if name == group]
-        return sum(task.missed for task in own) / max(sum(task.cycles for task in own), 1)
+        bad = sum(task.missed + task.skipped for task in own)
+        return bad / max(sum(task.cycles for task in own), 1)
 
     slow_ones = compare("slow_levels_missed_share", missed_share("slow"), "<=", FEW)
     most = missed_share("loose") + FEW

@@ -142,8 +142,8 @@ def partitions(slow: int, fast: int, plans: int) -> Partitions:
     """Return what levels miss of 100 cycles: a slow one, and a fast one on one processor."""
 
     def figures(partition: Partition, missed: dict[str, int]) -> PartitionFigures:
-        executors = [TaskFigures(level, "executor", 100, bad) for level, bad in missed.items()]
-        planners = [TaskFigures(level, "planner", plans, 0) for level in missed]
+        executors = [TaskFigures(level, "executor", 100, bad, 0) for level, bad in missed.items()]
+        planners = [TaskFigures(level, "planner", plans, 0, 0) for level in missed]
         return PartitionFigures(partition, (*executors, *planners), {0: 0.5})
 
     tight = figures(Partition("tight", 1), {"task": slow, "servo": fast})

@@ -62,12 +62,13 @@ PARTITIONS: tuple[Partition, ...] = tuple(
 
 @dataclass(frozen=True)
 class TaskFigures:
-    """A task in a run: its cycles, of a planner its plans, and those missed or skipped."""
+    """A task in a run: its cycles, of a planner its plans, those missed, and releases skipped."""
 
     board: str
     role: str
     cycles: int
     missed: int
+    skipped: int
 
 
 @dataclass(frozen=True)
@@ -119,4 +120,4 @@ def _task(task: TaskSpec, run: Recording) -> TaskFigures:
     if task.role == "planner":
         rows = plans(rows)
     missed, _ = counts(rows)
-    return TaskFigures(task.board, task.role, len(rows), missed + skipped)
+    return TaskFigures(task.board, task.role, len(rows), missed, skipped)
