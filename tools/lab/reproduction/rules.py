@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import ceil, inf
 
 from rack.boards.config import load, rack_timing, wire
@@ -77,12 +77,14 @@ def judge_determinism(found: determinism.ComparedRuns) -> ClaimVerdict:
         and (run.first_miss is None or run.first_miss > run.difference.tick)
         for run in real
     )
-    always = check_none(
-        lockstep_runs_that_differ=sum(run.digest != digest for run in lockstep),
-        realtime_runs_that_differ_before_a_miss=early,
-    )
     equal = sum(run.first_miss is None and run.digest == digest for run in real)
-    return rule_on(*always, compare("realtime_runs_equal", equal, ">=", 1), here=always)
+    return rule_on(
+        *check_none(
+            lockstep_runs_that_differ=sum(run.digest != digest for run in lockstep),
+            realtime_runs_that_differ_before_a_miss=early,
+        ),
+        ideal=[compare("realtime_runs_equal", equal, ">=", 1)],
+    )
 
 
 def judge_speedup(one: FigureRun, two: FigureRun) -> ClaimVerdict:
@@ -111,13 +113,12 @@ def judge_pipeline(found: Chains) -> ClaimVerdict:
     early = sum(count for took, count in real.items() if took < LEVELS)
     late = arrived - early - real.get(LEVELS, 0)
     off = sent - exact.get(LEVELS, 0)
-    always = check_none(lockstep_messages_off=off, realtime_messages_early=early)
     # Every level may miss its part.
     share = compare("realtime_messages_late_share", late / max(arrived, 1), "<=", LEVELS * STRAY)
     return rule_on(
-        *always,
-        *check_none(realtime_messages_late=late),
-        here=[*always, share],
+        *check_none(lockstep_messages_off=off, realtime_messages_early=early),
+        ideal=check_none(realtime_messages_late=late),
+        here=[share],
         needs=[compare("messages", min(arrived, sent), ">=", 1)],
     )
 
@@ -192,7 +193,7 @@ def judge_equation(number: str, found: NasremRun) -> ClaimVerdict:
     cycles."""
     verdicts = [one for one in found.verdicts if one.measured.equation == number]
     return rule_on(
-        *check_equations(one.measured for one in verdicts),
+        ideal=check_equations(one.measured for one in verdicts),
         here=check_none(failing_in_1_of_100_cycles=sum(not one.mostly for one in verdicts)),
         needs=[compare("subjects", len(verdicts), ">=", 1)],
     )
@@ -210,7 +211,7 @@ def judge_sum(found: NasremRun) -> ClaimVerdict:
     ]
     unexplained = sum(way.unexplained for way in ways.values())
     return rule_on(
-        *checks,
+        ideal=checks,
         here=check_none(beyond_grid_without_miss=unexplained),
         needs=[compare("ways", len(checks), "=", 2)],
     )
@@ -219,13 +220,12 @@ def judge_sum(found: NasremRun) -> ClaimVerdict:
 def judge_background(behind: FigureRun, in_line: FigureRun) -> ClaimVerdict:
     """Count the cycles that are late while a level stores data in the background, and compare with
     storing in the cycle."""
-    stored = [
+    return rule_on(
         compare("blocks_stored", behind.tasks[PLANNER].jobs, ">=", 1),
         compare("stored_in_cycle_late_share", in_line.late(LEVEL), ">=", MOSTLY),
-    ]
-    share = compare("cycles_late_share", behind.late(LEVEL), "<=", STRAY)
-    late = check_none(cycles_late=behind.tasks[LEVEL].late)
-    return rule_on(*late, *stored, here=[share, *stored])
+        ideal=check_none(cycles_late=behind.tasks[LEVEL].late),
+        here=[compare("cycles_late_share", behind.late(LEVEL), "<=", STRAY)],
+    )
 
 
 def judge_loose(plain: NetworkRun, later: NetworkRun) -> ClaimVerdict:
@@ -234,13 +234,13 @@ def judge_loose(plain: NetworkRun, later: NetworkRun) -> ClaimVerdict:
     later_ms = 0.0
     if plain.response_ms is not None and later.response_ms is not None:
         later_ms = later.response_ms - plain.response_ms
-    always = [
+    missed = max(plain.servo_missed, later.servo_missed)
+    return rule_on(
         *check_done(plain, later),
         compare("response_off_expected_ms", abs(later_ms - LATER_MS), "<=", EXCHANGE_MS),
-    ]
-    missed = max(plain.servo_missed, later.servo_missed)
-    share = compare("servo_missed_share", missed, "<=", STRAY)
-    return rule_on(*check_none(servo_missed_share=missed), *always, here=[share, *always])
+        ideal=check_none(servo_missed_share=missed),
+        here=[compare("servo_missed_share", missed, "<=", STRAY)],
+    )
 
 
 def judge_waits(found: Waits) -> ClaimVerdict:
@@ -276,15 +276,14 @@ def _undisturbed(found: FigureRun) -> list[Check]:
 def judge_working(found: FigureRun) -> ClaimVerdict:
     """Rule on a figure of which the paper says that it works."""
     late = check_none(late=sum(count.late for count in found.tasks.values()))
-    return rule_on(*late, here=[_compare_late(found, "<=")], needs=_undisturbed(found))
+    return rule_on(ideal=late, here=[_compare_late(found, "<=")], needs=_undisturbed(found))
 
 
 def judge_failing(found: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
     """Rule on a figure of which the paper says that it fails, with the shortest X that the paper
     permits too."""
-    usual = _compare_late(found, ">")
-    shortest = (_compare_late(run, ">", "shortest_X_late_share") for run in shorter)
-    return rule_on(usual, *shortest, here=[usual], needs=_undisturbed(found))
+    shortest = [_compare_late(run, ">", "shortest_X_late_share") for run in shorter]
+    return rule_on(_compare_late(found, ">"), ideal=shortest, needs=_undisturbed(found))
 
 
 def check_planning(process_ms: float) -> tuple[Check, Check]:
@@ -337,7 +336,7 @@ def judge_levels(found: NasremRun) -> ClaimVerdict:
         off = abs(rate_hz / nominal_hz - 1.0)
         rates.append(compare(f"{name}_off_{nominal_hz:g}_Hz_share", off, "<=", NOMINAL))
         gaps.append(compare(f"{name}_gap_ms", task.largest_gap_ms, "<", 2.0 * task.slice_ms))
-    return rule_on(*rates, *gaps, here=rates)
+    return rule_on(*rates, ideal=gaps)
 
 
 def judge_switch(found: SwitchRun) -> ClaimVerdict:
@@ -367,13 +366,11 @@ def judge_figure_5(found: partition.Partitions) -> ClaimVerdict:
         bad = sum(task.missed + task.skipped for task in own)
         return bad / max(sum(task.cycles for task in own), 1)
 
-    slow_ones = compare("slow_levels_missed_share", missed_share("slow"), "<=", FEW)
     most = missed_share("loose") + FEW
     plans = min((task.cycles for _, task in tasks if task.role == "planner"), default=0)
     return rule_on(
-        slow_ones,
-        compare("fast_levels_missed_share", missed_share("tight"), ">", most),
-        here=[slow_ones],
+        compare("slow_levels_missed_share", missed_share("slow"), "<=", FEW),
+        ideal=[compare("fast_levels_missed_share", missed_share("tight"), ">", most)],
         needs=[compare("fewest_plans", plans, ">=", 1)],
     )
 
@@ -389,15 +386,13 @@ def judge_systems(names: Iterable[str], *found: TaskRun | tables.TableRuns) -> C
         for way, response in run.response.ways.items()
         if response.longest_ms is not None
     }
-    always = check_done(*runs)
-    late = sum(way.unexplained for way in ways.values())
     return rule_on(
-        *always,
-        *(
+        *check_done(*runs),
+        ideal=[
             compare(name, way.longest_ms or 0.0, "<=", way.bound_ms + ROUNDING_MS)
             for name, way in ways.items()
-        ),
-        here=[*always, *check_none(late_without_miss=late)],
+        ],
+        here=check_none(late_without_miss=sum(way.unexplained for way in ways.values())),
     )
 
 
@@ -411,44 +406,42 @@ def judge_layers(names: Iterable[str]) -> ClaimVerdict:
     return rule_on(*levels, *check_none(systems_with_a_faster_level_above=inverted))
 
 
-def judge_links(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
+def judge_links(
+    rates_hz: Mapping[str, int], found: TaskRun, ideal: Sequence[Check] = ()
+) -> ClaimVerdict:
     """Compare what passed between the sides of a system with what its rates demand.
 
     Args:
         rates_hz: Messages a second of each mailbox; 1 for at least one message.
         found: The whole task of the system.
+        ideal: What it takes to hold, too; without it, it holds within bounds.
     """
-    return rule_on(*_check_links(rates_hz, found))
+    least = {
+        box: (1.0 - STRAY) * rate_hz * found.lasted_s if rate_hz > 1 else 1
+        for box, rate_hz in rates_hz.items()
+    }
+    return rule_on(
+        *check_done(found),
+        compare("missed_share", found.missed, "<=", STRAY),
+        *(
+            compare(f"{box}_messages", found.messages.get(box, 0), ">=", count)
+            for box, count in least.items()
+        ),
+        ideal=ideal,
+    )
 
 
 def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
     """Judge RCCL's links as others; for it to hold, every joint has a processor, too."""
-    links = _check_links(rates_hz, found)
     joints = [task.core for task in wire(load("rccl")).tasks if task.board.startswith("joint")]
     cores = compare("processors_of_joints", len(set(joints)), ">=", len(joints))
-    return rule_on(*links, cores, here=links)
-
-
-def _check_links(rates_hz: Mapping[str, int], found: TaskRun) -> list[Check]:
-    checks = [
-        *check_done(found),
-        compare("missed_share", found.missed, "<=", STRAY),
-    ]
-    for box, rate_hz in rates_hz.items():
-        least = (1.0 - STRAY) * rate_hz * found.lasted_s if rate_hz > 1 else 1
-        checks.append(compare(f"{box}_messages", found.messages.get(box, 0), ">=", least))
-    return checks
+    return judge_links(rates_hz, found, [cores])
 
 
 def judge_predictable(found: response.ResponseRun) -> ClaimVerdict:
     """Compare responses with the tick predicted, and with equations 3.2 and 3.3; within bounds,
     with the longest that the grid permits instead of the sum of eq. 3.3."""
     exact, real = found.lockstep, found.realtime.response
-    always = check_none(
-        lockstep_off_predicted_tick=len(exact.response.off),
-        lockstep_torque_off_predicted_tick=sum(not twin.agrees for twin in exact.twins),
-        realtime_beyond_grid=len(real.beyond),
-    )
     upper, total = (
         [
             compare(f"{row['level']}_within_{bound}", row["max_from_reading_ms"], "<=", row[bound])
@@ -458,9 +451,12 @@ def judge_predictable(found: response.ResponseRun) -> ClaimVerdict:
         for bound in ("bound_eq_3_2_ms", "sum_eq_3_3_ms")
     )
     return rule_on(
-        *always,
+        *check_none(
+            lockstep_off_predicted_tick=len(exact.response.off),
+            lockstep_torque_off_predicted_tick=sum(not twin.agrees for twin in exact.twins),
+            realtime_beyond_grid=len(real.beyond),
+        ),
         *upper,
-        *total,
-        here=[*always, *upper],
+        ideal=total,
         needs=[compare("realtime_commands", len(real.measured), ">=", 1)],
     )

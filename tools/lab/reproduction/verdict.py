@@ -69,7 +69,8 @@ def check_none(**counts: float) -> list[Check]:
 
 
 def rule_on(
-    *claim: Check,
+    *always: Check,
+    ideal: Sequence[Check] = (),
     here: Sequence[Check] = (),
     needs: Sequence[Check] = (),
     holding: Ruling = Ruling.HOLDS,
@@ -77,9 +78,9 @@ def rule_on(
     """Rule on a claim by comparisons alone.
 
     Args:
-        claim: The comparisons that the claim demands.
-        here: The same claim with the disturbances of this machine permitted. If only these are
-            met, the claim holds within bounds.
+        always: Comparisons that the claim demands on every machine.
+        ideal: Further ones, which the disturbances of this machine may spoil.
+        here: What is demanded instead of the ideal ones for the claim to hold within bounds.
         needs: What a run must show before the claim is judged by it.
         holding: The ruling if the claim is met.
 
@@ -88,17 +89,19 @@ def rule_on(
     """
     if describe_unmet(needs):
         ruling = Ruling.UNTESTABLE
-    elif not describe_unmet(claim):
-        ruling = holding
-    elif here and not describe_unmet(here):
-        ruling = Ruling.BOUNDED
-    else:
+    elif describe_unmet(always):
         ruling = Ruling.FAILS
-    return ClaimVerdict(ruling, tuple(dict.fromkeys((*needs, *claim, *here))))
+    elif not describe_unmet(ideal):
+        ruling = holding
+    else:
+        ruling = Ruling.FAILS if describe_unmet(here) else Ruling.BOUNDED
+    return ClaimVerdict(ruling, tuple(dict.fromkeys((*needs, *always, *ideal, *here))))
 
 
 def rule_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
     """Rule on something that must not happen; within bounds if at most a stray share did."""
-    share = compare(f"{name}_share", bad / max(due, 1), "<=", STRAY)
-    needs = *needs, compare(f"{name}_of", due, ">=", 1)
-    return rule_on(compare(name, bad, "=", 0), here=[share], needs=needs)
+    return rule_on(
+        ideal=[compare(name, bad, "=", 0)],
+        here=[compare(f"{name}_share", bad / max(due, 1), "<=", STRAY)],
+        needs=[*needs, compare(f"{name}_of", due, ">=", 1)],
+    )
