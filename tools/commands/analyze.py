@@ -11,11 +11,11 @@ import typer
 from rack.tools.console.answer import print_json, write_json
 from rack.tools.console.parameters import Json, RunFolder
 from rack.tools.console.progress import reading_progress
-from rack.tools.console.tables import print_wrapped
+from rack.tools.console.tables import print_blocks
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import document
-from rack.tools.timing.analysis.tables import brief, text
+from rack.tools.timing.analysis.tables import analysis_blocks
 from rack.tools.timing.operator_response import show
 
 Percentile = Annotated[
@@ -84,7 +84,6 @@ def analyze(
     if as_json:
         print_json(found)
     else:
-        shown = text(analysis) if verbose else brief(analysis)
-        print_wrapped(f"{shown}\n\n{folder}/analysis.json")
+        print_blocks((*analysis_blocks(analysis, verbose), "", f"{folder}/analysis.json"))
     if not analysis.holds:
         sys.exit(1)

@@ -21,13 +21,13 @@ from rack.boards.errors import UNKEPT
 from rack.levels.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
-from rack.tools.console.tables import print_wrapped
+from rack.tools.console.tables import TextTable, print_blocks
 from rack.tools.live.folder import folder_of
-from rack.tools.timing.inventory import arm_lines, inventory, inventory_lines
+from rack.tools.timing.inventory import arm_lines, inventory, inventory_blocks
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import Repair, repair
-from rack.tools.timing.summary import summary_lines
-from rack.tools.timing.tables import forecast_lines
+from rack.tools.timing.summary import summary_blocks
+from rack.tools.timing.tables import forecast_blocks
 
 if TYPE_CHECKING:
     from rack.levels.robot.abilities import Abilities
@@ -136,23 +136,19 @@ def check(
         measuring = (
             f"rack run {again} --seconds 10 --out {measured}; rack check {again} --from {measured}"
         )
-        head, *rest = inventory_lines(stock)
-        lines = [
+        head, *rest = inventory_blocks(stock)
+        lines: list[str | TextTable] = [
             head,
             *found.changed,
             *lacking,
             *([f"{UNKEPT}{unkept}"] if unkept else []),
-            *summary_lines(forecast, fitting, arm, found.joints, "" if run else measuring),
+            *summary_blocks(forecast, fitting, arm, found.joints, "" if run else measuring),
         ]
         if verbose:
-            lines += [
-                *rest[len(lacking) :],
-                *arm_lines(stock),
-                *forecast_lines(forecast),
-            ]
+            lines += [*rest[len(lacking) :], *arm_lines(stock), *forecast_blocks(forecast)]
         else:
             lines.append("--verbose shows every task, mailbox and equation")
-        print_wrapped("\n".join(lines))
+        print_blocks(lines)
     if not forecast.holds:
         sys.exit(1)
 

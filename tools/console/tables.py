@@ -3,7 +3,7 @@ or coloured."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO
 from typing import Any
@@ -104,22 +104,74 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterat
             yield f"|{'|'.join('-' * (width + 2) for width in widths)}|"
 
 
+Cell = str | float | None
+"""Text, or a number without trailing zeros; None for "-"."""
+
+
 @dataclass(frozen=True)
 class TextTable:
-    """A table as data. `dropped` are columns that a narrow terminal leaves out, the first of them
-    first."""
+    """A table as data: of each row the cells by column. `dropped` are columns that a narrow
+    terminal leaves out, the first of them first."""
 
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    records: Sequence[Mapping[str, Cell]]
     dropped: Sequence[str] = ()
 
-    def markdown(self) -> Iterator[str]:
-        """Yield all of it in Markdown."""
-        return markdown_table(self.head, self.rows)
+    @property
+    def head(self) -> list[str]:
+        """The names of the columns; none without a row."""
+        return [*self.records[0]] if self.records else []
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """The cells as text."""
+        return [[cell_text(cell) for cell in record.values()] for record in self.records]
+
+
+def cell_text(cell: Cell) -> str:
+    """Return a cell as text."""
+    if cell is None:
+        return "-"
+    return f"{cell:g}" if isinstance(cell, float) else str(cell)
 
 
 Blocks = Iterator[str | TextTable]
-"""A text for people, line by line, with tables in it."""
+"""A text for people, line by line, with tables in it; a line that begins with "#" is a title."""
+
+
+def render_markdown(blocks: Iterable[str | TextTable]) -> str:
+    """Return a text as Markdown, with all columns."""
+    lines: list[str] = []
+    for block in blocks:
+        if isinstance(block, TextTable):
+            lines += markdown_table(block.head, block.rows)
+        else:
+            lines.append(block)
+    return "\n".join(lines) + "\n"
+
+
+def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> Iterator[str]:
+    """Yield the lines of a text, its tables as `table` fits them to `width`."""
+    for block in blocks:
+        if isinstance(block, TextTable):
+            yield from table(block.head, block.rows, width, block.dropped)
+        else:
+            yield block
+
+
+def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
+    """Print a text on a terminal: tables show as many columns as fit, and titles are bold."""
+    for line in render_text(blocks, terminal.width):
+        style = "bold" if line.startswith("#") else ""
+        terminal.print(line.lstrip("# "), style=style, highlight=False, markup=False)
+
+
+def print_blocks(blocks: Iterable[str | TextTable]) -> None:
+    """Print a text on stdout: as it fits a terminal, or else whole."""
+    terminal = console()
+    if terminal.is_terminal:
+        show_blocks(blocks, terminal)
+    else:
+        print(*render_text(blocks), sep="\n")
 
 
 def decimal(value: float | None, digits: int = 3) -> str:

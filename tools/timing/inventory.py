@@ -14,7 +14,7 @@ from rack.levels.level import Executor
 from rack.levels.tables import read_params
 from rack.levels.timing.chains import spanned
 from rack.tools.console.answer import Document
-from rack.tools.console.tables import fitted
+from rack.tools.console.tables import Blocks, TextTable
 
 PATIENCE = (
     "patience: '{board}' goes on with its last torque for {ms:g} ms ({cycles} cycles; permitted:"
@@ -152,7 +152,81 @@ def _network(config: RackConfig) -> Document | None:
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 
 
-def _network_lines(network: Document | None) -> Iterator[str]:
+def inventory_blocks(found: Document) -> Blocks:
+    """Yield an inventory as text for people."""
+    boards = len({task["slot"] for task in found["tasks"]})
+    crate = f"{boards} board{'s' * (boards > 1)} and the clock"
+    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
+    yield from found["notes"]
+    has_phases = any(task["phase_ticks"] for task in found["tasks"])
+    rows = [
+        {
+            "slot": task["slot"],
+            "task": task["task"],
+            "core": task["core"],
+            "FIFO": task["priority"] or None,
+            "rate, Hz": task["rate_hz"],
+            "ticks": task["every_ticks"],
+            **({"phase": task["phase_ticks"]} if has_phases else {}),
+            "slice, ms": task["slice_ms"],
+            "trace at": _hex(task["trace_address"]),
+        }
+        for task in found["tasks"]
+    ]
+    clock = {
+        **dict.fromkeys(rows[0], ""),
+        "slot": CLOCK_SLOT,
+        "task": "clock",
+        "core": found["clock_core"],
+        "FIFO": found["clock_priority"] or None,
+    }
+    yield ""
+    yield TextTable([clock, *rows], ("trace at", "slice, ms"))
+    yield from _host_blocks(found["hosts"])
+    yield from _network_blocks(found["network"])
+    yield ""
+    mailboxes = [
+        {
+            "bus address": _hex(mailbox["address"]),
+            "mailbox": mailbox["mailbox"],
+            "message": mailbox["message"],
+            "bytes": mailbox["size"],
+            "slots": mailbox["depth"],
+            # Of a queue with its depth, as in `[protocol.depth]`.
+            "protocol": f"{mailbox['protocol']} of {mailbox['capacity']}"
+            if mailbox["capacity"]
+            else mailbox["protocol"],
+            "delay, ms": mailbox["delay_ms"],
+            "written by > read by": (
+                f"{mailbox['writer']} > {spanned(mailbox['readers']) or '(nobody)'}"
+            ),
+        }
+        for mailbox in found["mailboxes"]
+    ]
+    yield TextTable(mailboxes, ("slots", "bytes", "message", "protocol"))
+    yield ""
+    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
+    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+
+
+def _host_blocks(hosts: Sequence[Document]) -> Blocks:
+    """Yield the boards of the host side: they have no rate, and the timing model leaves them
+    out."""
+    if hosts:
+        rows = [
+            {
+                "host side": host["board"],
+                "program": "rack prompt" if host["external"] else host["program"],
+                "writes": ", ".join(host["writes"]),
+                "reads": ", ".join(host["reads"]),
+            }
+            for host in hosts
+        ]
+        yield ""
+        yield TextTable(rows, ("program",))
+
+
+def _network_blocks(network: Document | None) -> Blocks:
     """Yield with whom a rack exchanges what, and what it does while one of them is lost."""
     if network is None:
         return
@@ -161,102 +235,22 @@ def _network_lines(network: Document | None) -> Iterator[str]:
     rule = f"lost after {network['lease_ms']:g} ms: {network['on_peer_loss']}"
     yield from ("", f"network: {'; '.join([*ends, f'works with {peers}', rule])}")
     rows = [
-        [
-            e["entry"],
-            e["way"],
-            e["mailbox"],
-            f"{e['rate_hz']:g}",
-            f"{e['max_age_ms']:g}" if "max_age_ms" in e else "",
-        ]
-        for e in network["entries"]
+        {
+            "exchange": entry["entry"],
+            "way": entry["way"],
+            "mailbox": entry["mailbox"],
+            "rate, Hz": entry["rate_hz"],
+            "max age, ms": entry.get("max_age_ms", ""),
+        }
+        for entry in network["entries"]
     ]
-    yield from fitted(["exchange", "way", "mailbox", "rate, Hz", "max age, ms"], rows)
-
-
-def _host_lines(hosts: Sequence[Document]) -> Iterator[str]:
-    """Yield the boards of the host side: they have no rate, and the timing model leaves them
-    out."""
-    if hosts:
-        rows = [
-            [
-                h["board"],
-                "rack prompt" if h["external"] else h["program"],
-                ", ".join(h["writes"]),
-                ", ".join(h["reads"]),
-            ]
-            for h in hosts
-        ]
-        yield ""
-        yield from fitted(["host side", "program", "writes", "reads"], rows, ("program",))
-
-
-def inventory_lines(found: Document) -> Iterator[str]:
-    """Yield an inventory as text for people."""
-    boards = len({task["slot"] for task in found["tasks"]})
-    crate = f"{boards} board{'s' * (boards > 1)} and the clock"
-    yield f"rack {found['rack']}: {crate}, {found['clock_ms']:g} ms, {found['mode']}"
-    yield from found["notes"]
-    phase = {"phase": "phase_ticks"} if any(task["phase_ticks"] for task in found["tasks"]) else {}
-    clock = [*map(str, (CLOCK_SLOT, "clock", found["clock_core"], found["clock_priority"] or "-"))]
-    rows = [
-        [
-            *map(str, (t["slot"], t["task"], t["core"], t["priority"] or "-")),
-            f"{t['rate_hz']:g}",
-            str(t["every_ticks"]),
-            *(str(t[key]) for key in phase.values()),
-            f"{t['slice_ms']:g}",
-            _hex(t["trace_address"]),
-        ]
-        for t in found["tasks"]
-    ]
-    head = ["slot", "task", "core", "FIFO", "rate, Hz", "ticks", *phase, "slice, ms", "trace at"]
-    yield ""
-    yield from fitted(
-        head, [[*clock, *[""] * (len(head) - len(clock))], *rows], ("trace at", "slice, ms")
-    )
-    rows = [
-        [
-            _hex(m["address"]),
-            m["mailbox"],
-            m["message"],
-            str(m["size"]),
-            str(m["depth"]),
-            _protocol(m),
-            f"{m['delay_ms']:g}",
-            f"{m['writer']} > {spanned(m['readers']) or '(nobody)'}",
-        ]
-        for m in found["mailboxes"]
-    ]
-    yield from _host_lines(found["hosts"])
-    yield from _network_lines(found["network"])
-    head = [
-        "bus address",
-        "mailbox",
-        "message",
-        "bytes",
-        "slots",
-        "protocol",
-        "delay, ms",
-        "written by > read by",
-    ]
-    yield ""
-    yield from fitted(head, rows, ("slots", "bytes", "message", "protocol"))
-    yield ""
-    windows = ", ".join(f"{board} {_hex(address)}" for board, address in found["windows"].items())
-    yield f"segment: {found['segment_bytes']} bytes; board windows: {windows}"
+    yield TextTable(rows)
 
 
 def arm_lines(found: Document) -> Iterator[str]:
     """Yield what an arm does while no torque comes, and what its monitors take for good."""
     yield from (PATIENCE.format(**one) for one in found["patience"])
     yield from (MONITORS.format(**one) for one in found["monitors"])
-
-
-def _protocol(mailbox: Document) -> str:
-    """Return a mailbox's protocol; of a queue with its depth, as in `[protocol.depth]`."""
-    if mailbox["capacity"]:
-        return f"{mailbox['protocol']} of {mailbox['capacity']}"
-    return str(mailbox["protocol"])
 
 
 def _hex(address: int) -> str:

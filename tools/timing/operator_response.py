@@ -20,7 +20,7 @@ from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.levels.timing.trace_times import distribution
 from rack.tools.console.answer import Document, Failure, print_json, write_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
-from rack.tools.console.tables import decimal, fitted, print_wrapped
+from rack.tools.console.tables import Blocks, TextTable, decimal, print_blocks
 from rack.tools.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -150,28 +150,24 @@ class OperatorResponse:
         }
         return {**head, **figures, "levels": self.rows(), "each": commands}
 
-    def text(self) -> str:
-        """Return the figures as text for people."""
-        return "\n".join(self._lines())
-
-    def _lines(self) -> Iterator[str]:
+    def blocks(self) -> Blocks:
+        """Yield the figures as text for people."""
         yield (
             f"response to {len(self.measured)} operator commands, ms of simulated time: from giving"
             " a command, and"
         )
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
         rows = [
-            [
-                row["level"],
-                str(row["commands"]),
-                *(decimal(row[key], 1) for key in FIGURES.values()),
-                str(row["beyond"]),
-                str(row["off_prediction"]),
-            ]
+            {
+                "given to": row["level"],
+                "commands": row["commands"],
+                **{head: decimal(row[key], 1) for head, key in FIGURES.items()},
+                "beyond": row["beyond"],
+                "off prediction": row["off_prediction"],
+            }
             for row in self.rows()
         ]
-        head = ["given to", "commands", *FIGURES, "beyond", "off prediction"]
-        yield from fitted(head, rows, ("min", "sum, eq. 3.3", "median"))
+        yield TextTable(rows, ("min", "sum, eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
             yield (
                 f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
@@ -269,7 +265,7 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
     if as_json:
         print_json(document)
     else:
-        print_wrapped(f"{response.text()}\n\n{files}")
+        print_blocks((*response.blocks(), "", files))
     return response.held
 
 

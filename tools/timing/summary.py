@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rack.levels.timing.forecast import NO_BUDGET, Forecast
 from rack.levels.timing.verdicts import EQUATIONS, EquationVerdict
+from rack.tools.console.tables import Blocks
 from rack.tools.timing.repair import Repair
 from rack.tools.timing.tables import side_text, verdict_table
 
@@ -19,13 +20,13 @@ RESPONSES = "3.2", "3.3"
 """Equations of the system's response."""
 
 
-def summary_lines(
+def summary_blocks(
     forecast: Forecast,
     fitting: Repair,
     arm: Abilities | None,
     joints: Sequence[str],
     measuring: str,
-) -> Iterator[str]:
+) -> Blocks:
     """Yield the summary as text for people, with every verdict that fails.
 
     Args:
@@ -40,9 +41,10 @@ def summary_lines(
     yield from tightest(forecast.verdicts)
     system = forecast.system
     if system.levels:
-        down = system.command_ms
-        up = system.status_ms
-        yield f"response: a command down {down:g} ms, a status up {up:g} ms"
+        yield (
+            f"response: a command down {system.command_ms:g} ms, a status up"
+            f" {system.status_ms:g} ms"
+        )
     if arm is not None:
         yield (
             f"arm: its tool reaches {arm.reach:.2f} m, holds {arm.payload:.1f} kg at rest; gravity"
@@ -50,7 +52,7 @@ def summary_lines(
         )
     if failing:
         yield ""
-        yield from verdict_table(("", verdict) for verdict in failing)
+        yield verdict_table(("", verdict) for verdict in failing)
         yield ""
         yield from fitting.lines()
     elif not forecast.uncounted:

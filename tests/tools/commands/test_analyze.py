@@ -10,13 +10,12 @@ import pytest
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config import load
-from rack.tools.console import tables
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import document
-from rack.tools.timing.analysis.tables import brief, text
 from tests.shared_runs import slow_run
+from tests.tools.analysis_text import brief, text
 from tests.tools.command_line import rack
 from tests.tools.recordings import MS, Cycle, recorded
 
@@ -261,13 +260,11 @@ def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_the_tables_of_an_analysis_fit_the_terminal(
-    small: Path, tmp_path: Path, width: int, monkeypatch: pytest.MonkeyPatch
+    small: Path, tmp_path: Path, width: int
 ) -> None:
     traces = {name: [Cycle(SETTLED + k, PLAIN) for k in range(8)] for name in ("lower", "upper")}
     analysis = Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces))
-    with monkeypatch.context() as patched:
-        patched.setattr(tables, "terminal_width", lambda: width)
-        lines = text(analysis).splitlines()
+    lines = text(analysis, width).splitlines()
     rows = [
         line
         for line in lines

@@ -13,10 +13,10 @@ import pytest
 from rack.boards.config import budgets, load
 from rack.boards.config.files import names
 from rack.levels.timing.forecast import Forecast
-from rack.tools.console import tables
-from rack.tools.timing.inventory import inventory, inventory_lines
+from rack.tools.console.tables import render_text
+from rack.tools.timing.inventory import inventory, inventory_blocks
 from rack.tools.timing.judged_config import JudgedConfig
-from rack.tools.timing.tables import forecast_lines
+from rack.tools.timing.tables import forecast_blocks
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
@@ -89,12 +89,11 @@ def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_what_a_check_shows_fits_the_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "terminal_width", lambda: width)
+def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
     found = load("nasrem")
     judged = JudgedConfig.of(found)
-    lines = [*inventory_lines(inventory(found, judged.layout, []))]
-    lines += forecast_lines(Forecast.of(judged.timing))
+    lines = [*render_text(inventory_blocks(inventory(found, judged.layout, [])), width)]
+    lines += render_text(forecast_blocks(Forecast.of(judged.timing)), width)
     # Other text is wrapped when it is printed.
     rows = [line for line in lines if "  " in line.strip()]
     assert len(rows) > 50

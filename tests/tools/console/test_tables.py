@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
+import io
 
-from rack.tools.console.tables import table
+import pytest
+from rich.console import Console
+
+from rack.tools.console.tables import TextTable, render_markdown, render_text, show_blocks, table
 
 HEAD = ("task", "count", "what it says of itself")
 ROWS = (("servo", "12", "torque of j3 is NaN, and rejected"), ("elemental_move", "7", "idle"))
@@ -56,3 +59,34 @@ def test_no_word_is_lost_where_a_column_is_narrower_than_it() -> None:
     lines = list(table(("name", "what"), [["a" * 30, "b" * 30]], 20))
     assert max(map(len, lines)) <= 20
     assert ["".join(lines).count(letter) for letter in "ab"] == [30 + 2, 30]
+
+
+BLOCKS = (
+    "# Levels",
+    TextTable([{"level": "servo", "R": 2.5, "d": 3}, {"level": "task", "R": 1e3, "d": None}]),
+    "all held",
+)
+
+
+def test_a_text_is_the_same_facts_as_markdown_and_in_a_pipe() -> None:
+    assert render_markdown(BLOCKS) == (
+        "# Levels\n"
+        "| level | R    | d |\n"
+        "|-------|------|---|\n"
+        "| servo | 2.5  | 3 |\n"
+        "| task  | 1000 | - |\n"
+        "all held\n"
+    )
+    assert list(render_text(BLOCKS)) == [
+        "# Levels",
+        "level     R  d",
+        "servo   2.5  3",
+        "task   1000  -",
+        "all held",
+    ]
+
+
+def test_on_a_terminal_titles_lose_their_mark() -> None:
+    terminal = Console(width=40, record=True, file=io.StringIO())
+    show_blocks(BLOCKS, terminal)
+    assert terminal.export_text().splitlines()[0] == "Levels"

@@ -16,6 +16,7 @@ from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config.resolved import loads, wire
 from rack.levels.peer import Presence
+from rack.tools.console.tables import render_text
 from rack.tools.live.display import RackView
 from rack.tools.live.network import (
     ExportRow,
@@ -30,7 +31,7 @@ from rack.tools.live.newest import Newest
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.timing.analysis.report import network
 from rack.tools.timing.analysis.report_markdown import _network
-from rack.tools.timing.inventory import inventory, inventory_lines
+from rack.tools.timing.inventory import inventory, inventory_blocks
 from tests.boards.lan.racks import rack_text
 
 TEXT = rack_text(
@@ -97,7 +98,7 @@ def test_check_shows_the_exchange() -> None:
     config = loads(TEXT)
     found = inventory(config, wire(config), [])
     assert found["network"]["peers"] == ("other-one", "third")
-    text = "\n".join(inventory_lines(found))
+    text = "\n".join(render_text(inventory_blocks(found)))
     assert (
         "network: listen tcp/127.0.0.1:7447; works with other-one, third; lost after 500 ms: go on"
         in text

@@ -31,10 +31,10 @@ from rack.tools.recording.run_files import mend
 from rack.tools.recording.spool import Spool, locked
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
-from rack.tools.timing.analysis.tables import text as analysis_text
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import executable
 from tests.shared_runs import small_run
+from tests.tools.analysis_text import text as analysis_text
 from tests.tools.recording.struck_recorders import (
     FIRST_BLOCK,
     LONG_S,

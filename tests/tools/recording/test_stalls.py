@@ -38,8 +38,8 @@ from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.document import document
 from rack.tools.timing.analysis.report import report_of
 from rack.tools.timing.analysis.report_markdown import markdown
-from rack.tools.timing.analysis.tables import text
 from tests.machine import needs_fifo
+from tests.tools.analysis_text import text
 from tests.tools.recordings import MS, Cycle, recorded
 
 MISSED, PLANNED = int(Flag.MISSED), int(Flag.PLANNED)

@@ -12,6 +12,7 @@ import pytest
 from rack.boards.config import load
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.tools.console.answer import Failure
+from rack.tools.console.tables import render_text
 from rack.tools.lab.benches.observed import record, with_commands
 from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
 from tests.boards.commanded_racks import COMMANDED
@@ -54,7 +55,7 @@ def test_every_command_of_a_run_comes_at_its_predicted_tick(
         (250, 251, 251, 251),
     ]
     assert response.held
-    assert "0 " in response.text().splitlines()[-1]
+    assert "0 " in "\n".join(render_text(response.blocks())).splitlines()[-1]
     pictures = plot(response, tmp_path)
     assert [picture.suffix for picture in pictures] == [".png", ".svg"]
     assert all(picture.stat().st_size > 1000 for picture in pictures)
@@ -79,7 +80,7 @@ def test_what_no_torque_rests_on_is_told_apart(config: MakeConfig, tmp_path: Pat
     assert len(response.measured) == 1
     assert (
         "not measured: 1 to upper (refused), 2 to upper (superseded), 4 to upper (run over)"
-        in response.text()
+        in "\n".join(render_text(response.blocks()))
     )
 
 

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from rich.console import Console
-
 from rack.boards.events import Braking, braked_text
 from rack.tools.console.answer import Document
-from rack.tools.console.tables import Blocks, TextTable, figure, table
+from rack.tools.console.tables import (
+    Blocks,
+    Cell,
+    TextTable,
+    decimal,
+    figure,
+    render_markdown,
+)
 from rack.tools.live.holds import resume_command
 from rack.tools.live.verdict import headline
 from rack.tools.recording.recording import Gap
@@ -25,41 +30,17 @@ from rack.tools.timing.analysis.run_report import RunReport
 CHANGED = 1.05
 """Ratio of a core's highest to its lowest frequency from which the text mentions it."""
 
-FAULTS = (
-    "fault",
-    "target",
-    "at tick",
-    "found as",
-    "after",
-    "bound",
-    "reactions",
-    "recovered after",
-)
-
 
 def markdown(report: Document) -> str:
     """Return report.md of a report."""
-    blocks = (
-        block.markdown() if isinstance(block, TextTable) else (block,) for block in _blocks(report)
-    )
-    return "\n".join(line for lines in blocks for line in lines) + "\n"
+    return render_markdown(report_blocks(report))
 
 
-def show(report: Document, terminal: Console) -> None:
-    """Print as much of a report as the terminal's width permits."""
-    for block in (*_blocks(report), "", _files(report)):
-        is_title = isinstance(block, str) and block.startswith("#")
-        lines = (
-            table(block.head, block.rows, terminal.width, block.dropped)
-            if isinstance(block, TextTable)
-            else (block.lstrip("# "),)
-        )
-        for line in lines:
-            terminal.print(line, style="bold" if is_title else "", highlight=False, markup=False)
-
-
-def _files(report: Document) -> str:
-    return f"all columns: {report['folder']}/report.md; all data: report.json"
+def terminal_blocks(report: Document) -> Blocks:
+    """Yield a report for a terminal, with the files that hold the rest."""
+    yield from report_blocks(report)
+    yield ""
+    yield f"all columns: {report['folder']}/report.md; all data: report.json"
 
 
 def summary(document: Document) -> Iterator[str]:
@@ -77,7 +58,8 @@ def summary(document: Document) -> Iterator[str]:
         yield f"- {braked_text([Braking(**one) for one in found])}"
 
 
-def _blocks(document: Document) -> Blocks:
+def report_blocks(document: Document) -> Blocks:
+    """Yield a report as text for people."""
     report = RunReport.of(document)
     yield from summary(document)
     yield from _notes(report)
@@ -122,16 +104,16 @@ def _holds(report: RunReport) -> Blocks:
     yield from ("", f"## Holds: {len(holds)}{the_most(holds, 'longest')}", "")
     longest = sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
     rows = [
-        [
-            hold["level"],
-            f"{'operator: ' if hold['by'] == 'operator' else ''}{hold['why']}",
-            f"{hold['since_s']:.2f}",
-            "the end" if hold["until_s"] is None else f"{hold['until_s']:.2f}",
-            f"{hold['lasted_s']:.2f}",
-        ]
+        {
+            "level": hold["level"],
+            "by": f"{'operator: ' if hold['by'] == 'operator' else ''}{hold['why']}",
+            "since, s": decimal(hold["since_s"], 2),
+            "until, s": "the end" if hold["until_s"] is None else decimal(hold["until_s"], 2),
+            "lasted, s": decimal(hold["lasted_s"], 2),
+        }
         for hold in longest
     ]
-    yield TextTable(("level", "by", "since, s", "until, s", "lasted, s"), rows)
+    yield TextTable(rows)
     for level in (
         hold["level"] for hold in holds if hold["until_s"] is None and hold["by"] == "operator"
     ):
@@ -151,14 +133,20 @@ def _state_tables(levels: dict[str, list[Document]]) -> Blocks:
     rows = []
     for level, fired in levels.items():
         most = max(fired, key=lambda row: row["cycles"])
-        last = fired[-1]
-        tables = ", then ".join(dict.fromkeys(row["table"] for row in fired))
-        count = [str(len(fired)), str(sum(row["cycles"] for row in fired))]
-        ends = [f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, last)]
-        rows.append([level, tables, *count, *ends])
-    yield TextTable(
-        ("level", "table", "rows fired", "cycles", "most often, since", "newest, since"), rows
-    )
+        often, newest = (
+            f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, fired[-1])
+        )
+        rows.append(
+            {
+                "level": level,
+                "table": ", then ".join(dict.fromkeys(row["table"] for row in fired)),
+                "rows fired": len(fired),
+                "cycles": sum(row["cycles"] for row in fired),
+                "most often, since": often,
+                "newest, since": newest,
+            }
+        )
+    yield TextTable(rows)
 
 
 def _machine(report: RunReport) -> Iterator[str]:
@@ -206,40 +194,35 @@ def _against(against: Document) -> Iterator[str]:
 def _faults(report: RunReport) -> Blocks:
     if faults := report.faults:
         yield from ("", f"## Faults: {len(faults)}", "")
-        yield TextTable(FAULTS, [_fault_row(fault) for fault in faults])
+        yield TextTable([_fault_row(fault) for fault in faults])
     if restarts := ", ".join(f"{task} {count}" for task, count in report.restarts.items()):
         yield from ("", f"Restarts: {restarts}.")
     if unexplained := report.unexplained:
         yield from ("", f"## Unexplained detections: {len(unexplained)}", "")
-        rows = [
-            [str(found["tick"]), found["board"], found["code"], found["text"]]
-            for found in unexplained
-        ]
-        yield TextTable(("tick", "found by", "as", "what"), rows)
+        columns = {"tick": "tick", "found by": "board", "as": "code", "what": "text"}
+        yield TextTable(
+            [{head: found[key] for head, key in columns.items()} for found in unexplained]
+        )
 
 
-def _fault_row(fault: Document) -> list[str]:
-    subject = fault["mailbox"] or fault["joint"]
-    is_struck = fault["seen"] != "not struck"
-    found = (
-        f"{fault['found_as']} by {fault['found_by']}"
-        if fault["seen"] == "detected"
-        else fault["seen"]
-    )
-    in_ms = fault["bound_ms"] is not None
-    unit, after, bound = (
-        ("ms", "delay_ms", "bound_ms") if in_ms else ("cycles", "delay_cycles", "bound_cycles")
+def _fault_row(fault: Document) -> dict[str, Cell]:
+    unit = "cycles" if fault["bound_ms"] is None else "ms"
+    after, bound = (
+        "-" if fault[f"{key}_{unit}"] is None else f"{fault[f'{key}_{unit}']:.3g} {unit}"
+        for key in ("delay", "bound")
     )
     recovered = "-" if fault["recovery_ms"] is None else f"{fault['recovery_ms']:.1f} ms"
-    return [
-        fault["kind"],
-        f"{fault['board']} {subject}".strip(),
-        str(fault["struck"]) if is_struck else "-",
-        found,
-        *("-" if fault[key] is None else f"{fault[key]:.3g} {unit}" for key in (after, bound)),
-        ", ".join(fault["reactions"]) or "-",
-        recovered if fault["is_recovered"] else "not recovered",
-    ]
+    seen = fault["seen"]
+    return {
+        "fault": fault["kind"],
+        "target": f"{fault['board']} {fault['mailbox'] or fault['joint']}".strip(),
+        "at tick": None if seen == "not struck" else fault["struck"],
+        "found as": (f"{fault['found_as']} by {fault['found_by']}" if seen == "detected" else seen),
+        "after": after,
+        "bound": bound,
+        "reactions": ", ".join(fault["reactions"]) or None,
+        "recovered after": recovered if fault["is_recovered"] else "not recovered",
+    }
 
 
 def _queues(queues: Sequence[Document]) -> Iterator[str]:
@@ -269,13 +252,14 @@ def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
 
 def _passed(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
     """Return what passed from side to side, and its ages."""
-    counts = [name for name in rows[0] if name != "age_ms"]
-    ages = ("p50", "p99", "max")
     cells = [
-        [*(str(row[name]) for name in counts), *(figure(row["age_ms"], key) for key in ages)]
+        {
+            **{name: count for name, count in row.items() if name != "age_ms"},
+            **{f"age {key}": figure(row["age_ms"], key) for key in ("p50", "p99", "max")},
+        }
         for row in rows
     ]
-    return TextTable([*counts, *(f"age {key}" for key in ages)], cells, dropped)
+    return TextTable(cells, dropped)
 
 
 def _network(network: Document | None) -> Blocks:

@@ -55,15 +55,16 @@ def misses_text(report: RunReport) -> Blocks:
         )
         yield from (f"The tasks counted {of_all}; {why}.", "")
     rows = [
-        [
-            str(miss["tick"]),
-            miss["task"],
-            miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
-            *(decimal(miss.get(key)) for key in ("started_ms", "took_ms")),
-        ]
+        {
+            "tick": miss["tick"],
+            "task": miss["task"],
+            "what": miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
+            "started late, ms": decimal(miss.get("started_ms")),
+            "took, ms": decimal(miss.get("took_ms")),
+        }
         for miss in misses[:SHOWN]
     ]
-    yield TextTable(("tick", "task", "what", "started late, ms", "took, ms"), rows)
+    yield TextTable(rows)
 
 
 def response_text(response: Document) -> Blocks:
@@ -85,20 +86,21 @@ def _response_along(response: Document) -> Blocks:
     yield ""
     ways = {"command, down": response["command"], "status, up": response["status"]}
     rows = [
-        [
-            (
+        {
+            "way": (
                 way
                 if len(found["levels"]) == len(response["levels"])
                 else f"{way} from {found['levels'][0]}"
             ),
-            *(figure(found["measured_ms"], key) for key in ("p50", "max")),
-            f"{found['bound_ms']:g}",
-            JUDGED[found["holds"]],
-        ]
+            "measured p50": figure(found["measured_ms"], "p50"),
+            "measured max": figure(found["measured_ms"], "max"),
+            "bound": found["bound_ms"],
+            "": JUDGED[found["holds"]],
+        }
         for way, found in ways.items()
         if found["levels"]
     ]
-    yield TextTable(("way", "measured p50", "measured max", "bound", ""), rows)
+    yield TextTable(rows)
     for way, found in ways.items():
         if found["beyond"]:
             yield from (

@@ -71,12 +71,11 @@ def print_report(data: Document, text: str, as_json: bool) -> None:
     if as_json:
         print_json(data)
         return
-    from rack.tools.console.tables import console
+    from rack.tools.console.tables import print_blocks, terminal_width
 
-    terminal = console()
-    if terminal.is_terminal and data["folder"] is not None:
-        from rack.tools.timing.analysis.report_markdown import show
+    if terminal_width() is not None and data["folder"] is not None:
+        from rack.tools.timing.analysis.report_markdown import terminal_blocks
 
-        show(data, terminal)
+        print_blocks(terminal_blocks(data))
     else:
         print(text)

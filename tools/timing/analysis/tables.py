@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rack.levels.timing.verdicts import verdicts
-from rack.tools.console.tables import fitted
+from rack.tools.console.tables import Blocks
 from rack.tools.recording.cycles import START_UP_S, restarts
 from rack.tools.timing.analysis.analysis import MOSTLY, Analysis, Pair
 from rack.tools.timing.analysis.document import task_document
@@ -14,18 +14,13 @@ from rack.tools.timing.summary import tightest
 from rack.tools.timing.tables import level_table, verdict_table
 
 
-def text(analysis: Analysis) -> str:
-    """Return everything as text for a screen or two."""
-    return "\n".join(_lines(analysis))
-
-
-def brief(analysis: Analysis) -> str:
-    """Return what matters most: how the run ended, what held, and what to do."""
-    return "\n".join([*_head(analysis), "--verbose shows every level, task and equation"])
-
-
-def _lines(analysis: Analysis) -> Iterator[str]:
+def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
+    """Yield an analysis as text: how the run ended, what held, and what to do; if verbose, every
+    level, task and equation."""
     yield from _head(analysis)
+    if not is_verbose:
+        yield "--verbose shows every level, task and equation"
+        return
     yield ""
     yield (
         f"Levels: processor time in ms, {_worst_words(analysis.percentile)}; t_residual is alpha of"
@@ -33,7 +28,7 @@ def _lines(analysis: Analysis) -> Iterator[str]:
     )
     sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
     names = analysis.config.board
-    yield from level_table(
+    yield level_table(
         ((side, of[name]) for name in names for side, of in sides.items() if name in of), "side"
     )
     yield ""
@@ -41,10 +36,9 @@ def _lines(analysis: Analysis) -> Iterator[str]:
     tasks = {
         name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()
     }
-    times = times_table(tasks, analysis.predicted.is_lockstep)
-    yield from fitted(times.head, times.rows, times.dropped)
+    yield times_table(tasks, analysis.predicted.is_lockstep)
     yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
-    yield from verdict_table(
+    yield verdict_table(
         (side, verdict)
         for pair in analysis.pairs
         for side, verdict in (("predicted", pair.predicted), ("measured", pair.measured))

@@ -110,15 +110,15 @@ def times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
     """Return a line per task, without what means nothing in lockstep."""
     columns = USED if is_lockstep else BY_THE_CLOCK | USED
     rows = [
-        [
-            name,
-            f"{task['slice_ms']:g}",
-            *(str(task.get(key, "-")) for key in ("cycles", "missed", "skipped")),
-            *(
-                figure(task.get(key), part) if part else decimal(task[key])
-                for key, part in columns.values()
-            ),
-        ]
+        {
+            "task": name,
+            "R": task["slice_ms"],
+            **{key: task.get(key) for key in ("cycles", "missed", "skipped")},
+            **{
+                column: figure(task.get(key), part) if part else decimal(task[key])
+                for column, (key, part) in columns.items()
+            },
+        }
         for name, task in tasks.items()
     ]
-    return TextTable(("task", "R", "cycles", "missed", "skipped", *columns), rows, DROPPED)
+    return TextTable(rows, DROPPED)

@@ -17,13 +17,14 @@ from rack.boards.config import load
 from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
 from rack.levels.systems.hand.messages import HAND_STATUS
 from rack.levels.systems.joint_boards.messages import DRIVING
+from rack.tools.console.tables import show_blocks
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.live.verdict import ACROSS_RACKS, judge_run
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis import arm_outcome
 from rack.tools.timing.analysis.report import report_of, write_report
-from rack.tools.timing.analysis.report_markdown import markdown, show
+from rack.tools.timing.analysis.report_markdown import markdown, terminal_blocks
 from rack.tools.timing.analysis.task_times import task_times
 from rack.tools.timing.measured_response import system_response
 from tests.boards.commanded_racks import COMMANDED, commands
@@ -215,7 +216,7 @@ def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: i
     }
     report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
     terminal = Console(width=width, record=True, file=io.StringIO())
-    show(report, terminal)
+    show_blocks(terminal_blocks(report), terminal)
     lines = terminal.export_text().splitlines()
     assert max(map(len, lines)) <= width
     rows = [line.split() for line in lines if line.startswith("elemental_move.planner")]

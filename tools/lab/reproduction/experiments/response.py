@@ -18,6 +18,7 @@ from rack.boards.config import rack_timing, wire
 from rack.boards.config.schema import CommandConfig
 from rack.levels.timing.command_path import CommandPath, command_paths
 from rack.tools.console.answer import Failure
+from rack.tools.console.tables import render_text
 from rack.tools.lab.benches.observed import with_commands
 from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Workshop
 from rack.tools.recording.recording import Recording
@@ -75,7 +76,8 @@ class ResponseRun(Charted):
 def _measure(workshop: Workshop) -> ResponseRun:
     lockstep = measure_response(workshop, "lockstep", TWINS)
     realtime = measure_response(workshop, "realtime", 0)
-    return ResponseRun(lockstep, realtime, chart=realtime.response.text())
+    chart = "\n".join(render_text(realtime.response.blocks()))
+    return ResponseRun(lockstep, realtime, chart=chart)
 
 
 RESPONSE = Experiment(
