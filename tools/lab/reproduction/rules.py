@@ -28,7 +28,6 @@ from rack.tools.lab.reproduction.experiments.figures import (
 from rack.tools.lab.reproduction.experiments.nasrem import NAME, NasremRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
-from rack.tools.lab.reproduction.experiments.systems import prediction
 from rack.tools.lab.reproduction.experiments.tasks import LATER_MS, NetworkRun, TaskRun
 from rack.tools.lab.reproduction.verdict import (
     STRAY,
@@ -398,12 +397,11 @@ def judge_systems(names: Iterable[str], *found: TaskRun | tables.TableRuns) -> C
 
 def judge_layers(names: Iterable[str]) -> ClaimVerdict:
     """Count levels in configs, and the systems in which a level is faster than one below it."""
-    promised = {name: prediction(load(name)) for name in names}
-    inverted = sum(sorted(said.rates_hz) != list(said.rates_hz) for said in promised.values())
-    levels = (
-        compare(f"{name}_levels", len(said.levels), ">=", 2) for name, said in promised.items()
-    )
-    return rule_on(*levels, *check_none(systems_with_a_faster_level_above=inverted))
+    configs = {name: load(name) for name in names}
+    paths = {name: rack_timing(one, wire(one)).hierarchy for name, one in configs.items()}
+    faster = sum(sorted(path.cycles, reverse=True) != [*path.cycles] for path in paths.values())
+    levels = (compare(f"{name}_levels", len(path.levels), ">=", 2) for name, path in paths.items())
+    return rule_on(*levels, *check_none(systems_with_a_faster_level_above=faster))
 
 
 def judge_links(

@@ -24,13 +24,15 @@ from rack.tools.lab.reproduction.experiments.partition import (
 )
 from rack.tools.lab.reproduction.experiments.sharing import ChainRun, Chains
 from rack.tools.lab.reproduction.experiments.switch import SwitchRun
-from rack.tools.lab.reproduction.experiments.systems import (
+from rack.tools.lab.reproduction.experiments.tables import TableRun, TableRuns
+from rack.tools.lab.reproduction.experiments.tasks import (
+    TASKS,
+    NetworkRun,
     SystemResponse,
+    TaskRun,
     WayResponse,
     response_from,
 )
-from rack.tools.lab.reproduction.experiments.tables import TableRun, TableRuns
-from rack.tools.lab.reproduction.experiments.tasks import TASKS, NetworkRun, TaskRun
 from rack.tools.lab.reproduction.reproduction import SECTIONS, list_experiments, select_sections
 from rack.tools.lab.reproduction.rules import DONE
 from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet

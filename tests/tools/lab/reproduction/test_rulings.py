@@ -22,7 +22,6 @@ from rack.tools.lab.reproduction.experiments import (
     response,
     sharing,
     switch,
-    systems,
     tasks,
 )
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
@@ -169,7 +168,7 @@ def by_equation(rack: str, settings: tuple[str, ...] = IN_LOCKSTEP) -> Judge:
         run = workshop.run(rack, workshop.config(rack, settings)).recording
         analysis = Analysis.of(run)
         verdicts = tuple(nasrem.measured_verdicts(analysis))
-        response = systems.response_from(analysis.response)
+        response = tasks.response_from(analysis.response)
         return claim.judge(replace(RUN, verdicts=verdicts, response=response))
 
     return judge

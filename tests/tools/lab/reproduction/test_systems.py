@@ -1,15 +1,14 @@
-"""Systems next to each other: what their configs promise, whatever their levels are."""
+"""Systems next to each other, and how many levels their configs have."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from rack.boards.config import load, names
+from rack.boards.config import names
 from rack.boards.config.files import CONFIGS
 from rack.tools.lab.reproduction.claims import SYSTEMS
-from rack.tools.lab.reproduction.experiments.systems import prediction
+from rack.tools.lab.reproduction.rules import judge_layers
+from rack.tools.lab.reproduction.verdict import Ruling, describe_unmet
 from tests.boards.conftest import PLAIN
 
 
@@ -21,14 +20,14 @@ def test_the_systems_are_nasrem_and_every_bundled_rack_with_a_folder() -> None:
     assert len(set(SYSTEMS)) == len(SYSTEMS)
 
 
-def test_what_a_config_promises_is_read_from_it_alone() -> None:
-    found = prediction(load("nasrem"))
-    assert found.levels == ("task", "elemental_move", "primitive", "servo")
-    assert found.rates_hz == pytest.approx((1, 4, 50, 400))
+def test_levels_are_read_from_a_config_alone() -> None:
+    levels, faster = judge_layers(["nasrem"]).checks
+    assert (levels.measured, faster.measured) == (4, 0)
 
 
-def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: Path) -> None:
+def test_a_rack_without_levels_above_each_other_has_no_two(tmp_path: Path) -> None:
     path = tmp_path / "lone.toml"
     path.write_text(PLAIN.replace('below = "wave"', 'reads = { status = "wave.status" }'))
-    found = prediction(load(path))
-    assert (found.levels, found.rates_hz) == ((), ())
+    verdict = judge_layers([str(path)])
+    assert verdict.ruling is Ruling.FAILS
+    assert "_levels 0, not >= 2" in describe_unmet(verdict.checks)

@@ -4,7 +4,7 @@ joined by a network."""
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +16,6 @@ from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import UNVIEWED, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import RUNS, Experiment, Workshop
-from rack.tools.lab.reproduction.experiments.systems import SystemResponse, response_from
 from rack.tools.live.host_side import entries_of
 from rack.tools.live.launch import RunResult
 from rack.tools.recording.recording import Recording
@@ -47,6 +46,48 @@ LATER_MS = 100
 DELAYED = ("lan.reference", "lan.modifications")
 MODIFICATION = "pd"
 """The first modification of the task."""
+
+
+@dataclass(frozen=True)
+class WayResponse:
+    """The response one way, ms of simulated time.
+
+    Attributes:
+        longest_ms: The longest that was measured; None if nothing went all the way.
+        bound_ms: The longest on the grid.
+        unexplained: Responses beyond the bound that no missed cycle delayed.
+    """
+
+    longest_ms: float | None
+    bound_ms: float
+    unexplained: int
+
+
+@dataclass(frozen=True)
+class SystemResponse:
+    """The response of a rack by way, "command" and "status", next to equation 3.3, ms."""
+
+    sum_eq_3_3_ms: float
+    ways: dict[str, WayResponse]
+
+
+def response_from(found: Mapping[str, Any] | None) -> SystemResponse | None:
+    """Return the response in a report; None without a hierarchy, or if it crosses racks, for which
+    there is no bound."""
+    if found is None or found["crosses_racks"]:
+        return None
+    ways = {way: _way_response(found[way]) for way in ("command", "status")}
+    return SystemResponse(found["sum_eq_3_3_ms"], ways)
+
+
+def _way_response(way: Mapping[str, Any]) -> WayResponse:
+    delays = [beyond["delayed_by"] for beyond in way["beyond"]]
+    times = way["measured_ms"]
+    return WayResponse(
+        longest_ms=None if times is None else times["max"],
+        bound_ms=way["bound_ms"],
+        unexplained=sum(not any("missed" in delay for delay in each) for each in delays),
+    )
 
 
 @dataclass(frozen=True)
