@@ -161,8 +161,9 @@ def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> 
 def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
     """Print a text on a terminal: tables show as many columns as fit, and titles are bold."""
     for line in render_text(blocks, terminal.width):
-        style = "bold" if line.startswith("#") else ""
-        terminal.print(line.lstrip("# "), style=style, highlight=False, markup=False)
+        is_title = line.startswith("#")
+        text = line.lstrip("# ") if is_title else line
+        terminal.print(text, style="bold" if is_title else "", highlight=False, markup=False)
 
 
 def print_blocks(blocks: Iterable[str | TextTable]) -> None:
