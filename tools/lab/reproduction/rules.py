@@ -439,7 +439,7 @@ def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
 def judge_predictable(found: response.ResponseRun) -> ClaimVerdict:
     """Compare responses with the tick predicted, and with equations 3.2 and 3.3; within bounds,
     with the longest that the grid permits instead of the sum of eq. 3.3."""
-    exact, real = found.lockstep, found.realtime.response
+    real = found.realtime
     upper, total = (
         [
             compare(f"{row['level']}_within_{bound}", row["max_from_reading_ms"], "<=", row[bound])
@@ -450,8 +450,8 @@ def judge_predictable(found: response.ResponseRun) -> ClaimVerdict:
     )
     return rule_on(
         *check_none(
-            lockstep_off_predicted_tick=len(exact.response.off),
-            lockstep_torque_off_predicted_tick=sum(not twin.agrees for twin in exact.twins),
+            lockstep_off_predicted_tick=len(found.lockstep.off),
+            lockstep_torque_off_predicted_tick=found.differs != found.predicted,
             realtime_beyond_grid=len(real.beyond),
         ),
         *upper,

@@ -396,8 +396,8 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "ATTEMPTS", 1)
     monkeypatch.setattr(sharing, "SECONDS", 0.7)
     monkeypatch.setattr(partition, "SECONDS", 2.5)
-    monkeypatch.setattr(response, "COMMANDS", 4)
-    monkeypatch.setattr(response, "TWINS", 0)
+    monkeypatch.setattr(response, "HOLDS", response.HOLDS[:2])
+    monkeypatch.setattr(response, "MOVING_AT", response.HOLDS[1][1])
     monkeypatch.setattr(switch, "WAKES", 200)
 
 
