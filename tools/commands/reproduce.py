@@ -58,7 +58,7 @@ def reproduce(
     holds here, within bounds; the paper contradicts itself; it is not testable here; or it does not
     hold here.
 
-    The page is DIR/index.html, self-contained, and DIR/README.md with its pictures next to it.
+    The page is DIR/index.html and, as Markdown, DIR/README.md; figures are drawn in letters.
     DIR/paper.json has everything as data, DIR/runs the recordings: `rack report`, `rack gantt` and
     `rack analyze` read them.
 

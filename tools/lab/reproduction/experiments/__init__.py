@@ -1,1 +1,1 @@
-"""What `rack reproduce` runs: measurements whose results are plain data and pictures."""
+"""What `rack reproduce` runs: measurements whose results are plain data."""
