@@ -31,12 +31,6 @@ def terminal_width() -> int | None:
     return found.width if found.is_terminal else None
 
 
-def print_wrapped(text: str) -> None:
-    """Print text; on a terminal, wrap long lines between words."""
-    terminal = console()
-    terminal.print(text, highlight=False, markup=False) if terminal.is_terminal else print(text)
-
-
 def table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],

@@ -27,7 +27,7 @@ import numpy as np
 
 from rack.backplane.process import pin, set_priority
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.tables import decimal, print_wrapped, table, terminal_width
+from rack.tools.console.tables import decimal, print_blocks, table, terminal_width
 
 if TYPE_CHECKING:
     from rack.tools.console.progress import Progress
@@ -260,7 +260,7 @@ def show(measure: Callable[[Progress], Found], as_json: bool) -> Found:
     if as_json:
         print_json(found.document())
     else:
-        print_wrapped("\n".join(found.lines(terminal_width())))
+        print_blocks(found.lines(terminal_width()))
     return found
 
 
