@@ -8,12 +8,13 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load, wire
+from rack.tools.console.tables import render_text
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.live.newest import Newest
 from rack.tools.live.queues import queue_fills
 from rack.tools.timing.analysis.report import write_report
-from rack.tools.timing.inventory import inventory, inventory_lines
+from rack.tools.timing.inventory import inventory, inventory_blocks
 from tests.boards.test_queues import QUEUES
 
 FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
@@ -54,7 +55,7 @@ def test_check_shows_the_depth_of_a_queue(tmp_path: Path) -> None:
     config = load(path, list(FULL))
     (line,) = (
         line
-        for line in inventory_lines(inventory(config, wire(config), []))
+        for line in render_text(inventory_blocks(inventory(config, wire(config), [])))
         if "upper.requests " in line
     )
     assert "queue of 7" in line
