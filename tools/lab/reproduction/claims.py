@@ -351,8 +351,7 @@ SECTIONS = (
                 "Figure 2: one processor, 8 ms",
                 "All the functions can run tightly-coupled on one processor in one cycle, with"
                 " sufficient residual processing time.",
-                "It works, as the paper says (C: communicate, R: read, X: execute, W: write, P:"
-                " plan, U: update).",
+                "It works, as the paper says.",
                 (FIG2.experiment,),
                 rules.judge_working,
                 partial(predictions.predict_figure, FIG2),
