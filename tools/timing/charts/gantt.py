@@ -97,26 +97,27 @@ def gantt_of(
     """
     name = subject.config.name
     run = subject.run
+    panels: list[Panel] = []
+    notes: list[str] = []
     schedule = (
         Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
     )
     if run is not None and not run.is_lockstep:
         task = shown_task(run.tasks)
         start, end = options.window(task, run.end_ns, run.middle_ns(task))
-        measured = run.panel(start, end, progress)
+        panels.append(run.panel(start, end, progress))
         if schedule is None:
-            return Gantt(
-                name, (measured,), (f"no schedule: {NO_BUDGET}",), column_for(end - start, None)
-            )
-        schedule.on_cores_of(run.recording.layout)
-        panels = measured, schedule.panel(start, end)
-        return Gantt(name, panels, (), column_for(end - start, schedule.shortest_ns))
-    still = f"{name} ran in lockstep: time stood still while its tasks computed"
-    if schedule is None:
-        why = f"{name}:" if run is None else f"{still};"
-        raise Failure(f"{why} {NO_BUDGET}", 2)
-    start, end = options.window(shown_task(schedule.tasks), None, 0, schedule.shown_ns)
-    notes = () if run is None else (f"{still}; only the schedule is shown",)
-    return Gantt(
-        name, (schedule.panel(start, end),), notes, column_for(end - start, schedule.shortest_ns)
-    )
+            notes.append(f"no schedule: {NO_BUDGET}")
+        else:
+            schedule.on_cores_of(run.recording.layout)
+    else:
+        still = f"{name} ran in lockstep: time stood still while its tasks computed"
+        if schedule is None:
+            raise Failure(f"{name}: {NO_BUDGET}" if run is None else f"{still}; {NO_BUDGET}", 2)
+        if run is not None:
+            notes.append(f"{still}; only the schedule is shown")
+        start, end = options.window(shown_task(schedule.tasks), None, 0, schedule.shown_ns)
+    if schedule is not None:
+        panels.append(schedule.panel(start, end))
+    shortest_ns = None if schedule is None else schedule.shortest_ns
+    return Gantt(name, tuple(panels), tuple(notes), column_for(end - start, shortest_ns))

@@ -143,7 +143,7 @@ class _Traced:
         period = self.task.period_ns
         left_out = skipped(self.rows) * (self.task.role == "executor")
         for release, count, end in zip(
-            self._releases(), left_out.tolist(), self._at("end_ns"), strict=True
+            self._at("release_ns"), left_out.tolist(), self._at("end_ns"), strict=True
         ):
             for missing in range(count, 0, -1):
                 yield Job(
@@ -154,7 +154,8 @@ class _Traced:
     def units(self) -> Iterator[tuple[int, Unit, Stretch]]:
         """Yield release, unit function and time of everything it computed."""
         for unit, *borders in UNITS[self.task.role]:
-            for release, start, end in zip(self._releases(), *map(self._at, borders), strict=True):
+            stamps = map(self._at, ("release_ns", *borders))
+            for release, start, end in zip(*stamps, strict=True):
                 if end > start:
                     yield release, unit, (start, end)
 
@@ -164,10 +165,6 @@ class _Traced:
         yield from (
             (start - ns, start) for start, ns in zip(self._at("start_ns"), took, strict=True) if ns
         )
-
-    def _releases(self) -> list[int]:
-        found: list[int] = (self.rows["tick"] * self.tick_ns).tolist()
-        return found
 
     def _at(self, moment: str) -> list[int]:
         # Relative to its own release: ticks count from 0, the machine's clock from anything.
