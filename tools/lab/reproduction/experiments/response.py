@@ -107,14 +107,10 @@ def list_commands() -> list[CommandConfig]:
 
 
 def first_difference(first: Recording, second: Recording) -> int | None:
-    """Return the first tick at which the torques differ in any bit, over the ticks that both runs
-    have; None if they never do."""
-    ticks, *places = np.intersect1d(
-        first.signal(STATUS, "tick"), second.signal(STATUS, "tick"), return_indices=True
-    )
-    bits, others = (
-        run.signal(STATUS, "torque")[place].view(np.uint64)
-        for run, place in zip((first, second), places, strict=True)
-    )
-    differing = ticks[(bits != others).any(axis=1)]
-    return int(differing[0]) if len(differing) else None
+    """Return the first tick at which the torques of two runs in lockstep differ in any bit, over
+    the ticks that both have; None if they never do."""
+    torques = [run.signal(STATUS, "torque").view(np.uint64) for run in (first, second)]
+    # In lockstep the level writes in every cycle: messages of the same number have the same tick.
+    length = min(map(len, torques))
+    differ = (torques[0][:length] != torques[1][:length]).any(axis=1)
+    return next(iter(first.signal(STATUS, "tick")[:length][differ].tolist()), None)
