@@ -248,7 +248,7 @@ def judge_waits(found: Waits) -> ClaimVerdict:
 
 
 def judge_update(found: FigureRun) -> ClaimVerdict:
-    """Count updates of a plan in which the executor began, of those that its release met."""
+    """Count the updates of a plan during which the executor began, of all that its release met."""
     return rule_strays("updates_preempted", found.preempted, found.met)
 
 
@@ -313,7 +313,7 @@ def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
 
 
 def judge_tables(found: tables.TableRuns) -> ClaimVerdict:
-    """Compare the state transitions of a run with a disturbance with those of a run without."""
+    """Compare the state transitions of runs with and without a disturbance."""
     answering = {*found.disturbed.rows} - {*found.undisturbed.rows}
     return rule_on(
         *check_done(found.disturbed, found.undisturbed),

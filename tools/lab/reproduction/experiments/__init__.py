@@ -1,1 +1,1 @@
-"""What `rack reproduce` runs: measurements whose results are plain data."""
+"""The experiments of `rack reproduce`: measurements whose results are plain data."""

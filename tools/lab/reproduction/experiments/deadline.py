@@ -50,7 +50,7 @@ def _measure(workshop: Workshop) -> GotoRuns:
     if soft.done_s is None:
         raise Failure("goto without a time was not done")
     early = _goto(workshop, "goto-too-early", round(TOO_EARLY * soft.done_s, 2))
-    # Without a refusal there is no other time to demand than that of the first run.
+    # Without a refusal, the time of the first run is demanded.
     by_s = ceil((early.earliest_s or soft.done_s) * 10) / 10
     return GotoRuns(early, _goto(workshop, "goto-by", by_s))
 

@@ -12,7 +12,7 @@ from rack.tools.recording.recording import Recording
 
 NAME = "nasrem"
 SECONDS = 6.0
-"""Simulated time: the arm is on its way by then."""
+"""Simulated time, long enough for the arm to move."""
 ATTEMPTS = 3
 """Most runs in real time: one without a missed deadline is wanted."""
 LASTS_S = 2 * 3.0 + 2 * (SECONDS + 3.0)

@@ -39,7 +39,7 @@ RUNS = "runs"
 PROGRAM = Path(__file__).resolve().parents[4]
 FLOORS = ("backplane", "levels", "boards", "tools", "configs")
 RACK = "reproduce"
-"""What the names of racks in shared memory begin with."""
+"""Prefix of the names of racks in shared memory."""
 NO_FIFO = (
     "this machine refuses real-time priorities (SCHED_FIFO), so that an executor cannot preempt its"
     " planner"
@@ -56,8 +56,12 @@ class Lacking(Failure):
 
 
 class Workshop:
-    """Where experiments work: the folder of the page. `share`: run on cores that another rack
-    holds."""
+    """The working folder of experiments, which holds the page.
+
+    Attributes:
+        folder: The folder, absolute.
+        share: Whether racks may run on cores that another rack holds.
+    """
 
     def __init__(self, folder: Path, share: bool) -> None:
         self.folder = folder.absolute()
@@ -81,13 +85,18 @@ class Workshop:
     def config(
         self, name: str, settings: Sequence[str] = (), faults: str | None = None
     ) -> RackConfig:
-        """Return a config under a name of its own, whose recording nobody views. Raises
-        `ConfigError`."""
+        """Return a config under the workshop's rack name, without a viewer's recording.
+
+        Raises:
+            ConfigError: The config is not valid.
+        """
         return load(self.source(name), [*settings, *UNVIEWED, f"name={self.rack}"], faults)
 
     def source(self, name: str) -> str:
-        """Return a config's name, or its text, as an experiment loads it: a rack that breaks a
-        claim takes its place here."""
+        """Return the config that an experiment loads for a name or a text.
+
+        Tests override this to replace a rack by one that breaks a claim.
+        """
         return name
 
     def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
@@ -107,10 +116,16 @@ class Charted:
 
 @dataclass(frozen=True)
 class Experiment(Generic[Found]):
-    """A measurement: `measure` returns what it found as a record of `kind`, after about `seconds`.
+    """A measurement.
 
-    `cores` are the processors that it needs for boards at real-time priorities; 0: it needs no
-    such priorities. `measure` raises `Failure`.
+    Attributes:
+        name: Its name, and the name of the file that keeps its result.
+        about: Its description for the progress bar.
+        seconds: About how long it takes.
+        kind: Type of its record.
+        measure: Runs it and returns the record. Raises `Failure`.
+        cores: Number of processors needed for boards at real-time priorities. 0 if it does not need
+            such priorities.
     """
 
     name: str
@@ -212,7 +227,7 @@ def program() -> str:
 
 
 def program_files() -> Iterator[Path]:
-    """Yield the files that results depend on: without those that only write the page."""
+    """Yield the files that results depend on, which leaves out the files that write the page."""
     page = Path(__file__).resolve().parents[1]
     for floor in FLOORS:
         for path in sorted((PROGRAM / floor).rglob("*.*")):

@@ -34,8 +34,14 @@ MS = 1e-6
 
 @dataclass(frozen=True)
 class FigureRack:
-    """A figure of the paper: its config with these settings, drawn over so many cycles. `label` is
-    the name of its experiment."""
+    """A figure of the paper.
+
+    Attributes:
+        config: Its config.
+        cycles: Number of cycles that are drawn.
+        label: Name of its experiment.
+        settings: Changes of the config.
+    """
 
     config: str
     cycles: int
@@ -128,10 +134,12 @@ SHORT_3 = _with_x("fig3", 3, LEAST_X)
 
 @dataclass(frozen=True)
 class FigureRun(Charted):
-    """A run of a figure: jobs of its tasks.
+    """A run of a figure.
 
-    Releases of the executor `met` so many updates of the plan; it began within so many,
-    `preempted`.
+    Attributes:
+        tasks: Jobs by task.
+        met: Number of updates of the plan during which the executor was released.
+        preempted: Number of updates of the plan during which the executor began.
     """
 
     tasks: dict[str, Count]

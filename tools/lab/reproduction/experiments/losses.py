@@ -1,5 +1,5 @@
-"""Boards that die and sensors that fail, by scripts of faults: how many ticks until each is
-detected, and what then."""
+"""Boards that die and sensors that fail, by scripts of faults, with the time until each is
+detected and recovered from."""
 
 from __future__ import annotations
 

@@ -46,8 +46,14 @@ class ExecutorCycles:
 
 @dataclass(frozen=True)
 class NasremRun(TaskRun):
-    """What the run left. `due` are the messages in each mailbox that the ticks of its writer
-    demand."""
+    """The results of the run.
+
+    Attributes:
+        ticks: Length of the run.
+        verdicts: Every equation on every subject.
+        executors: Cycles by executor.
+        due: Number of messages by mailbox that its writer should have sent.
+    """
 
     ticks: int
     verdicts: tuple[MeasuredVerdict, ...]

@@ -1,13 +1,12 @@
-"""The response of a rack to its operator: holds and resumes, at ticks that were drawn at random.
+"""The response of a rack to its operator: holds and resumes at ticks that were drawn at random.
 
-A twin of the run in lockstep, without one command, checks the serials that the
-measurement rests on. Until the tick at which the torque first rests on that command both runs are
+A twin of the run in lockstep, without one command, checks the serials that the measurement rests
+on. Until the tick at which the torque first rests on that command both runs are
 equal bit for bit. If the command was a hold given to a moving arm, they differ from exactly that
 tick on.
 """
 
 from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +36,7 @@ RUN_S = 24.0
 """Simulated time of one run, at most."""
 LASTS_S = 62.0
 TWIN_EXTRA_TICKS = 40
-"""A twin runs for so many ticks after the predicted one."""
+"""Number of ticks that the twin runs after the predicted one."""
 STATUS = "servo.status"
 """The status of the lowest level, with the torque."""
 
@@ -46,8 +45,12 @@ STATUS = "servo.status"
 class ResponseRun(Charted):
     """Commands of an operator in lockstep and in real time.
 
-    `predicted` is the first tick at which the torque in lockstep should differ without the hold at
-    `MOVING_AT`, `differs` the first at which it does in any bit; None: it never does.
+    Attributes:
+        lockstep: Responses in lockstep.
+        realtime: Responses in real time.
+        predicted: First tick at which the torque in lockstep should differ without the hold at
+            `MOVING_AT`.
+        differs: First tick at which it differs in any bit. None if it never does.
     """
 
     lockstep: OperatorResponse

@@ -1,5 +1,5 @@
-"""How boards share processors and the backplane: chains of them, with locks too, and how a board
-waits for its cycle."""
+"""Boards that share processors and the backplane: chains of boards, with and without locks, and
+ways of waiting for a cycle."""
 
 from __future__ import annotations
 
@@ -26,8 +26,14 @@ LOCKS = '\n[protocol]\ndefault = "lock"\n'
 
 @dataclass(frozen=True)
 class ChainRun:
-    """A chain of empty boards: cycles due, those missed or skipped, and how many messages took how
-    many cycles."""
+    """A run of a chain of empty boards.
+
+    Attributes:
+        boards: Number of boards.
+        due: Number of cycles due.
+        missed: Number of cycles missed or skipped.
+        took: Number of messages by the cycles that they took.
+    """
 
     boards: int
     due: int
@@ -59,7 +65,7 @@ def _chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> 
     missed, due = count_cycles(run.result.tasks[name] for name in chain.names)
     last = f"{chain.names[-1]}.status"
     sent, visible_at = (run.recording.signal(last, name) for name in ("sent", "visible_at"))
-    # A message that a miss repeats counts once; -1: none was sent yet.
+    # A message that a miss repeats counts once. It is -1 before the first one.
     sent, first = np.unique(sent, return_index=True)
     took = Counter((visible_at[first] - sent)[sent >= 0].tolist())
     return ChainRun(chain.boards, due, missed, dict(sorted(took.items())))

@@ -13,7 +13,7 @@ from rack.levels.level import Ports
 from rack.levels.systems.figures import FigureExecutor, FigurePlanner
 
 BLOCK_BYTES = 1 << 20
-"""Compressing so much takes several of the figure's cycles."""
+"""Size of a block; to compress it takes several of the figure's cycles."""
 
 
 class Storage:

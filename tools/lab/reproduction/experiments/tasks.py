@@ -31,18 +31,18 @@ TASKS_S = {
     "penn": 26.2,
     "rccl": 17.5,
 }
-"""The systems of one rack, with the simulated time of their tasks; experiments of their own run the
-tasks of NASREM and of the state tables."""
+"""The systems of one rack, with the simulated time of their tasks, s. Other experiments run the tasks
+of NASREM and of the state tables."""
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
 PATIENCE = 2.0
-"""A task that takes so many times as long is ended: on a machine too slow for it some board is
-always away, and it may never be done."""
+"""Multiple of its time after which a task is ended, because a machine that is too slow may never
+finish it."""
 ATTEMPTS = 3
 LAUNCH_S = 3.0
 LATER_MS = 100
-"""What the machine above sends comes so much later in the second run, and is due so much later."""
+"""Additional delay of messages from the machine above in the second run."""
 DELAYED = ("lan.reference", "lan.modifications")
 MODIFICATION = "pd"
 """The first modification of the task."""
@@ -92,8 +92,15 @@ def _way_response(way: Mapping[str, Any]) -> WayResponse:
 
 @dataclass(frozen=True)
 class TaskRun:
-    """A system's whole task: how it ended, the part of all cycles missed or skipped, the messages
-    in each mailbox, and the response; None: it has none that is bounded."""
+    """A run of a system's whole task.
+
+    Attributes:
+        ended: Cause of its end.
+        lasted_s: Simulated time.
+        missed: Share of all cycles missed or skipped.
+        messages: Number of messages by mailbox.
+        response: The response of the system. None if it has no bounded response.
+    """
 
     ended: str
     lasted_s: float
@@ -104,11 +111,12 @@ class TaskRun:
 
 @dataclass(frozen=True)
 class NetworkRun(TaskRun):
-    """The same of two racks: the end is that of the machine above, which ends in error with the
-    servo rack.
+    """A run of a task on two racks, ended by the machine above, which fails if the servo rack does.
 
-    `servo_missed` is the servo rack's part alone; `response_ms` the time from a modification wanted
-    above until a servo law is so modified, None: it never was.
+    Attributes:
+        servo_missed: Share of the servo rack's cycles missed or skipped.
+        response_ms: Time from the request of a modification by the machine above until a servo law
+            is modified. None if it never was.
     """
 
     servo_missed: float
@@ -127,7 +135,7 @@ def task_run(result: RunResult, *recordings: Recording) -> TaskRun:
     first = recordings[0]
     for status, entry, source in entries_of(first.layout, first.config):
         if source not in messages and status in first.mailboxes:
-            # What a host board writes is counted where it enters.
+            # Messages of a host board are counted where they enter the rack.
             messages[source] = int(first.signal(status, f"{entry}.passed")[-1])
     return TaskRun(
         ended=result.outcome.cause,
@@ -143,8 +151,11 @@ def _missed(*recordings: Recording) -> float:
 
 
 def _measure_two(later_ms: int, workshop: Workshop) -> NetworkRun:
-    """Run Brown's racks with a network that takes so much longer; up to three times, until all is
-    recorded: two recorders share two cores with eight boards."""
+    """Run Brown's racks with a network that is slower by `later_ms`.
+
+    Two recorders share two cores with eight boards, so a run may lose records. It is then repeated,
+    up to `ATTEMPTS` runs in all.
+    """
     lost: list[str] = []
     for attempt in range(1, ATTEMPTS + 1):
         result, general, servo = _two_recorded(later_ms, workshop, attempt)
@@ -166,7 +177,7 @@ def _two_recorded(
     path.write_text(_servo(workshop, later_ms).text(), encoding="utf-8")
     ways = f'adapter.lan.connect=["{_socket(workshop)}"]', f'adapter.lan.launch=["{path}"]'
     with chdir(workshop.folder):
-        # What it launches records its run below where it is.
+        # The rack that it launches records its run below the working folder.
         result, general = workshop.run(label, _renamed(workshop, BROWN, ways))
     (other,) = result.others
     assert other.folder is not None, "it is recorded, as the other is"
@@ -193,7 +204,7 @@ def _socket(workshop: Workshop) -> str:
 
 
 def _renamed(workshop: Workshop, name: str, more: Sequence[str]) -> RackConfig:
-    """Return one of both racks under a name of its own, by which the other knows it."""
+    """Return one of both racks under a unique name, which the other rack uses for its imports."""
     given = load(name)
     assert given.adapter.lan is not None
     own = {BROWN: workshop.rack, f"{BROWN}-servo": f"{workshop.rack}-servo"}
