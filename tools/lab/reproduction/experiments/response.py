@@ -7,6 +7,7 @@ tick on.
 """
 
 from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

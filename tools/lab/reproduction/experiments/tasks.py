@@ -31,8 +31,8 @@ TASKS_S = {
     "penn": 26.2,
     "rccl": 17.5,
 }
-"""The systems of one rack, with the simulated time of their tasks, s. Other experiments run the tasks
-of NASREM and of the state tables."""
+"""The systems of one rack, with the simulated time of their tasks, s. Other experiments run the
+tasks of NASREM and of the state tables."""
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
