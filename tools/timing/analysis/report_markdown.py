@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from rack.boards.events import Braking, braked_text
 from rack.tools.console.answer import Document
@@ -16,17 +17,15 @@ from rack.tools.console.tables import (
 )
 from rack.tools.live.holds import resume_command
 from rack.tools.live.verdict import headline
+from rack.tools.recording.history import counted
 from rack.tools.recording.recording import Gap
 from rack.tools.timing.analysis.arm_outcome import outcome_text
-from rack.tools.timing.analysis.report_timing import (
-    SHOWN,
-    misses_text,
-    response_text,
-    the_most,
-    times_text,
-)
 from rack.tools.timing.analysis.run_report import RunReport
+from rack.tools.timing.analysis.task_times import times_text
 
+SHOWN = 10
+"""Most misses, holds and long responses in the text; report.json has them all."""
+JUDGED = {True: "ok", False: "beyond", None: "-"}
 CHANGED = 1.05
 """Ratio of a core's highest to its lowest frequency from which the text mentions it."""
 
@@ -73,9 +72,9 @@ def report_blocks(document: Document) -> Blocks:
     yield from times_text(report)
     yield from _faults(report)
     if report.misses:
-        yield from misses_text(report)
+        yield from _misses(report)
     if report.system_response:
-        yield from response_text(report.system_response)
+        yield from _responses(report.system_response)
     if report.entries:
         yield from ("", "## Bus adapters, ages in ms of simulated time", "")
         yield _passed(report.entries, ("superseded", "waiting", "source"))
@@ -99,9 +98,14 @@ def _notes(report: RunReport) -> Iterator[str]:
         yield from _against(report.against)
 
 
+def _the_most(rows: Sequence[Any], which: str) -> str:
+    """Return, for a heading, which of the rows are shown; "" if all are."""
+    return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
+
+
 def _holds(report: RunReport) -> Blocks:
     holds = report.holds
-    yield from ("", f"## Holds: {len(holds)}{the_most(holds, 'longest')}", "")
+    yield from ("", f"## Holds: {len(holds)}{_the_most(holds, 'longest')}", "")
     longest = sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
     rows = [
         {
@@ -223,6 +227,89 @@ def _fault_row(fault: Document) -> dict[str, Cell]:
         "reactions": ", ".join(fault["reactions"]) or None,
         "recovered after": recovered if fault["is_recovered"] else "not recovered",
     }
+
+
+def _misses(report: RunReport) -> Blocks:
+    """Yield the first missed and skipped cycles, and why they are fewer than tasks counted."""
+    misses = report.misses
+    late, skipped = counted(misses)
+    yield from (
+        "",
+        f"## Missed and skipped cycles: {late} and {skipped}{_the_most(misses, 'first')}",
+        "",
+    )
+    if (late, skipped) != (report.missed, report.skipped):
+        of_all = f"{report.missed} and {report.skipped}"
+        why = (
+            "the recorder lost rows"
+            if report.rows_lost
+            else "the recording does not hold all of it"
+        )
+        yield from (f"The tasks counted {of_all}; {why}.", "")
+    rows = [
+        {
+            "tick": miss["tick"],
+            "task": miss["task"],
+            "what": miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
+            "started late, ms": decimal(miss.get("started_ms")),
+            "took, ms": decimal(miss.get("took_ms")),
+        }
+        for miss in misses[:SHOWN]
+    ]
+    yield TextTable(rows)
+
+
+def _responses(response: Document) -> Blocks:
+    """Yield the responses of all chains of levels against their bounds, and what is beyond."""
+    yield from ("", "## System response, ms of simulated time")
+    for found in (response, *response["others"]):
+        yield from _response_along(found)
+
+
+def _response_along(response: Document) -> Blocks:
+    yield ""
+    bounds = (
+        f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
+    )
+    yield (
+        f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its"
+        " cycle."
+    )
+    yield ""
+    ways = {"command, down": response["command"], "status, up": response["status"]}
+    rows = [
+        {
+            "way": (
+                way
+                if len(found["levels"]) == len(response["levels"])
+                else f"{way} from {found['levels'][0]}"
+            ),
+            "measured p50": figure(found["measured_ms"], "p50"),
+            "measured max": figure(found["measured_ms"], "max"),
+            "bound": found["bound_ms"],
+            "": JUDGED[found["holds"]],
+        }
+        for way, found in ways.items()
+        if found["levels"]
+    ]
+    yield TextTable(rows)
+    for way, found in ways.items():
+        if found["beyond"]:
+            yield from (
+                "",
+                (
+                    f"{way}: {len(found['beyond'])} beyond the"
+                    f" bound{_the_most(found['beyond'], 'longest')}:"
+                ),
+            )
+        for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
+            why = "; ".join(each["delayed_by"]) or "no cause is recorded"
+            yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
+        if found["unseen"]:
+            yield from (
+                "",
+                f"{way}: {found['unseen']} not measured: messages are missing in the recording.",
+            )
 
 
 def _queues(queues: Sequence[Document]) -> Iterator[str]:

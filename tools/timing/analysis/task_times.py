@@ -18,7 +18,8 @@ from rack.levels.timing.trace_times import (
     residual_ns,
 )
 from rack.tools.console.answer import Document
-from rack.tools.console.tables import TextTable, decimal, figure
+from rack.tools.console.tables import Blocks, TextTable, decimal, figure
+from rack.tools.timing.analysis.run_report import RunReport
 
 MS = 1e-6
 BY_THE_CLOCK = {
@@ -122,3 +123,18 @@ def times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
         for name, task in tasks.items()
     ]
     return TextTable(rows, DROPPED)
+
+
+def times_text(report: RunReport) -> Blocks:
+    """Yield the table of cycles."""
+    is_lockstep = report.mode == "lockstep"
+    yield from ("", "## Cycles, ms", "")
+    if is_lockstep:
+        yield (
+            "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no"
+            " lateness, no residuals."
+        )
+        yield ""
+    for name, (traced, ran) in report.untraced.items():
+        yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
+    yield times_table(report.tasks, is_lockstep)
