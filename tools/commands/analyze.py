@@ -14,8 +14,7 @@ from rack.tools.console.progress import reading_progress
 from rack.tools.console.tables import print_blocks
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.document import document
-from rack.tools.timing.analysis.tables import analysis_blocks
+from rack.tools.timing.analysis.tables import analysis_blocks, document
 from rack.tools.timing.operator_response import show
 
 Percentile = Annotated[

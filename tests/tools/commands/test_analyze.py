@@ -13,7 +13,7 @@ from rack.boards.config import load
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.document import document
+from rack.tools.timing.analysis.tables import document
 from tests.shared_runs import slow_run
 from tests.tools.analysis_text import brief, text
 from tests.tools.command_line import rack

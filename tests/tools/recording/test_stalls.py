@@ -35,9 +35,9 @@ from rack.tools.recording.stalls import (
     stalls_of,
 )
 from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.document import document
 from rack.tools.timing.analysis.report import report_of
 from rack.tools.timing.analysis.report_markdown import markdown
+from rack.tools.timing.analysis.tables import document
 from tests.machine import needs_fifo
 from tests.tools.analysis_text import text
 from tests.tools.recordings import MS, Cycle, recorded
