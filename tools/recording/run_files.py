@@ -31,6 +31,7 @@ from rack.tools.recording.spool import (
     locked,
     read,
     read_head,
+    ring_dtypes,
     rings,
     stretch_files,
 )
@@ -70,7 +71,8 @@ class Tally:
 
     def __init__(self, layout: Layout, before: Mapping[str, int] | None = None) -> None:
         self.tasks = [task.name for task in layout.tasks]
-        self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
+        self._dtypes = ring_dtypes(layout)
+        self.lost = dict.fromkeys(self._dtypes, 0)
         self.taken = {**self.lost, **(before or {})}
         self.rows = dict(self.lost)
         self.kept: list[tuple[int, int]] = []
@@ -85,7 +87,8 @@ class Tally:
             case StretchEnd():
                 self.end(part.tick)
             case Frame():
-                self.add(part.ring, part.unpack(), part.lost)
+                for block in part.unpack(self._dtypes):
+                    self.add(*block)
 
     def begin(self, stretch: StretchHead) -> None:
         """Go on with a stretch; others before it may have been removed."""
@@ -197,7 +200,7 @@ def mend(folder: Path) -> bool:
             return False
         layout, launch = read_head(file, path)
         files = RunFiles(folder, layout, launch, MENDED)
-        for part in read(file, folder, layout):
+        for part in read(file, folder):
             files.take(part)
         # Still locked: another process that opens this run waits until the files are in place.
         files.close()
@@ -212,7 +215,7 @@ def mend(folder: Path) -> bool:
 
 
 def tally(folder: Path) -> Tally | None:
-    """Return what a flight recorder has left in a folder, by the heads and checks of its frames;
+    """Return what a flight recorder has left in a folder, by the counts of its frames;
     None where none has. Raises `Failure` when it cannot be read."""
     path = folder / SPOOL
     if not path.is_file() or not (folder / STRETCHES).is_dir():
@@ -220,9 +223,10 @@ def tally(folder: Path) -> Tally | None:
     with path.open("rb") as file:
         layout, _ = read_head(file, path)
         found = Tally(layout)
-        for part in read(file, folder, layout):
+        for part in read(file, folder):
             if isinstance(part, Frame):
-                found.count(part.ring, part.length, part.lost)
+                for counts in part.counts:
+                    found.count(*counts)
             else:
                 found.take(part)
     found.end()
