@@ -4,6 +4,7 @@ longer."""
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import asdict
 
 from rack.tools.console.answer import Failure, print_answer, print_json
@@ -60,12 +61,11 @@ def describe(name: str) -> dict[str, str | int | float | None]:
 def show_status(rack: str | None, as_json: bool) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly
     one."""
+    from rack.backplane.segment import Segment
     from rack.tools.live.snapshot import RackMonitor
-    from rack.tools.live.watched import LocalRack
     from rack.tools.recording.recorder_process import recorded_by, size_of, size_text
 
-    with LocalRack(rack or only_rack()) as one:
-        segment = one.segment
+    with closing(Segment.attach(rack or only_rack())) as segment:
         found = RackMonitor(segment).look()
         run = recorded_by(segment)
     size = 0 if run is None else size_of(run)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
@@ -116,16 +117,16 @@ def command(
       rack command nist-state-table task table careful
       rack command nist-state-table elemental_move do pick block1 --wait
     """
+    from rack.backplane.segment import Segment
     from rack.tools.live.desk import LiveDesk, goal_of
     from rack.tools.live.holds import resume_command
-    from rack.tools.live.watched import LocalRack
 
     check_timeout(timeout, wait)
     if lease and wait:
         raise Failure("--lease, --wait: a lease stays anyway", 2)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
-    with INTERRUPT.raising(), LocalRack(rack) as one:
-        desk = LiveDesk(one)
+    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
+        desk = LiveDesk(segment)
         if is_list:
             print_answer(desk.levels(), desk.text(), as_json)
             return

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -20,7 +20,6 @@ from rack.tools.console.answer import Document, Failure, fail, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, View, named_here
 from rack.tools.live.folder import folder_of
-from rack.tools.live.watched import LocalRack
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink, is_opening
 from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes, unwritable
@@ -89,7 +88,8 @@ def record(
     if save and (others or view):
         raise Failure(f"--save, {'--with' if others else '--view'}: give one of them", 2)
     with ExitStack() as stack:
-        found = [stack.enter_context(LocalRack(str(named_here(each)))).segment for each in racks]
+        attached = (closing(Segment.attach(str(named_here(each)))) for each in racks)
+        found = [stack.enter_context(one) for one in attached]
         folder = folder_of(out, rack)
         if save:
             print_answer(*_saved(found[0], folder), as_json)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Annotated
 
 import typer
 
+from rack.backplane.segment import Segment
 from rack.tools.commands.command import At, Tick, print_reply
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live.desk import LiveDesk
-from rack.tools.live.watched import LocalRack
 
 Setting = Annotated[
     str,
@@ -35,6 +36,6 @@ def set_param(
       rack set nasrem board.servo.params.bandwidth=80
       rack set nasrem board.servo.params.damping=0.8 --at 12.5
     """
-    with INTERRUPT.raising(), LocalRack(rack) as one:
-        reply = LiveDesk(one).set_param(setting, tick, at)
+    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
+        reply = LiveDesk(segment).set_param(setting, tick, at)
     print_reply(reply, as_json)
