@@ -9,8 +9,8 @@ folder, which parquet's readers take for one table: a long run has many parts.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from math import prod
 from pathlib import Path
 from shutil import rmtree
@@ -20,19 +20,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rack.backplane.json_text import encode_json
-from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
+from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Launch
 from rack.backplane.trace import FIELDS
 from rack.tools.recording.cores import CoreRecord
+from rack.tools.recording.signal import HEAD, TIME, Signal, signals_of
 
 TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
 CONFIG = "config.toml"
 PUBLISHED = "published.json"
 """Facts about the rack's levels: see `rack.boards.config.published`."""
-HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
-"""Columns that the messages of all mailboxes have; the first of a table, after `TIME`."""
-TIME = "time_s"
-"""The tick as simulated time, s."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
@@ -134,13 +131,13 @@ class _SignalTable:
         folder.mkdir(parents=True)
         self._folder = folder
         self._tick_s = layout.clock_ns * 1e-9
-        self._columns = columns_of(mailbox)
+        self._signals = signals_of(mailbox)
         self._waiting: list[np.ndarray] = []
         head = [
             pa.field(TIME, pa.float64(), metadata={"unit": "s"}),
             *(pa.field(name, pa.uint64() if name == "chain" else pa.int64()) for name in HEAD),
         ]
-        self._schema = pa.schema([*head, *(column.field for column in self._columns)])
+        self._schema = pa.schema([*head, *map(arrow_field, self._signals)])
         self._parts = 0
         self._begin_part()
 
@@ -151,7 +148,7 @@ class _SignalTable:
             self._folder / PART.format(self._parts),
             self._schema,
             compression="zstd",
-            use_dictionary=[column.label for column in self._columns if column.kind[1] == "S"],
+            use_dictionary=[signal.label for signal in self._signals if signal.is_text],
             write_statistics=["tick"],
             write_page_checksum=True,
         )
@@ -172,7 +169,7 @@ class _SignalTable:
         self._waiting = []
         head = [np.ascontiguousarray(rows[name]) for name in HEAD]
         time_s = pa.array(rows["tick"] * self._tick_s)
-        arrays = [column.array(rows["message"]) for column in self._columns]
+        arrays = [arrow_array(signal, rows["message"]) for signal in self._signals]
         self._writer.write_batch(
             pa.record_batch([time_s, *map(pa.array, head), *arrays], schema=self._schema),
             row_group_size=len(rows),
@@ -188,67 +185,19 @@ class _SignalTable:
         self._writer.close()
 
 
-@dataclass(frozen=True)
-class Column:
-    """One field of a mailbox, a column of its table: `name` is `<mailbox>.<path>`.
-
-    `shape` is () for a single value, otherwise that of one row's list.
-    """
-
-    name: str
-    path: tuple[str, ...]
-    kind: str
-    shape: tuple[int, ...]
-    unit: str
-    values: tuple[tuple[str, int], ...]  # names and numbers of an enum
-    meaning: str
-
-    @property
-    def label(self) -> str:
-        """Its name in the table; that of a field named like a column of the head differs."""
-        name = ".".join(self.path)
-        return f"message.{name}" if name in (TIME, *HEAD) else name
-
-    @property
-    def field(self) -> pa.Field:
-        """The column's Arrow field; shape and unit are in its metadata."""
-        element = pa.string() if self.kind[1] == "S" else pa.from_numpy_dtype(np.dtype(self.kind))
-        arrow = pa.list_(element, prod(self.shape)) if self.shape else element
-        return pa.field(
-            self.label, arrow, metadata={"shape": encode_json(self.shape), "unit": self.unit}
-        )
-
-    def of(self, messages: np.ndarray) -> np.ndarray:
-        """Return the field in a block of messages, shape (rows, *shape): a view."""
-        for key in self.path:
-            messages = messages[key]
-        return messages
-
-    def array(self, messages: np.ndarray) -> pa.Array:
-        """Return the column of a block of messages, shape (rows,)."""
-        flat = np.ascontiguousarray(self.of(messages)).reshape(-1)
-        values = pa.array(
-            np.strings.decode(flat, "ascii", "replace") if self.kind[1] == "S" else flat
-        )
-        if not self.shape:
-            return values
-        return pa.FixedSizeListArray.from_arrays(values, prod(self.shape))
+def arrow_field(signal: Signal) -> pa.Field:
+    """Return the column of a signal; shape and unit are in its metadata."""
+    spec = signal.spec
+    element = pa.string() if signal.is_text else pa.from_numpy_dtype(np.dtype(spec.kind))
+    arrow = pa.list_(element, prod(signal.shape)) if signal.shape else element
+    metadata = {"shape": encode_json(signal.shape), "unit": spec.unit}
+    return pa.field(signal.label, arrow, metadata=metadata)
 
 
-def columns_of(mailbox: MailboxSpec) -> list[Column]:
-    """Return the columns of a mailbox in the order of its fields; groups of fields are
-    flattened."""
-    return list(_columns(mailbox.name, (), (), mailbox.fields))
-
-
-def _columns(
-    mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
-) -> Iterator[Column]:
-    for field in fields:
-        inner = (*path, field.name)
-        shape = outer + field.shape
-        if field.fields:
-            yield from _columns(mailbox, inner, shape, field.fields)
-        else:
-            name = ".".join((mailbox, *inner))
-            yield Column(name, inner, field.kind, shape, field.unit, field.values, field.meaning)
+def arrow_array(signal: Signal, messages: np.ndarray) -> pa.Array:
+    """Return the values of a signal in a block of messages, shape (rows,)."""
+    flat = np.ascontiguousarray(signal.values(messages)).reshape(-1)
+    values = pa.array(np.strings.decode(flat, "ascii", "replace") if signal.is_text else flat)
+    if not signal.shape:
+        return values
+    return pa.FixedSizeListArray.from_arrays(values, prod(signal.shape))

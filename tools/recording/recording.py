@@ -15,9 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rack.backplane.layout import MailboxSpec, TaskSpec
+from rack.backplane.layout import TaskSpec
 from rack.backplane.mailbox.history import row_dtype
-from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import printable
 from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import FIELDS, RECORD
@@ -36,14 +35,13 @@ from rack.tools.recording.checksums import (
 from rack.tools.recording.cores import CoreRecord
 from rack.tools.recording.parquet import (
     CONFIG,
-    HEAD,
     PART,
     PUBLISHED,
     SIGNALS,
     TABLE,
-    columns_of,
 )
 from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, mend
+from rack.tools.recording.signal import HEAD, signals_of
 from rack.tools.recording.spool import STRETCHES, rings
 
 
@@ -110,7 +108,10 @@ class Recording:
             removed nothing."""
             self._gaps = json.loads(metadata[b"gaps"])
             self._lost_before_the_end = dict[str, int](json.loads(metadata[b"lost"]))
-        self._columns = {box.name: columns_of(box) for box in self.layout.mailboxes}
+        self._shapes = {
+            box.name: {signal.label: signal.shape for signal in signals_of(box)}
+            for box in self.layout.mailboxes
+        }
         self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
         self.events = self._read_events()
         """The events of the run by tick, then its outcome."""
@@ -141,8 +142,7 @@ class Recording:
         parts = [path / PART.format(number) for number in range(1, count + 1)]
         if absent := [part.name for part in parts if not part.exists()]:
             raise Failure(f"{path}: {absent[0]} is missing", 2)
-        names = (*HEAD, *(column.label for column in self._columns[mailbox]))
-        return [self._opened(part, names) for part in parts]
+        return [self._opened(part, (*HEAD, *self._shapes[mailbox])) for part in parts]
 
     def _opened(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
         """Return an undamaged parquet file that has these columns. Raises `Failure`."""
@@ -298,9 +298,7 @@ class Recording:
         "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox;
         a field of its own with such a name is "message.<name>". Raises `KeyError`.
         """
-        shape: tuple[int, ...] = ()
-        if field not in HEAD:
-            shape = {column.label: column.shape for column in self._columns[mailbox]}[field]
+        shape = () if field in HEAD else self._shapes[mailbox][field]
         read = []
         for file in self._tables.get(mailbox, ()):
             with _naming(self.folder / SIGNALS / TABLE.format(mailbox)):
@@ -320,14 +318,6 @@ class Recording:
         has_reason = "reason" in self.fields(mailbox)
         return printable(str(self.signal(mailbox, "reason")[row])) if has_reason else ""
 
-    def messages(self, box: MailboxSpec) -> np.ndarray:
-        """Return every message of a mailbox as it was written, oldest first; `box` with its
-        fields."""
-        found = np.zeros(len(self.signal(box.name, "tick")), message_dtype(box.fields, box.size))
-        for column in columns_of(box):
-            column.of(found)[...] = self.signal(box.name, column.label)
-        return found
-
     def rows(self, name: str) -> np.ndarray:
         """Return what a recorder took from a ring, oldest first: trace records of a task, or
         messages of a mailbox."""
@@ -337,12 +327,13 @@ class Recording:
         found = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
         for field in HEAD:
             found[field] = self.signal(name, field)
-        found["message"] = self.messages(box)
+        for signal in signals_of(box):
+            signal.values(found["message"])[...] = self.signal(name, signal.label)
         return found
 
     def fields(self, mailbox: str) -> set[str]:
         """Return the fields of a mailbox's messages."""
-        return {column.label for column in self._columns[mailbox]}
+        return {*self._shapes[mailbox]}
 
     @property
     def mailboxes(self) -> list[str]:

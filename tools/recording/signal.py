@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from math import isnan
@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.layout import MailboxSpec
+from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.backplane.message import text_of
 from rack.tools.console.answer import Failure
-from rack.tools.recording.parquet import Column, columns_of
 
 NAME = re.compile(r"([\w.]+)((?:\[\d{1,9}\])*)")
 CONDITION = re.compile(r"\s*(\S+?)\s*(==|!=|<=|>=|<|>)\s*(\S+)\s*")
@@ -32,23 +31,36 @@ NEAREST = 3
 """Names offered in place of one that is not known, at most."""
 
 
+HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
+"""Columns that the messages of all mailboxes have; the first of a table, after `TIME`."""
+TIME = "time_s"
+"""The tick as simulated time, s."""
+
+
 @dataclass(frozen=True)
 class Signal:
-    """Numbers, or text, in every message of a mailbox."""
+    """Numbers, or text, in every message of a mailbox: a field, or part of an array field.
+
+    Attributes:
+        name: Mailbox, groups and field, and indices, as in `servo.status.position[2]`.
+        mailbox: Name of the mailbox.
+        path: Names of the groups that hold the field, and of the field.
+        shape: Shape of the whole field in a message, () for a single value.
+        spec: The field.
+        index: Indices into an array field, as far as they are given.
+    """
 
     name: str
     mailbox: str
-    column: Column
-    index: tuple[int, ...]  # of an array field, as far as it is given
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    spec: FieldSpec
+    index: tuple[int, ...] = ()
 
     @classmethod
     def all(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
         """Return every whole field of these mailboxes by its name."""
-        return {
-            column.name: cls(column.name, box.name, column, ())
-            for box in boxes
-            for column in columns_of(box)
-        }
+        return {signal.name: signal for box in boxes for signal in signals_of(box)}
 
     @classmethod
     def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:
@@ -59,27 +71,36 @@ class Signal:
         if found is None or found[1] not in known:
             raise _unknown("signal", text, known, boxes)
         whole = known[found[1]]
-        column = whole.column
         index = tuple(int(number) for number in re.findall(r"\d+", found[2]))
-        shape = column.shape[: len(index)]
+        shape = whole.shape[: len(index)]
         if len(shape) < len(index) or any(i >= n for i, n in zip(index, shape, strict=True)):
-            ends = "".join(f"[0 to {size - 1}]" for size in column.shape)
-            raise Failure(f"{text}: no such index; permitted: {column.name}{ends}", 2)
+            ends = "".join(f"[0 to {size - 1}]" for size in whole.shape)
+            raise Failure(f"{text}: no such index; permitted: {whole.name}{ends}", 2)
         return replace(whole, name=text, index=index)
+
+    @property
+    def label(self) -> str:
+        """Its column in the mailbox's table; that of a field named like one of the head differs."""
+        name = ".".join(self.path)
+        return f"message.{name}" if name in (TIME, *HEAD) else name
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is text."""
+        return self.spec.kind[1] == "S"
 
     @property
     def unit(self) -> str:
         """Its unit; empty for counts, names and text."""
-        column = self.column
-        return "" if column.values or column.kind[1] == "S" or column.unit == "1" else column.unit
+        unit = self.spec.unit
+        return "" if self.spec.values or self.is_text or unit == "1" else unit
 
     @property
     def json_type(self) -> str:
         """The JSON type of one of its values."""
-        kind = np.dtype(self.column.kind).kind
-        if kind == "S" or self.column.values:
+        if self.is_text or self.spec.values:
             return "string"
-        return "number" if kind == "f" else "integer"
+        return "number" if np.dtype(self.spec.kind).kind == "f" else "integer"
 
     @property
     def head(self) -> str:
@@ -89,11 +110,14 @@ class Signal:
     @property
     def is_number(self) -> bool:
         """Whether it is a single number."""
-        return len(self.index) == len(self.column.shape) and self.column.kind[1] != "S"
+        return len(self.index) == len(self.shape) and not self.is_text
 
     def values(self, messages: np.ndarray) -> np.ndarray:
-        """Return it in each of these messages, shape (messages, *what is left of its own)."""
-        return self.part(self.column.of(messages))
+        """Return it in each of these messages, shape (messages, *what is left of its own): a
+        view."""
+        for key in self.path:
+            messages = messages[key]
+        return self.part(messages)
 
     def part(self, values: np.ndarray) -> np.ndarray:
         """Return it out of the values of its whole field, (messages, *shape of the field)."""
@@ -108,9 +132,9 @@ class Signal:
 
     def named(self, values: np.ndarray) -> np.ndarray:
         """Return its values with names in place of the numbers that stand for them."""
-        if not self.column.values:
+        if not self.spec.values:
             return values
-        names = {number: name for name, number in self.column.values}
+        names = {number: name for name, number in self.spec.values}
         return np.asarray(np.vectorize(lambda number: names.get(number, number), "O")(values))
 
     def plain(self, messages: np.ndarray) -> list[Any]:
@@ -119,12 +143,29 @@ class Signal:
         values = self.values(messages)
         if values.dtype.kind == "S":
             values = np.vectorize(text_of, "O")(values)
-        elif self.column.values:
+        elif self.spec.values:
             values = self.named(values)
         elif values.dtype.kind == "f" and not np.isfinite(values).all():
             values = np.where(np.isfinite(values), values, np.array(None))
         found: list[Any] = values.tolist()
         return found
+
+
+def signals_of(box: MailboxSpec) -> list[Signal]:
+    """Return the fields of a mailbox in their order; groups of fields are flattened."""
+    return list(_signals(box.name, (), (), box.fields))
+
+
+def _signals(
+    mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
+) -> Iterator[Signal]:
+    for field in fields:
+        inner = (*path, field.name)
+        shape = outer + field.shape
+        if field.fields:
+            yield from _signals(mailbox, inner, shape, field.fields)
+        else:
+            yield Signal(".".join((mailbox, *inner)), mailbox, inner, shape, field)
 
 
 def mailbox_of(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
@@ -160,10 +201,10 @@ class Trigger:
             raise Failure(f'"{text}": not a condition; permitted: as in "{example}"', 2)
         signal = Signal.of(found[1], boxes)
         if not signal.is_number:
-            shape = list(signal.column.shape[len(signal.index) :])
+            shape = list(signal.shape[len(signal.index) :])
             what = f"numbers of shape {shape}" if shape else "text"
             raise Failure(f"{signal.name}: {what}; a condition needs a single number", 2)
-        names = dict(signal.column.values)
+        names = dict(signal.spec.values)
         try:
             number = names[found[3]] if found[3] in names else float(found[3])
         except ValueError:

@@ -16,9 +16,10 @@ from rack.backplane.message import State
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import Checksums, checked_line, read_line
-from rack.tools.recording.parquet import HEAD, SignalTables
+from rack.tools.recording.parquet import SignalTables
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import TABLES
+from rack.tools.recording.signal import HEAD
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.charts.gantt import subject_of
@@ -131,7 +132,7 @@ def test_a_field_named_like_a_column_of_every_mailbox_keeps_its_own_values(
     tables.close()
     Checksums(recording.folder).store(*TABLES)
     again = Recording(recording.folder)
-    assert np.array_equal(again.messages(box), rows["message"])
+    assert np.array_equal(again.rows(box.name)["message"], rows["message"])
     assert np.array_equal(
         again.signal(box.name, "tick") + 7, again.signal(box.name, "message.tick")
     )
