@@ -226,7 +226,7 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
 def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> Document:
     """Make the report, print it and return it. A run that has no report where one is wanted has
     failed."""
-    from rack.tools.recording.recorder_process import size_of, size_text
+    from rack.tools.recording.recorder_process import recorded_line
     from rack.tools.timing.analysis.report import unrecorded, write_report
     from rack.tools.timing.analysis.report_markdown import summary
     from rack.tools.timing.analysis.stored import print_report
@@ -247,7 +247,7 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
         return data
     if folder is not None:
         lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
-        print(f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}")
+        print(recorded_line(folder, lasted_s))
     for other in result.others:
         ended = f"{other.rack}: {other.cause} after {other.ticks} ticks"
         print(f"{ended}, digest {other.digest}, {other.folder or 'not recorded'}")

@@ -127,9 +127,9 @@ def decimal(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def figure(found: Mapping[str, Any] | None, key: str, digits: int = 3) -> str:
+def figure(found: Mapping[str, Any] | None, key: str) -> str:
     """Return one figure of a distribution; "-" where there is none."""
-    return "-" if found is None else decimal(found[key], digits)
+    return "-" if found is None else decimal(found[key])
 
 
 def ms(time_ns: float | None) -> str:

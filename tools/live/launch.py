@@ -272,7 +272,7 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
     # Here, not above: its libraries would delay the launch.
     from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recording import Recording
-    from rack.tools.recording.run_files import tally
+    from rack.tools.recording.run_files import find_missing, tally
 
     try:
         retention = Retention.of(segment)
@@ -281,7 +281,7 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
         if retention is None or left is None:
             missing = Recording(folder).missing(segment)
         else:
-            missing = left.missing(segment)
+            missing = find_missing(segment, left.taken, left.lost)
             if not missing and (absent := retention.absent(segment, left.kept, ticks)):
                 first, last = absent[0]
                 return f"ticks {first:,} to {last:,} had to be kept, and are not there", {}

@@ -253,6 +253,11 @@ def size_text(size: int, lasted_s: float) -> str:
     return f"{size * 1e-6:.1f} MB{rate}"
 
 
+def recorded_line(folder: Path, lasted_s: float) -> str:
+    """Return where a run is recorded, and how large that is, as text."""
+    return f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
+
+
 def sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
     """Return the bytes of a recording, and of a second of it, for programs."""
     size = size_of(folder)

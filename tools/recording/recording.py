@@ -40,7 +40,7 @@ from rack.tools.recording.parquet import (
     SIGNALS,
     TABLE,
 )
-from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, mend
+from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, find_missing, mend
 from rack.tools.recording.signal import HEAD, signals_of
 from rack.tools.recording.spool import STRETCHES, rings
 
@@ -254,20 +254,18 @@ class Recording:
     def missing(self, segment: Segment) -> dict[str, Missing]:
         """Return what the files lack of the rings of a rack that has ended, by task and by
         mailbox."""
-        found = {}
+        taken = {}
+        lost = dict(self.lost)
         for name, ring in rings(segment).items():
-            lost = self.lost[name]
             if name in self.cycles:
-                rows = len(self.cycles[name])
-                at = ring.before + lost + rows
+                taken[name] = ring.before + lost[name] + len(self.cycles[name])
             else:
                 serials = self.signal(name, "serial")
-                rows = len(serials)
-                at = int(serials[-1]) if rows else ring.before
-            # Messages that every reader rejects are absent and not lost; those lost last are
-            # overwritten.
-            found[name] = Missing.of(ring, at, min(lost, at - ring.before - rows))
-        return {name: missing for name, missing in found.items() if missing.rows}
+                taken[name] = int(serials[-1]) if len(serials) else ring.before
+                # Messages that every reader rejects are absent and not lost; those lost last are
+                # overwritten.
+                lost[name] = min(lost[name], taken[name] - ring.before - len(serials))
+        return find_missing(segment, taken, lost)
 
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:

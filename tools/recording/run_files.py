@@ -8,13 +8,12 @@ from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from shutil import copyfile, rmtree
-from typing import IO, NamedTuple, Self
+from typing import IO, NamedTuple
 
 import numpy as np
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
-from rack.backplane.ring import Ring
 from rack.backplane.segment import Launch, Segment
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, Checksums
@@ -51,14 +50,28 @@ class Missing(NamedTuple):
     rows: int
     written: int
 
-    @classmethod
-    def of(cls, ring: Ring, taken: int, lost: int) -> Self:
-        """Return it for the ring of a rack that has ended, from which `taken` records were taken,
-        and `lost` of them were not."""
-        ring.resume(taken)
-        written = taken - ring.before + ring.waiting
+
+def find_missing(
+    segment: Segment, taken: Mapping[str, int], lost: Mapping[str, int]
+) -> dict[str, Missing]:
+    """Return what a recording lacks of the rings of a rack that has ended.
+
+    Args:
+        segment: The rack.
+        taken: Number of the last record that was taken, by ring.
+        lost: Number of rows before it that are not in the recording, by ring.
+
+    Returns:
+        The rows missing, by task and by mailbox.
+    """
+    found = {}
+    for name, ring in rings(segment).items():
+        ring.resume(taken[name])
+        written = taken[name] - ring.before + ring.waiting
         left, overwritten = ring.drain()
-        return cls(lost + overwritten + len(left), written)
+        if rows := lost[name] + overwritten + len(left):
+            found[name] = Missing(rows, written)
+    return found
 
 
 class Tally:
@@ -126,15 +139,6 @@ class Tally:
         if self.kept and self.kept[-1][1] == OPEN:
             first = self.kept[-1][0]
             self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN else tick
-
-    def missing(self, segment: Segment) -> dict[str, Missing]:
-        """Return what was written into the rings of a rack that has ended, and was lost or never
-        taken, by task and by mailbox."""
-        found = {
-            name: Missing.of(ring, self.taken[name], self.lost[name])
-            for name, ring in rings(segment).items()
-        }
-        return {name: missing for name, missing in found.items() if missing.rows}
 
 
 class RunFiles(Tally):
