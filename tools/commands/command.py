@@ -20,59 +20,57 @@ if TYPE_CHECKING:
 DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
 """Commands that leave none in force."""
 
-Level = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own"
-    ),
-]
-What = Annotated[
-    str | None,
-    typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, enable, ...; see above"),
-]
-Goals = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="GOAL",
-        help=(
-            "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify:"
-            " NAME on|off; for table: NAME; for do: the level's command; for set: KEY=VALUE"
-        ),
-    ),
-]
 Tick = Annotated[
     int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")
 ]
 At = Annotated[
     float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")
 ]
-Wait = Annotated[
-    bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")
-]
-Lease = Annotated[
-    bool,
-    typer.Option(
-        "--lease",
-        help="stay while it is in force; where this command ends before, the level holds",
-    ),
-]
-List = Annotated[
-    bool,
-    typer.Option("--list", help="list the levels, the commands each takes, and the one in force"),
-]
 
 
 def command(
     rack: RackName,
-    level: Level = None,
-    what: What = None,
-    goal: Goals = None,
+    level: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own"
+        ),
+    ] = None,
+    what: Annotated[
+        str | None,
+        typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, enable, ...; see above"),
+    ] = None,
+    goal: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="GOAL",
+            help=(
+                "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for"
+                " modify: NAME on|off; for table: NAME; for do: the level's command; for set:"
+                " KEY=VALUE"
+            ),
+        ),
+    ] = None,
     tick: Tick = None,
     at: At = None,
-    wait: Wait = False,
+    wait: Annotated[
+        bool,
+        typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal"),
+    ] = False,
     timeout: Timeout = None,
-    lease: Lease = False,
-    is_list: List = False,
+    lease: Annotated[
+        bool,
+        typer.Option(
+            "--lease",
+            help="stay while it is in force; where this command ends before, the level holds",
+        ),
+    ] = False,
+    is_list: Annotated[
+        bool,
+        typer.Option(
+            "--list", help="list the levels, the commands each takes, and the one in force"
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Command one level of a running rack, overriding the level above it.

@@ -21,15 +21,18 @@ from rack.tools.recording.signal import mailbox_of
 LOOK_S = 0.1
 PLAIN_S = 1.0
 """Times between looks, real time: on a terminal or as JSON, and as plain text."""
-Name = Annotated[
-    str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
-]
-Watch = Annotated[
-    bool, typer.Option("--watch", help="show each message, until Ctrl-C or the end of the run")
-]
 
 
-def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Json = False) -> None:
+def mailbox(
+    rack: RackName,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
+    ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="show each message, until Ctrl-C or the end of the run")
+    ] = False,
+    as_json: Json = False,
+) -> None:
     """Show the newest message in a mailbox of a running rack, field by field with units; or list
     the rack's mailboxes.
 

@@ -39,32 +39,29 @@ from rack.tools.viewer.window import ViewerWindow, free_port, url
 LOOK_S = 0.1
 """Longest time until a signal is handled that came to another thread than the first."""
 
-Out = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>"),
-]
-With = Annotated[
-    list[str],
-    typer.Option(
-        "--with",
-        metavar="RACK",
-        help="record this rack as well; repeatable",
-    ),
-]
-Save = Annotated[
-    bool,
-    typer.Option(
-        "--save", help="save what the recorder of its run has taken so far; the run is untouched"
-    ),
-]
-
 
 def record(
     rack: RackName,
-    others: With = [],  # noqa: B006  typer copies it
-    out: Out = None,
+    others: Annotated[
+        list[str],
+        typer.Option(
+            "--with",
+            metavar="RACK",
+            help="record this rack as well; repeatable",
+        ),
+    ] = [],  # noqa: B006  typer copies it
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>"),
+    ] = None,
     view: View = False,
-    save: Save = False,
+    save: Annotated[
+        bool,
+        typer.Option(
+            "--save",
+            help="save what the recorder of its run has taken so far; the run is untouched",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Record a running rack until its run is over, or until Ctrl-C.

@@ -18,24 +18,25 @@ if TYPE_CHECKING:
 DROPPED = ("default", "permitted", "type")
 """Columns that a narrow terminal leaves out, in this order."""
 
-TableName = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params"
-    ),
-]
-Of = Annotated[
-    str,
-    typer.Option(
-        "--config",
-        metavar="CONFIG",
-        help="config whose levels declare [task] and params",
-        autocompletion=config_names,
-    ),
-]
 
-
-def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False) -> None:
+def schema(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params"
+        ),
+    ] = None,
+    config: Annotated[
+        str,
+        typer.Option(
+            "--config",
+            metavar="CONFIG",
+            help="config whose levels declare [task] and params",
+            autocompletion=config_names,
+        ),
+    ] = "nasrem",
+    as_json: Json = False,
+) -> None:
     """Show the keys of a config: type, unit, permitted values, default and meaning.
 
     Without TABLE it lists the tables. The levels' own tables, [task] and [board.<name>.params], are

@@ -13,14 +13,16 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live.desk import LiveDesk
 
-Setting = Annotated[
-    str,
-    typer.Argument(metavar="KEY=VALUE", help="as in board.servo.params.bandwidth=80"),
-]
-
 
 def set_param(
-    rack: RackName, setting: Setting, tick: Tick = None, at: At = None, as_json: Json = False
+    rack: RackName,
+    setting: Annotated[
+        str,
+        typer.Argument(metavar="KEY=VALUE", help="as in board.servo.params.bandwidth=80"),
+    ],
+    tick: Tick = None,
+    at: At = None,
+    as_json: Json = False,
 ) -> None:
     """Set a live parameter of a running rack, between two cycles of its level.
 
