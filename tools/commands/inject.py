@@ -132,12 +132,13 @@ def inject(
 
 def _values(parameters: list[str]) -> dict[str, str]:
     """Return parameters by name. Raises `Failure`."""
+    values = {}
     for text in parameters:
-        if not text.partition("=")[0] or not text.partition("=")[2]:
+        key, _, value = text.partition("=")
+        if not key or not value:
             raise Failure(f"'{text}': a parameter must be key=value, as in size=0.05", 2)
-    return {
-        key.strip(): value.strip() for key, _, value in (text.partition("=") for text in parameters)
-    }
+        values[key.strip()] = value.strip()
+    return values
 
 
 class KindsCommand(TyperCommand):

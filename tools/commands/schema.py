@@ -57,13 +57,11 @@ def schema(
         found = key_tables(rack) if name is None else find_tables(name, rack)
     except LookupError as error:
         raise Failure(f'TABLE = "{name}": {error.args[0]}', 2) from None
-    lines = _names(found) if name is None else _keys(found)
+    lines = _keys(found)
+    if name is None:
+        rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
+        lines = fitted(["table", "in TOML", "meaning"], rows, ("in TOML",))
     print_answer([asdict(entry) for entry in found], lines, as_json)
-
-
-def _names(found: list[KeyTable]) -> Iterator[str]:
-    rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
-    return fitted(["table", "in TOML", "meaning"], rows, ("in TOML",))
 
 
 def _keys(found: list[KeyTable]) -> Iterator[str]:

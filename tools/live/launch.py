@@ -212,15 +212,9 @@ def run_rack(
             others=others.ends(),
             failed=failed,
         )
-        return _end_log(log, result)
-
-
-def _end_log(log: EventLog, result: RunResult) -> RunResult:
-    """Write the end of a run; return its result, which fails without all events."""
-    log.end(asdict(result))
-    if log.has_failed:
-        return replace(result, recording="events.jsonl ends before the run")
-    return result
+        log.end(asdict(result))
+        cut_off = replace(result, recording="events.jsonl ends before the run")
+        return cut_off if log.has_failed else result
 
 
 def _viewer(port: int) -> News:
