@@ -11,7 +11,8 @@ from rack.backplane.words import Box
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import fitted
 from rack.tools.live.signals import cell
-from rack.tools.recording.signal import HEAD, signals_of
+from rack.tools.recording.parquet import HEAD
+from rack.tools.recording.signal import signals_of
 
 DROPPED = ("bytes", "message", "protocol", "readers")
 """Columns of the list of mailboxes that a narrow terminal leaves out, in this order."""

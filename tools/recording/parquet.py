@@ -9,8 +9,8 @@ folder, which parquet's readers take for one table: a long run has many parts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from math import prod
 from pathlib import Path
 from shutil import rmtree
@@ -20,16 +20,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rack.backplane.json_text import encode_json
-from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.layout import FieldSpec, Layout, MailboxSpec
 from rack.backplane.segment import Launch
 from rack.backplane.trace import FIELDS
 from rack.tools.recording.cores import CoreRecord
-from rack.tools.recording.signal import HEAD, TIME, Signal, signals_of
 
 TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
 CONFIG = "config.toml"
 PUBLISHED = "published.json"
 """Facts about the rack's levels: see `rack.boards.config.published`."""
+HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
+"""Columns that the messages of all mailboxes have; the first of a table, after `TIME`."""
+TIME = "time_s"
+"""The tick as simulated time, s."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
@@ -131,13 +134,13 @@ class _SignalTable:
         folder.mkdir(parents=True)
         self._folder = folder
         self._tick_s = layout.clock_ns * 1e-9
-        self._signals = signals_of(mailbox)
+        self._columns = columns_of(mailbox)
         self._waiting: list[np.ndarray] = []
         head = [
             pa.field(TIME, pa.float64(), metadata={"unit": "s"}),
             *(pa.field(name, pa.uint64() if name == "chain" else pa.int64()) for name in HEAD),
         ]
-        self._schema = pa.schema([*head, *map(arrow_field, self._signals)])
+        self._schema = pa.schema([*head, *(column.arrow_field for column in self._columns)])
         self._parts = 0
         self._begin_part()
 
@@ -148,7 +151,7 @@ class _SignalTable:
             self._folder / PART.format(self._parts),
             self._schema,
             compression="zstd",
-            use_dictionary=[signal.label for signal in self._signals if signal.is_text],
+            use_dictionary=[column.label for column in self._columns if column.is_text],
             write_statistics=["tick"],
             write_page_checksum=True,
         )
@@ -169,7 +172,7 @@ class _SignalTable:
         self._waiting = []
         head = [np.ascontiguousarray(rows[name]) for name in HEAD]
         time_s = pa.array(rows["tick"] * self._tick_s)
-        arrays = [arrow_array(signal, rows["message"]) for signal in self._signals]
+        arrays = [column.array(rows["message"]) for column in self._columns]
         self._writer.write_batch(
             pa.record_batch([time_s, *map(pa.array, head), *arrays], schema=self._schema),
             row_group_size=len(rows),
@@ -185,19 +188,71 @@ class _SignalTable:
         self._writer.close()
 
 
-def arrow_field(signal: Signal) -> pa.Field:
-    """Return the column of a signal; shape and unit are in its metadata."""
-    spec = signal.spec
-    element = pa.string() if signal.is_text else pa.from_numpy_dtype(np.dtype(spec.kind))
-    arrow = pa.list_(element, prod(signal.shape)) if signal.shape else element
-    metadata = {"shape": encode_json(signal.shape), "unit": spec.unit}
-    return pa.field(signal.label, arrow, metadata=metadata)
+@dataclass(frozen=True)
+class Column:
+    """A field of a mailbox's messages, a column of its table.
+
+    Attributes:
+        name: Mailbox, groups and field, as in `servo.status.position`.
+        mailbox: Name of the mailbox.
+        path: Names of the groups that hold the field, and of the field.
+        shape: Shape of the field in a message, () for a single value.
+        spec: The field.
+    """
+
+    name: str
+    mailbox: str
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    spec: FieldSpec
+
+    @property
+    def label(self) -> str:
+        """Its name in the table; that of a field named like a column of the head differs."""
+        name = ".".join(self.path)
+        return f"message.{name}" if name in (TIME, *HEAD) else name
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is text."""
+        return self.spec.kind[1] == "S"
+
+    @property
+    def arrow_field(self) -> pa.Field:
+        """The column's Arrow field; shape and unit are in its metadata."""
+        element = pa.string() if self.is_text else pa.from_numpy_dtype(np.dtype(self.spec.kind))
+        arrow = pa.list_(element, prod(self.shape)) if self.shape else element
+        metadata = {"shape": encode_json(self.shape), "unit": self.spec.unit}
+        return pa.field(self.label, arrow, metadata=metadata)
+
+    def values(self, messages: np.ndarray) -> np.ndarray:
+        """Return the field in a block of messages, shape (rows, *shape): a view."""
+        for key in self.path:
+            messages = messages[key]
+        return messages
+
+    def array(self, messages: np.ndarray) -> pa.Array:
+        """Return the column of a block of messages, shape (rows,)."""
+        flat = np.ascontiguousarray(self.values(messages)).reshape(-1)
+        values = pa.array(np.strings.decode(flat, "ascii", "replace") if self.is_text else flat)
+        if not self.shape:
+            return values
+        return pa.FixedSizeListArray.from_arrays(values, prod(self.shape))
 
 
-def arrow_array(signal: Signal, messages: np.ndarray) -> pa.Array:
-    """Return the values of a signal in a block of messages, shape (rows,)."""
-    flat = np.ascontiguousarray(signal.values(messages)).reshape(-1)
-    values = pa.array(np.strings.decode(flat, "ascii", "replace") if signal.is_text else flat)
-    if not signal.shape:
-        return values
-    return pa.FixedSizeListArray.from_arrays(values, prod(signal.shape))
+def columns_of(mailbox: MailboxSpec) -> list[Column]:
+    """Return the columns of a mailbox in the order of its fields; groups of fields are
+    flattened."""
+    return list(_columns(mailbox.name, (), (), mailbox.fields))
+
+
+def _columns(
+    mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
+) -> Iterator[Column]:
+    for field in fields:
+        inner = (*path, field.name)
+        shape = outer + field.shape
+        if field.fields:
+            yield from _columns(mailbox, inner, shape, field.fields)
+        else:
+            yield Column(".".join((mailbox, *inner)), mailbox, inner, shape, field)

@@ -35,13 +35,14 @@ from rack.tools.recording.checksums import (
 from rack.tools.recording.cores import CoreRecord
 from rack.tools.recording.parquet import (
     CONFIG,
+    HEAD,
     PART,
     PUBLISHED,
     SIGNALS,
     TABLE,
+    columns_of,
 )
 from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, find_missing, mend
-from rack.tools.recording.signal import HEAD, signals_of
 from rack.tools.recording.spool import STRETCHES, rings
 
 
@@ -109,7 +110,7 @@ class Recording:
             self._gaps = json.loads(metadata[b"gaps"])
             self._lost_before_the_end = dict[str, int](json.loads(metadata[b"lost"]))
         self._shapes = {
-            box.name: {signal.label: signal.shape for signal in signals_of(box)}
+            box.name: {column.label: column.shape for column in columns_of(box)}
             for box in self.layout.mailboxes
         }
         self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
@@ -325,8 +326,8 @@ class Recording:
         found = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
         for field in HEAD:
             found[field] = self.signal(name, field)
-        for signal in signals_of(box):
-            signal.values(found["message"])[...] = self.signal(name, signal.label)
+        for column in columns_of(box):
+            column.values(found["message"])[...] = self.signal(name, column.label)
         return found
 
     def fields(self, mailbox: str) -> set[str]:

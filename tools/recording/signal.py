@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from math import isnan
@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.layout import FieldSpec, MailboxSpec
+from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import text_of
 from rack.tools.console.answer import Failure
+from rack.tools.recording.parquet import Column, columns_of
 
 NAME = re.compile(r"([\w.]+)((?:\[\d{1,9}\])*)")
 CONDITION = re.compile(r"\s*(\S+?)\s*(==|!=|<=|>=|<|>)\s*(\S+)\s*")
@@ -31,36 +32,23 @@ NEAREST = 3
 """Names offered in place of one that is not known, at most."""
 
 
-HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
-"""Columns that the messages of all mailboxes have; the first of a table, after `TIME`."""
-TIME = "time_s"
-"""The tick as simulated time, s."""
-
-
 @dataclass(frozen=True)
-class Signal:
+class Signal(Column):
     """Numbers, or text, in every message of a mailbox: a field, or part of an array field.
 
     Attributes:
-        name: Mailbox, groups and field, and indices, as in `servo.status.position[2]`.
-        mailbox: Name of the mailbox.
-        path: Names of the groups that hold the field, and of the field.
-        shape: Shape of the whole field in a message, () for a single value.
-        spec: The field.
         index: Indices into an array field, as far as they are given.
     """
 
-    name: str
-    mailbox: str
-    path: tuple[str, ...]
-    shape: tuple[int, ...]
-    spec: FieldSpec
     index: tuple[int, ...] = ()
 
     @classmethod
     def all(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
         """Return every whole field of these mailboxes by its name."""
-        return {signal.name: signal for box in boxes for signal in signals_of(box)}
+        columns = (column for box in boxes for column in columns_of(box))
+        return {
+            one.name: cls(one.name, one.mailbox, one.path, one.shape, one.spec) for one in columns
+        }
 
     @classmethod
     def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:
@@ -77,17 +65,6 @@ class Signal:
             ends = "".join(f"[0 to {size - 1}]" for size in whole.shape)
             raise Failure(f"{text}: no such index; permitted: {whole.name}{ends}", 2)
         return replace(whole, name=text, index=index)
-
-    @property
-    def label(self) -> str:
-        """Its column in the mailbox's table; that of a field named like one of the head differs."""
-        name = ".".join(self.path)
-        return f"message.{name}" if name in (TIME, *HEAD) else name
-
-    @property
-    def is_text(self) -> bool:
-        """Whether it is text."""
-        return self.spec.kind[1] == "S"
 
     @property
     def unit(self) -> str:
@@ -115,9 +92,7 @@ class Signal:
     def values(self, messages: np.ndarray) -> np.ndarray:
         """Return it in each of these messages, shape (messages, *what is left of its own): a
         view."""
-        for key in self.path:
-            messages = messages[key]
-        return self.part(messages)
+        return self.part(super().values(messages))
 
     def part(self, values: np.ndarray) -> np.ndarray:
         """Return it out of the values of its whole field, (messages, *shape of the field)."""
@@ -152,20 +127,8 @@ class Signal:
 
 
 def signals_of(box: MailboxSpec) -> list[Signal]:
-    """Return the fields of a mailbox in their order; groups of fields are flattened."""
-    return list(_signals(box.name, (), (), box.fields))
-
-
-def _signals(
-    mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
-) -> Iterator[Signal]:
-    for field in fields:
-        inner = (*path, field.name)
-        shape = outer + field.shape
-        if field.fields:
-            yield from _signals(mailbox, inner, shape, field.fields)
-        else:
-            yield Signal(".".join((mailbox, *inner)), mailbox, inner, shape, field)
+    """Return the fields of a mailbox in their order."""
+    return [*Signal.all([box]).values()]
 
 
 def mailbox_of(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:

@@ -23,12 +23,11 @@ from rack.boards.errors import CheckpointError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, checked_line, read_line
-from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.parquet import CONFIG, HEAD
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import tally
-from rack.tools.recording.signal import HEAD
 from rack.tools.timing.analysis.report import write_report
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack

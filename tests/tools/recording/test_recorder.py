@@ -18,11 +18,10 @@ from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
-from rack.tools.recording.parquet import arrow_array
+from rack.tools.recording.parquet import columns_of
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import recorded_by
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import Signal
 from rack.tools.timing.analysis.report import report_of
 from tests.shared_runs import SMALL_S, small_run
 
@@ -131,16 +130,16 @@ def test_groups_of_fields_become_one_column_a_field() -> None:
     rows["points"]["at"] = np.arange(60.0).reshape(5, 4, 3)
     rows["points"]["id"] = np.arange(20).reshape(5, 4)
     rows["why"] = b"because"
-    signals = Signal.all([box])
-    assert {name: signal.shape for name, signal in signals.items()} == {
+    columns = {column.name: column for column in columns_of(box)}
+    assert {name: column.shape for name, column in columns.items()} == {
         "a.path.count": (),
         "a.path.points.at": (4, 3),
         "a.path.points.id": (4,),
         "a.path.why": (),
     }
-    assert arrow_array(signals["a.path.points.at"], rows)[2].as_py() == list(np.arange(24.0, 36.0))
-    assert arrow_array(signals["a.path.points.id"], rows)[4].as_py() == [16, 17, 18, 19]
-    assert arrow_array(signals["a.path.why"], rows).to_pylist() == ["because"] * 5
+    assert columns["a.path.points.at"].array(rows)[2].as_py() == list(np.arange(24.0, 36.0))
+    assert columns["a.path.points.id"].array(rows)[4].as_py() == [16, 17, 18, 19]
+    assert columns["a.path.why"].array(rows).to_pylist() == ["because"] * 5
     # A message that was damaged on its way is recorded too.
     rows["why"][3] = b"bec\x80use"
-    assert arrow_array(signals["a.path.why"], rows).to_pylist()[3] == "bec\ufffduse"
+    assert columns["a.path.why"].array(rows).to_pylist()[3] == "bec\ufffduse"

@@ -16,10 +16,9 @@ from rack.backplane.message import State
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import Checksums, checked_line, read_line
-from rack.tools.recording.parquet import SignalTables
+from rack.tools.recording.parquet import HEAD, SignalTables
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import TABLES
-from rack.tools.recording.signal import HEAD
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.charts.gantt import subject_of
