@@ -17,9 +17,6 @@ from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 if TYPE_CHECKING:
     from rack.tools.live.replies import Reply
 
-DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
-"""Commands that leave none in force."""
-
 Tick = Annotated[
     int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")
 ]
@@ -116,6 +113,7 @@ def command(
       rack command nist-state-table elemental_move do pick block1 --wait
     """
     from rack.backplane.segment import Segment
+    from rack.levels.operator import EFFECTS, Operation
     from rack.tools.live.desk import LiveDesk, goal_of
     from rack.tools.live.holds import resume_command
 
@@ -138,7 +136,7 @@ def command(
             return
         reply = desk.give(given, wait, timeout)
     print_reply(reply, as_json)
-    if reply.is_standing and what not in DONE_AT_ONCE and not as_json:
+    if reply.is_standing and Operation[what.upper()] in EFFECTS and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
 
 

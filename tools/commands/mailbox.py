@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
-from rack.tools.console.tables import console, fitted
+from rack.tools.console.tables import console, fitted_records
 from rack.tools.live.message_text import DROPPED, MessageText, list_mailboxes
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import mailbox_of
@@ -51,8 +51,7 @@ def mailbox(
         if watch:
             raise Failure("--watch needs the NAME of a mailbox", 2)
         rows = list_mailboxes(segment)
-        cells = [[*map(str, row.values())] for row in rows]
-        print_answer(rows, fitted([*rows[0]], cells, DROPPED), as_json)
+        print_answer(rows, fitted_records(rows, DROPPED), as_json)
         return
     box = mailbox_of(name, segment.layout.mailboxes)
     ring = MailboxRing(segment, box.name)

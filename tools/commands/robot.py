@@ -20,7 +20,7 @@ from rack.boards.config import load, names
 from rack.levels.errors import RobotError
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json
-from rack.tools.console.tables import fitted
+from rack.tools.console.tables import fitted_records
 
 if TYPE_CHECKING:
     from rack.tools.robot.draft import Wishes
@@ -159,9 +159,7 @@ def _examined(given: str, folder: Path) -> tuple[Examined, str]:
 
 
 def _report(found: Document) -> Iterator[str]:
-    head = list(found["joints"][0])
-    rows = [[str(row[key]) for key in head] for row in found["joints"]]
-    yield from fitted(head, rows)
+    yield from fitted_records(found["joints"])
     yield f"reach {found['reach_m']} m, payload {found['payload_kg']} kg wherever it reaches"
     for finding in found["findings"]:
         verdict = "FAILS" if finding["fails"] else "ok"

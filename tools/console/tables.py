@@ -60,6 +60,14 @@ def fitted(
     return table(head, rows, terminal_width(), dropped)
 
 
+def fitted_records(
+    records: Sequence[Mapping[str, object]], dropped: Sequence[str] = ()
+) -> Iterator[str]:
+    """Yield the lines of such a table, with a row for each record, at least one, and a column for
+    each key."""
+    return fitted([*records[0]], [[*map(str, one.values())] for one in records], dropped)
+
+
 def grid(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],

@@ -32,7 +32,7 @@ def misses(recording: Recording) -> list[Document]:
     found = []
     for task in recording.layout.tasks:
         found += _misses_of(task, recording.trace(task.name))
-        done = recording.ended.get("tasks", {}).get(task.name, {}).get("done")
+        done = recording.counts(task.name).get("done")
         if done is None:
             # The end is not recorded, or was by an earlier version.
             continue

@@ -280,10 +280,14 @@ class Recording:
                 rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
 
+    def counts(self, task: str) -> Document:
+        """Return the counts of a task at the end of the run; empty where they are not recorded."""
+        return dict(self.ended.get("tasks", {}).get(task, {}))
+
     def place(self, task: TaskSpec) -> tuple[int, int]:
         """Return core and priority that a task obtained; those of the config where the run's end is
         not recorded."""
-        counted = self.ended.get("tasks", {}).get(task.name, {})
+        counted = self.counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)
 
     def trace(self, task: str) -> np.ndarray:
