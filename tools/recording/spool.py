@@ -13,7 +13,7 @@ time, and no stream has checksums, so that damage could be read as other values.
 A flight recorder (`[record] keep`) writes no parquet files: frames go to stretches, files that are
 removed again unless something happened near them. The head of each says what was taken before it,
 so the tables can be made from any of them. They are made when the run is opened: ten minutes of the
-NASREM rack take half a minute.
+NASREM rack take 20 s.
 """
 
 from __future__ import annotations
