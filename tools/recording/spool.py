@@ -53,7 +53,7 @@ OPEN = -1
 """End of a stretch that is being written, or whose recorder was killed."""
 
 
-class Head(NamedTuple):
+class SpoolHead(NamedTuple):
     """The first line of a spool: the rack's layout as plain data, and its launch."""
 
     layout: Any
@@ -109,7 +109,7 @@ class StretchEnd(NamedTuple):
 
 
 Part = StretchHead | Frame | StretchEnd
-KINDS = {kind.__name__: kind for kind in (Head, StretchHead, Frame, StretchEnd)}
+KINDS = {kind.__name__: kind for kind in (SpoolHead, StretchHead, Frame, StretchEnd)}
 
 
 class Spool:
@@ -133,7 +133,7 @@ class Spool:
             if not self.path.stat().st_size:
                 # The config and the origin of the run are written before its recorder begins.
                 Checksums(folder).store(CONFIG, ORIGIN)
-                _write(self._file, Head(asdict(layout), launch))
+                _write(self._file, SpoolHead(asdict(layout), launch))
             with self.path.open("rb") as left:
                 found = read_head(left, self.path)
             if found != (layout, launch):
@@ -203,7 +203,7 @@ class Spool:
         self._file.close()
 
 
-def _write(file: IO[bytes], part: Head | Part) -> None:
+def _write(file: IO[bytes], part: SpoolHead | Part) -> None:
     """Write a line to an unbuffered file. Raises `OSError` when the disk is full."""
     line = checked_line({type(part).__name__: part}).encode()
     while line:
