@@ -7,7 +7,7 @@ clock when it was written. Events are a channel of their own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from heapq import merge
 from pathlib import Path
 from typing import NamedTuple
@@ -81,17 +81,12 @@ def _schema(box: MailboxSpec) -> Document:
         "tick": {"type": "integer", "description": "release of the cycle that wrote it"},
     }
     for signal in signals_of(box):
-        field = _of_shape(signal.json_type, signal.shape)
+        field: Document = {"type": signal.json_type}
+        for _ in signal.shape:
+            field = {"type": "array", "items": field}
         field["description"] = f"{signal.spec.meaning} ({signal.unit})".removesuffix(" ()")
         head[".".join(signal.path)] = field
     return {"type": "object", "properties": head}
-
-
-def _of_shape(kind: str, shape: Sequence[int]) -> Document:
-    found: Document = {"type": kind}
-    for _ in shape:
-        found = {"type": "array", "items": found}
-    return found
 
 
 def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[ChannelMessage]:

@@ -106,29 +106,19 @@ class CyclesFile:
         self._writer.close()
 
 
-class SignalTables:
-    """signals/, being written; what a killed recorder has left there is replaced."""
-
-    def __init__(self, folder: Path, layout: Layout) -> None:
-        if folder.exists():
-            rmtree(folder)
-        self._tables = {
-            mailbox.name: _SignalTable(folder / TABLE.format(mailbox.name), mailbox, layout)
-            for mailbox in layout.timed
-        }
-
-    def add(self, mailbox: str, rows: np.ndarray) -> None:
-        """Add rows of a mailbox's ring, shape (rows,), at least one."""
-        self._tables[mailbox].add(rows)
-
-    def close(self) -> None:
-        """Finish the tables."""
-        for table in self._tables.values():
-            table.close()
+def signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
+    """Return the tables of signals/, by mailbox; what a killed recorder has left there is
+    replaced."""
+    if folder.exists():
+        rmtree(folder)
+    return {
+        mailbox.name: SignalTable(folder / TABLE.format(mailbox.name), mailbox, layout)
+        for mailbox in layout.timed
+    }
 
 
-class _SignalTable:
-    """The table of a mailbox, a folder of parts."""
+class SignalTable:
+    """The table of a mailbox, being written: a folder of parts."""
 
     def __init__(self, folder: Path, mailbox: MailboxSpec, layout: Layout) -> None:
         folder.mkdir(parents=True)
@@ -157,7 +147,7 @@ class _SignalTable:
         )
 
     def add(self, rows: np.ndarray) -> None:
-        """Add rows of the mailbox's ring."""
+        """Add rows of the mailbox's ring, shape (rows,), at least one."""
         self._waiting.append(rows)
         if (
             sum(map(len, self._waiting)) >= MESSAGE_ROWS

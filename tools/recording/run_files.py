@@ -18,7 +18,7 @@ from rack.backplane.segment import Launch, Segment
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import CONFIG, PUBLISHED, SIGNALS, CyclesFile, SignalTables
+from rack.tools.recording.parquet import CONFIG, PUBLISHED, SIGNALS, CyclesFile, signal_tables
 from rack.tools.recording.recorder_process import LOOK_S, ORIGIN, SPOOL
 from rack.tools.recording.spool import (
     OPEN,
@@ -160,7 +160,7 @@ class RunFiles(Tally):
         self._reached = dict.fromkeys(self.lost, (-1, 0))
         """Of each ring the newest tick, and the rows lost by then."""
         self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}", layout, launch)
-        self._signals = SignalTables(folder / f"{SIGNALS}{suffix}", layout)
+        self._signals = signal_tables(folder / f"{SIGNALS}{suffix}", layout)
 
     def begin(self, stretch: StretchHead) -> None:
         """Go on with a stretch: what is not there before it was removed, not lost."""
@@ -179,12 +179,13 @@ class RunFiles(Tally):
         if name in self.tasks:
             self._cycles.add(name, rows)
         elif len(rows):
-            self._signals.add(name, rows)
+            self._signals[name].add(rows)
 
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
         """Finish all files; the trace keeps what the machine did to its cores."""
         self.end()
-        self._signals.close()
+        for table in self._signals.values():
+            table.close()
         self._cycles.close(self.lost, cores, self.gaps, self.kept)
 
 
