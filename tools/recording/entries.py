@@ -42,7 +42,13 @@ def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str
             continue
         boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in ports}
         for box in boxes.values():
-            _check(box, ran.get(box.name), recording, asked)
+            needed = _type_of(box)
+            there = _type_of(ran[box.name]) if box.name in ran else "no such mailbox"
+            if there != needed:
+                raise Failure(f"{asked}: {box.name}: {there}; needed: {needed}", 2)
+            if recording.kept:
+                raise Failure(f"{asked}: {recording.kept_text}", 2)
+            _check_whole(box, recording, asked)
         found[task.task] = {port: _rows(recording, box, ports[port]) for port, box in boxes.items()}
     if not found:
         raise Failure(f"{asked}: '{config.name}' has no adapter", 2)
@@ -95,18 +101,6 @@ def _issued(recording: Recording) -> list[Request]:
             found.append((tick, number, Request(layout.index(box.name), message.tobytes(), tick)))
     found.sort(key=lambda command: command[:2])
     return [request for _, _, request in found]
-
-
-def _check(
-    box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording, asked: str
-) -> None:
-    needed = _type_of(box)
-    found = "no such mailbox" if recorded is None else _type_of(recorded)
-    if found != needed:
-        raise Failure(f"{asked}: {box.name}: {found}; needed: {needed}", 2)
-    if recording.kept:
-        raise Failure(f"{asked}: {recording.kept_text}", 2)
-    _check_whole(box, recording, asked)
 
 
 def _type_of(box: MailboxSpec) -> str:
