@@ -16,8 +16,9 @@ from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from importlib import import_module
 from io import StringIO, TextIOBase
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from rack.tools.console.interrupt import INTERRUPT, Interrupted
 
@@ -27,110 +28,144 @@ if TYPE_CHECKING:
 
     from rack.boards.crate.line import CrateLine
 
-COMMANDS = (
-    (
-        "run",
-        "rack.tools.commands.run:run",
-        "Run a rack until its task ends, and report on the run.",
+
+class Command(NamedTuple):
+    """A command.
+
+    Attributes:
+        name: Name on the command line.
+        source: Module and function, or `typer.Typer`, in it.
+        line: One line of help.
+    """
+
+    name: str
+    source: str
+    line: str
+
+
+COMMANDS = {
+    "Run": (
+        Command(
+            "run",
+            "rack.tools.commands.run:run",
+            "Run a rack until its task ends, and report on the run.",
+        ),
+        Command("stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."),
+        Command(
+            "pause", "rack.tools.commands.pause:pause", "Pause a rack, or the motion of its arm."
+        ),
+        Command("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
+        Command(
+            "step",
+            "rack.tools.commands.step:step",
+            "Let a rack in lockstep go on by single cycles.",
+        ),
+        Command(
+            "rewind",
+            "rack.tools.commands.rewind:rewind",
+            "Go back to any tick of a recorded run, and branch off.",
+        ),
+        Command("list", "rack.tools.commands.list:list_racks", "List the racks on this machine."),
+        Command(
+            "clean",
+            "rack.tools.commands.clean:clean",
+            "Remove the shared memory that killed racks left behind.",
+        ),
     ),
-    ("check", "rack.tools.commands.check:check", "Validate a config and predict its timing."),
-    ("robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."),
-    (
-        "schema",
-        "rack.tools.commands.schema:schema",
-        "Show the keys of a config with their units and defaults.",
+    "Watch": (
+        Command("status", "rack.tools.commands.status:status", "Show a running rack once."),
+        Command("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
+        Command(
+            "watch",
+            "rack.tools.commands.watch:watch",
+            "Show signals of a running rack, or what was around a moment.",
+        ),
+        Command(
+            "mailbox",
+            "rack.tools.commands.mailbox:mailbox",
+            "Show what is in a mailbox of a running rack.",
+        ),
+        Command("record", "rack.tools.commands.record:record", "Record a running rack."),
+        Command(
+            "replay",
+            "rack.tools.commands.replay:replay",
+            "Open recordings in the viewer, of several racks on one time line.",
+        ),
+        Command(
+            "export", "rack.tools.commands.export:export", "Write a recorded run as an MCAP file."
+        ),
+        Command(
+            "report",
+            "rack.tools.commands.report:report",
+            "Report on a recorded run, or compare two runs.",
+        ),
     ),
-    (
-        "list",
-        "rack.tools.commands.list:list_racks",
-        "List the racks on this machine.",
+    "Command and disturb": (
+        Command(
+            "command", "rack.tools.commands.command:command", "Command one level of a running rack."
+        ),
+        Command(
+            "set", "rack.tools.commands.set:set_param", "Set a live parameter of a running rack."
+        ),
+        Command(
+            "prompt",
+            "rack.tools.commands.prompt:prompt",
+            "Open a Python prompt on the host side of a rack.",
+        ),
+        Command(
+            "estop",
+            "rack.tools.commands.estop:estop",
+            "Engage the brakes of the arm at once, until --reset.",
+        ),
+        Command("inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."),
+        Command(
+            "campaign",
+            "rack.tools.commands.campaign:campaign",
+            "Inject random faults into many runs, and judge each.",
+        ),
     ),
-    ("status", "rack.tools.commands.status:status", "Show a running rack once."),
-    ("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
-    (
-        "watch",
-        "rack.tools.commands.watch:watch",
-        "Show signals of a running rack, or what was around a moment.",
+    "Predict": (
+        Command(
+            "check", "rack.tools.commands.check:check", "Validate a config and predict its timing."
+        ),
+        Command(
+            "analyze",
+            "rack.tools.commands.analyze:analyze",
+            "Compare a run with the timing model, equation by equation.",
+        ),
+        Command(
+            "gantt",
+            "rack.tools.commands.gantt:gantt",
+            "Draw a Gantt chart of a config's schedule, or of a run.",
+        ),
     ),
-    (
-        "mailbox",
-        "rack.tools.commands.mailbox:mailbox",
-        "Show what is in a mailbox of a running rack.",
+    "Compare": (
+        Command("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
+        Command(
+            "reproduce",
+            "rack.tools.commands.reproduce:reproduce",
+            "Reproduce the paper, claim by claim, as one page.",
+        ),
     ),
-    ("stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."),
-    (
-        "clean",
-        "rack.tools.commands.clean:clean",
-        "Remove the shared memory that killed racks left behind.",
+    "Bring up": (
+        Command("robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."),
     ),
-    ("command", "rack.tools.commands.command:command", "Command one level of a running rack."),
-    ("pause", "rack.tools.commands.pause:pause", "Pause a rack, or the motion of its arm."),
-    ("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
-    ("set", "rack.tools.commands.set:set_param", "Set a live parameter of a running rack."),
-    ("step", "rack.tools.commands.step:step", "Let a rack in lockstep go on by single cycles."),
-    (
-        "prompt",
-        "rack.tools.commands.prompt:prompt",
-        "Open a Python prompt on the host side of a rack.",
+    "Reach others": (
+        Command(
+            "lan",
+            "rack.tools.network.group:app",
+            "Prepare racks that work together over a network.",
+        ),
     ),
-    ("inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."),
-    (
-        "estop",
-        "rack.tools.commands.estop:estop",
-        "Engage the brakes of the arm at once, until --reset.",
+    "Look up": (
+        Command(
+            "schema",
+            "rack.tools.commands.schema:schema",
+            "Show the keys of a config with their units and defaults.",
+        ),
     ),
-    ("record", "rack.tools.commands.record:record", "Record a running rack."),
-    (
-        "replay",
-        "rack.tools.commands.replay:replay",
-        "Open recordings in the viewer, of several racks on one time line.",
-    ),
-    ("export", "rack.tools.commands.export:export", "Write a recorded run as an MCAP file."),
-    (
-        "rewind",
-        "rack.tools.commands.rewind:rewind",
-        "Go back to any tick of a recorded run, and branch off.",
-    ),
-    (
-        "report",
-        "rack.tools.commands.report:report",
-        "Report on a recorded run, or compare two runs.",
-    ),
-    (
-        "analyze",
-        "rack.tools.commands.analyze:analyze",
-        "Compare a run with the timing model, equation by equation.",
-    ),
-    (
-        "gantt",
-        "rack.tools.commands.gantt:gantt",
-        "Draw a Gantt chart of a config's schedule, or of a run.",
-    ),
-    (
-        "campaign",
-        "rack.tools.commands.campaign:campaign",
-        "Inject random faults into many runs, and judge each.",
-    ),
-    ("lan", "rack.tools.network.group:app", "Prepare racks that work together over a network."),
-    ("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
-    (
-        "reproduce",
-        "rack.tools.commands.reproduce:reproduce",
-        "Reproduce the paper, claim by claim, as one page.",
-    ),
-)
-"""Name, module and function or `typer.Typer` in it, and one line of help."""
-GROUPS = {
-    "Run": ("run", "stop", "pause", "resume", "step", "rewind", "list", "clean"),
-    "Watch": ("status", "top", "watch", "mailbox", "record", "replay", "export", "report"),
-    "Command and disturb": ("command", "set", "prompt", "estop", "inject", "campaign"),
-    "Predict": ("check", "analyze", "gantt"),
-    "Compare": ("bench", "reproduce"),
-    "Bring up": ("robot",),
-    "Reach others": ("lan",),
-    "Look up": ("schema",),
 }
-"""What one would do, and the commands for it."""
+"""All commands, by what one would do with them."""
 MAX_ARGUMENT = 4096
 """Characters, as in the longest path; longer values belong in the config file."""
 COMPLETION = "_RACK_COMPLETE"
@@ -323,29 +358,26 @@ def commands() -> TyperGroup:
     from typer.core import TyperCommand, TyperGroup
 
     class Grouped(TyperGroup):
-        """The command line, with its commands in `GROUPS`."""
+        """The command line, with its commands in groups."""
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             """Write a table of the commands for each group."""
-            lines = {name: line for name, _, line in COMMANDS}
-            for group, names in GROUPS.items():
+            for group, found in COMMANDS.items():
                 with formatter.section(group):
-                    formatter.write_dl([(f"{name:9}", lines[name]) for name in names])
+                    formatter.write_dl([(f"{one.name:9}", one.line) for one in found])
 
     class LazyCommand(TyperCommand):
         """A command of which only the name and one line of help are known."""
 
-        def __init__(self, name: str, source: str, line: str) -> None:
-            super().__init__(name, short_help=line)
-            self._source = source
+        def __init__(self, command: Command) -> None:
+            super().__init__(command.name, short_help=command.line)
+            self._command = command
 
         def make_context(
             self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
         ) -> Any:
             """Load the command; from here on it takes this one's place."""
-            return _loaded(self.name or "", self._source).make_context(
-                info_name, args, parent, **extra
-            )
+            return _loaded(self._command).make_context(info_name, args, parent, **extra)
 
     def rack(
         version: bool = typer.Option(False, "--version", help="Show the version and exit."),
@@ -368,8 +400,8 @@ def commands() -> TyperGroup:
     app.callback()(rack)
     group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup), "it has a callback"
-    for name, source, line in COMMANDS:
-        group.add_command(LazyCommand(name, source, line))
+    for command in chain.from_iterable(COMMANDS.values()):
+        group.add_command(LazyCommand(command))
     return group
 
 
@@ -379,15 +411,15 @@ def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
     return typer.Typer(add_completion=add_completion, rich_markup_mode=None, **settings)
 
 
-def _loaded(name: str, source: str) -> Any:
-    """Import a command from "module:attribute"."""
+def _loaded(command: Command) -> Any:
+    """Import a command."""
     import typer
 
-    path, _, attribute = source.partition(":")
+    path, _, attribute = command.source.partition(":")
     found = getattr(import_module(path), attribute)
     if not isinstance(found, typer.Typer):
         app = _app()
-        app.command(name)(found)
+        app.command(command.name)(found)
         found = app
     return typer.main.get_command(found)
 

@@ -16,7 +16,7 @@ from rack.boards.config import RackConfig, load, wire
 from rack.levels.peer import DRIFT_PPM, Presence, peer_port
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED
-from rack.tools.recording.parquet import CyclesFile, SignalTables
+from rack.tools.recording.parquet import CyclesFile, signal_tables
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import TABLES
 from tests.boards.lan.racks import rack_text
@@ -92,10 +92,10 @@ def recorded(
         rows[name] = machine.epoch_ns + rows["tick"] * machine.period_ns
     cycles.add("pulse", rows)
     cycles.close({}, UNMEASURED, (), ())
-    signals = SignalTables(folder / "signals", layout)
+    signals = signal_tables(folder / "signals", layout)
     for other in others:
         box = layout.mailbox(f"lan.{peer_port(other.rack)}")
-        signals.add(box.name, sightings(machine, other, box, seed))
+        signals[box.name].add(sightings(machine, other, box, seed))
     if machine.mode == "lockstep":
         for name, ticks in (
             ("pulse.status", TICKS),
@@ -105,8 +105,9 @@ def recorded(
             rows["basis"] = np.arange(0, ticks, 4)
             rows["tick"] = rows["basis"] + TICKS - ticks
             rows["message"]["count"] = counts_from + rows["basis"]
-            signals.add(name, rows)
-    signals.close()
+            signals[name].add(rows)
+    for table in signals.values():
+        table.close()
     Checksums(folder).store("config.toml", *TABLES)
     return Recording(folder)
 

@@ -13,7 +13,7 @@ from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, wire
 from rack.tools.recording.checksums import Checksums, checked_line
 from rack.tools.recording.cores import UNMEASURED
-from rack.tools.recording.parquet import CyclesFile, SignalTables
+from rack.tools.recording.parquet import CyclesFile, signal_tables
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import TABLES
 
@@ -70,13 +70,14 @@ def recorded(
     (folder / "events.jsonl").write_text("".join(checked_line({**event}) for event in events))
     layout = wire(config)
     cycles = CyclesFile(folder / "cycles.parquet", layout, Launch(EPOCH_NS, EPOCH_NS))
-    signals = SignalTables(folder / "signals", layout)
+    signals = signal_tables(folder / "signals", layout)
     for task, trace in traces.items():
         rows = [cycle.row(config.tick_ns) if isinstance(cycle, Cycle) else cycle for cycle in trace]
         cycles.add(task, np.array(rows, RECORD))
     for mailbox, rows in (messages or {}).items():
-        signals.add(mailbox, rows)
+        signals[mailbox].add(rows)
     cycles.close({}, UNMEASURED, (), ())
-    signals.close()
+    for table in signals.values():
+        table.close()
     Checksums(folder).store("config.toml", *TABLES)
     return Recording(folder)

@@ -9,32 +9,40 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import IO
 
 import pytest
 
-from rack.tools.cli import COMMANDS as ALL
-from rack.tools.cli import GROUPS
+from rack.tools.cli import COMMANDS
 from tests.processes import RACK
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
 LONG = "a" * 5000
-COMMANDS = (
-    ("check", LONG),
-    ("run", "fig2", "--set", f"clock.speed={LONG}"),
-    ("run", "fig2", "--out", LONG),
-    ("check", "fig2", "--faults", LONG),
-    ("status", LONG),
-    ("command", LONG, "task", "hold"),
-    ("inject", "fig2", LONG, "kill"),
-    ("report", LONG),
-    ("bench", "machine", LONG),
-    (LONG,),
+NAMES = [one.name for found in COMMANDS.values() for one in found]
+
+
+def run_process(
+    line: Sequence[str | bytes], stdout: int | IO[bytes] = subprocess.PIPE, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a command as a process."""
+    return subprocess.run(
+        line,
+        cwd=ROOT,
+        env=os.environ | environment,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments", [("check", LONG), ("run", "fig2", "--set", f"clock.speed={LONG}"), (LONG,)]
 )
-
-
-@pytest.mark.parametrize("arguments", COMMANDS, ids=lambda arguments: " ".join(arguments)[:20])
 def test_an_argument_without_end_is_refused_in_one_line(arguments: tuple[str, ...]) -> None:
     done = rack(*arguments)
     assert (done.returncode, done.stdout) == (2, "")
@@ -60,7 +68,7 @@ def test_no_run_lasts_for_ever_or_less_than_nothing(seconds: str) -> None:
     assert "Invalid value for '--seconds'" in done.stderr
 
 
-@pytest.mark.parametrize("command", [name for name, _, _ in ALL])
+@pytest.mark.parametrize("command", NAMES)
 def test_a_usage_error_of_any_command_is_a_document_under_json(command: str) -> None:
     done = rack(command, "--bogus", "--json")
     assert done.returncode == 2
@@ -82,7 +90,7 @@ def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
         ("status", rack_name, "--json"),
         run,
     ]
-    return [*((name, "--help") for name, _, _ in ALL), *answers, (*run, "--json")]
+    return [*((name, "--help") for name in NAMES), *answers, (*run, "--json")]
 
 
 @pytest.mark.slow
@@ -90,17 +98,9 @@ def outputs(small: Path, rack_name: str) -> list[tuple[str, ...]]:
 def test_output_that_cannot_be_printed_is_one_line(
     small: Path, rack_name: str, unbuffered: str
 ) -> None:
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     for arguments in outputs(small, rack_name)[-7 if unbuffered else 0 :]:
         with Path("/dev/full").open("wb") as full:
-            done = subprocess.run(
-                [*RACK, *arguments],
-                stdout=full,
-                stderr=subprocess.PIPE,
-                text=True,
-                env=environment,
-                timeout=BOUND_S,
-            )
+            done = run_process([*RACK, *arguments], full, PYTHONUNBUFFERED=unbuffered)
         *before, last = done.stderr.splitlines()
         assert (done.returncode, last) == (1, "stdout: No space left on device"), arguments
         assert "Traceback" not in done.stderr
@@ -113,19 +113,11 @@ def test_output_that_cannot_be_printed_is_one_line(
 def test_a_reader_that_has_seen_enough_hears_of_no_error(
     small: Path, rack_name: str, unbuffered: str
 ) -> None:
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     for arguments in outputs(small, rack_name)[-7:]:
         reader, writer = os.pipe()
         os.close(reader)
         try:
-            done = subprocess.run(
-                [*RACK, *arguments],
-                stdout=writer,
-                stderr=subprocess.PIPE,
-                text=True,
-                env=environment,
-                timeout=BOUND_S,
-            )
+            done = run_process([*RACK, *arguments], writer, PYTHONUNBUFFERED=unbuffered)
         finally:
             os.close(writer)
         assert done.returncode == 1, arguments
@@ -146,7 +138,7 @@ def test_in_a_removed_working_folder_a_command_works_or_says_why_not(
 ) -> None:
     command = shlex.join([*RACK, *arguments])
     script = f'cd "{tmp_path}" && rmdir "{tmp_path}" && exec {command}'
-    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, timeout=BOUND_S)
+    done = run_process(["sh", "-c", script])
     assert (done.stderr.strip(), done.returncode) == (answer, 2 if answer else 0)
 
 
@@ -155,7 +147,7 @@ def test_with_stdin_closed_a_command_that_reads_it_says_so(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     line = ["sh", "-c", '"$@" <&-', "sh", *RACK, "rewind", str(small_run(tmp_path_factory))]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=BOUND_S)
+    done = run_process(line)
     said = "stdin is closed, and this command reads from it\n"
     assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
 
@@ -165,7 +157,7 @@ def test_with_stdout_closed_commands_do_what_they_do(small: Path, rack_name: str
     for arguments in outputs(small, rack_name)[-7:]:
         # Python itself closes what the shell has closed before it starts.
         line = ["sh", "-c", '"$@" >&-', "sh", *RACK, *arguments]
-        done = subprocess.run(line, stderr=subprocess.PIPE, text=True, timeout=BOUND_S)
+        done = run_process(line)
         refused = int(arguments[0] == "status")
         assert (done.returncode, len(done.stderr.splitlines())) == (refused, refused), done.stderr
 
@@ -189,15 +181,13 @@ def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
     assert f"Invalid value for '{option.partition('=')[0]}'" in done.stderr
 
 
-def test_every_command_stands_in_one_group_of_the_help_with_its_line() -> None:
-    grouped = [name for names in GROUPS.values() for name in names]
-    assert sorted(grouped) == sorted(name for name, _, _ in ALL)
-    shown = " ".join(rack("--help").stdout.split())
-    for name, _, line in ALL:
-        assert f" {name} {line}" in shown
-    assert [shown.index(f" {group}: ") for group in GROUPS] == sorted(
-        shown.index(f" {group}: ") for group in GROUPS
+def test_help_has_a_whole_line_for_every_command_by_groups() -> None:
+    listed = "".join(
+        f" {group}: " + "".join(f"{one.name} {one.line} " for one in found)
+        for group, found in COMMANDS.items()
     )
+    assert len({*NAMES}) == len(NAMES)
+    assert "".join(listed.split()) in "".join(rack("--help").stdout.split())
 
 
 def test_the_version_is_that_of_the_project() -> None:
@@ -206,10 +196,7 @@ def test_the_version_is_that_of_the_project() -> None:
 
 
 def test_bytes_that_are_no_text_are_refused() -> None:
-    command = [*RACK, "check", b"\xff"]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
-    )
+    done = run_process([*RACK, "check", b"\xff"])
     assert (done.returncode, done.stderr) == (2, 'argument 2 = "?": not UTF-8\n')
 
 
@@ -224,33 +211,17 @@ def test_the_shell_completes_commands_and_configs(words: str, found: str) -> Non
         "COMP_WORDS": words,
         "COMP_CWORD": str(len(words.split()) - 1),
     }
-    command = list(RACK)
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env=os.environ | asked,
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
+    done = run_process(RACK, **asked)
     assert (done.returncode, done.stdout.strip()) == (0, found)
 
 
-def as_module(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line as `python WORDS`."""
-    return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, timeout=BOUND_S, check=False
-    )
-
-
 def test_the_command_line_runs_as_a_module() -> None:
-    done = as_module("-m", "rack", "--version")
+    done = run_process([sys.executable, "-m", "rack", "--version"])
     assert (done.returncode, done.stderr, done.stdout[:5]) == (0, "", "rack ")
 
 
 def test_help_without_its_texts_gives_the_reason() -> None:
-    assert as_module("-m", "rack", "list", "--help").stderr == ""
-    assert as_module("-OO", "-m", "rack", "list", "--help").stderr == (
+    assert run_process([sys.executable, "-m", "rack", "list", "--help"]).stderr == ""
+    assert run_process([sys.executable, "-OO", "-m", "rack", "list", "--help"]).stderr == (
         "help lacks its texts: PYTHONOPTIMIZE=2 (python -OO) removes them\n"
     )

@@ -17,38 +17,35 @@ from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.tables import analysis_blocks, document
 from rack.tools.timing.operator_response import show
 
-Percentile = Annotated[
-    float,
-    typer.Option(
-        metavar="P",
-        min=1.0,
-        max=100.0,
-        help=(
-            "judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as in eq. 3.6"
-        ),
-    ),
-]
-Out = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="folder for the results; default: the run's own")
-]
-OnlyResponse = Annotated[
-    bool,
-    typer.Option(
-        "--response", help="instead: the response to an operator's commands, with its bounds"
-    ),
-]
-Verbose = Annotated[
-    bool,
-    typer.Option("--verbose", help="add the tables of levels, tasks and equations"),
-]
-
 
 def analyze(
     run: RunFolder,
-    percentile: Percentile = 100.0,
-    response: OnlyResponse = False,
-    out: Out = None,
-    verbose: Verbose = False,
+    percentile: Annotated[
+        float,
+        typer.Option(
+            metavar="P",
+            min=1.0,
+            max=100.0,
+            help=(
+                "judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as"
+                " in eq. 3.6"
+            ),
+        ),
+    ] = 100.0,
+    response: Annotated[
+        bool,
+        typer.Option(
+            "--response", help="instead: the response to an operator's commands, with its bounds"
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="folder for the results; default: the run's own"),
+    ] = None,
+    verbose: Annotated[
+        bool,
+        typer.Option("--verbose", help="add the tables of levels, tasks and equations"),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Compare a run with the timing model: every equation that `rack check` predicts, with its

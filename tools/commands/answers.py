@@ -4,6 +4,7 @@ longer."""
 from __future__ import annotations
 
 import time
+from contextlib import closing
 from dataclasses import asdict
 
 from rack.tools.console.answer import Failure, print_answer, print_json
@@ -60,17 +61,15 @@ def describe(name: str) -> dict[str, str | int | float | None]:
 def show_status(rack: str | None, as_json: bool) -> None:
     """Print a running rack as it is now. Raises `Failure` if none is named and there is not exactly
     one."""
+    from rack.backplane.segment import Segment
     from rack.tools.live.snapshot import RackMonitor
-    from rack.tools.live.watched import LocalRack
-    from rack.tools.recording.recorder_process import recorded_by, size_of, size_text
+    from rack.tools.recording.recorder_process import recorded_by, recorded_line, size_of
 
-    with LocalRack(rack or only_rack()) as one:
-        segment = one.segment
+    with closing(Segment.attach(rack or only_rack())) as segment:
         found = RackMonitor(segment).look()
         run = recorded_by(segment)
-    size = 0 if run is None else size_of(run)
     if as_json:
-        recording = None if run is None else {"folder": str(run), "bytes": size}
+        recording = None if run is None else {"folder": str(run), "bytes": size_of(run)}
         print_json({**asdict(found), "recording": recording})
         return
     from rack.tools.console.tables import console
@@ -78,7 +77,7 @@ def show_status(rack: str | None, as_json: bool) -> None:
 
     console().print(RackView(found))
     if run is not None:
-        print(f"recorded into {run}: {size_text(size, found.time_s)}")
+        print(recorded_line(run, found.time_s))
 
 
 def only_rack() -> str:

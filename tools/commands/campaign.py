@@ -25,90 +25,84 @@ NO_TIME = "no time for the report: 'rack campaign' with --out {} goes on from he
 MOST = 100_000
 """Faults of a kind, kills or sizes of one campaign."""
 
-Injections = Annotated[
-    int,
-    typer.Option(
-        "--injections", metavar="N", min=0, max=MOST, help="strikes of each kind, at least"
-    ),
-]
-Seed = Annotated[
-    int, typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans")
-]
-Kinds = Annotated[
-    str | None,
-    typer.Option(metavar="A,B", help="only these kinds; default: all that the rack can have"),
-]
-Kills = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=1, max=MOST, help="instead: only N kills from outside"),
-]
-LockstepOnly = Annotated[
-    bool, typer.Option("--lockstep", help="trials in lockstep only; default: both")
-]
-RealtimeOnly = Annotated[
-    bool, typer.Option("--realtime", help="trials in real time only; default: both")
-]
-Faultless = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S",
-        min=0.0,
-        max=1e6,
-        help=f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
-    ),
-]
-Load = Annotated[
-    bool,
-    typer.Option("--load", help="without faults: only under load, by stress-ng where installed"),
-]
-Sizes = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        min=0,
-        max=MOST,
-        help=f"sizes on each curve of size against delay; default {SIZES}",
-    ),
-]
-Seconds = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S",
-        min=1.0,
-        max=1e9,
-        help="simulated seconds of a run, for a rack that no task ends",
-    ),
-]
-Whole = Annotated[
-    bool,
-    typer.Option(
-        "--whole",
-        help="run each trial from its beginning; default: from a checkpoint before its first fault",
-    ),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR", help="folder, also to continue a campaign in; default: runs/campaign-<time>"
-    ),
-]
-
 
 def campaign(
     config: ConfigName,
-    injections: Injections = INJECTIONS,
-    seed: Seed = 0,
-    kinds: Kinds = None,
-    kills: Kills = None,
-    lockstep: LockstepOnly = False,
-    realtime: RealtimeOnly = False,
-    faultless: Faultless = None,
-    load: Load = False,
-    sizes: Sizes = None,
-    seconds: Seconds = None,
+    injections: Annotated[
+        int,
+        typer.Option(
+            "--injections", metavar="N", min=0, max=MOST, help="strikes of each kind, at least"
+        ),
+    ] = INJECTIONS,
+    seed: Annotated[
+        int,
+        typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans"),
+    ] = 0,
+    kinds: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="only these kinds; default: all that the rack can have"),
+    ] = None,
+    kills: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, max=MOST, help="instead: only N kills from outside"),
+    ] = None,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="trials in lockstep only; default: both")
+    ] = False,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="trials in real time only; default: both")
+    ] = False,
+    faultless: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            min=0.0,
+            max=1e6,
+            help=f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
+        ),
+    ] = None,
+    load: Annotated[
+        bool,
+        typer.Option(
+            "--load", help="without faults: only under load, by stress-ng where installed"
+        ),
+    ] = False,
+    sizes: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=0,
+            max=MOST,
+            help=f"sizes on each curve of size against delay; default {SIZES}",
+        ),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            min=1.0,
+            max=1e9,
+            help="simulated seconds of a run, for a rack that no task ends",
+        ),
+    ] = None,
     settings: Settings = [],  # noqa: B006  typer copies it
-    whole: Whole = False,
-    out: Out = None,
+    whole: Annotated[
+        bool,
+        typer.Option(
+            "--whole",
+            help=(
+                "run each trial from its beginning; default: from a checkpoint before its"
+                " first fault"
+            ),
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="folder, also to continue a campaign in; default: runs/campaign-<time>",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Inject random faults of all kinds into runs of a rack, and judge each of them.

@@ -32,43 +32,42 @@ from rack.tools.timing.tables import forecast_blocks
 if TYPE_CHECKING:
     from rack.levels.robot.abilities import Abilities
 
-From = Annotated[
-    Path | None,
-    typer.Option(
-        "--from", metavar="RUN", help="use the budgets measured in this run, not the config's"
-    ),
-]
-Percentile = Annotated[
-    float,
-    typer.Option(
-        metavar="P",
-        min=0.0,
-        max=100.0,
-        help="with --from: the longest of P in 100 cycles, to leave out cycles stalled by the host",
-    ),
-]
-Fix = Annotated[
-    bool,
-    typer.Option("--fix", help="print only the config, with the cheapest changes that make it fit"),
-]
-
-Verbose = Annotated[
-    bool,
-    typer.Option(
-        "--verbose",
-        help="add slots, mailboxes, every equation, and what an arm does while no torque comes",
-    ),
-]
-
 
 def check(
     config: ConfigName,
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
-    run: From = None,
-    percentile: Percentile = 100.0,
-    fix: Fix = False,
-    verbose: Verbose = False,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", metavar="RUN", help="use the budgets measured in this run, not the config's"
+        ),
+    ] = None,
+    percentile: Annotated[
+        float,
+        typer.Option(
+            metavar="P",
+            min=0.0,
+            max=100.0,
+            help=(
+                "with --from: the longest of P in 100 cycles, to leave out cycles stalled by"
+                " the host"
+            ),
+        ),
+    ] = 100.0,
+    fix: Annotated[
+        bool,
+        typer.Option(
+            "--fix", help="print only the config, with the cheapest changes that make it fit"
+        ),
+    ] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose",
+            help="add slots, mailboxes, every equation, and what an arm does while no torque comes",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Validate a config, and predict whether its levels meet their cycles.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
@@ -16,62 +17,57 @@ from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
 if TYPE_CHECKING:
     from rack.tools.live.replies import Reply
 
-DONE_AT_ONCE = ("resume", "modify", "table", "set", "enable", "disable", "reset", "release")
-"""Commands that leave none in force."""
-
-Level = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own"
-    ),
-]
-What = Annotated[
-    str | None,
-    typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, enable, ...; see above"),
-]
-Goals = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="GOAL",
-        help=(
-            "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for modify:"
-            " NAME on|off; for table: NAME; for do: the level's command; for set: KEY=VALUE"
-        ),
-    ),
-]
 Tick = Annotated[
     int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")
 ]
 At = Annotated[
     float | None, typer.Option(metavar="S", min=0.0, max=1e9, help="the same, in simulated seconds")
 ]
-Wait = Annotated[
-    bool, typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal")
-]
-Lease = Annotated[
-    bool,
-    typer.Option(
-        "--lease",
-        help="stay while it is in force; where this command ends before, the level holds",
-    ),
-]
-List = Annotated[
-    bool,
-    typer.Option("--list", help="list the levels, the commands each takes, and the one in force"),
-]
 
 
 def command(
     rack: RackName,
-    level: Level = None,
-    what: What = None,
-    goal: Goals = None,
+    level: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own"
+        ),
+    ] = None,
+    what: Annotated[
+        str | None,
+        typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, enable, ...; see above"),
+    ] = None,
+    goal: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="GOAL",
+            help=(
+                "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for"
+                " modify: NAME on|off; for table: NAME; for do: the level's command; for set:"
+                " KEY=VALUE"
+            ),
+        ),
+    ] = None,
     tick: Tick = None,
     at: At = None,
-    wait: Wait = False,
+    wait: Annotated[
+        bool,
+        typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal"),
+    ] = False,
     timeout: Timeout = None,
-    lease: Lease = False,
-    is_list: List = False,
+    lease: Annotated[
+        bool,
+        typer.Option(
+            "--lease",
+            help="stay while it is in force; where this command ends before, the level holds",
+        ),
+    ] = False,
+    is_list: Annotated[
+        bool,
+        typer.Option(
+            "--list", help="list the levels, the commands each takes, and the one in force"
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Command one level of a running rack, overriding the level above it.
@@ -116,16 +112,17 @@ def command(
       rack command nist-state-table task table careful
       rack command nist-state-table elemental_move do pick block1 --wait
     """
+    from rack.backplane.segment import Segment
+    from rack.levels.operator import EFFECTS, Operation
     from rack.tools.live.desk import LiveDesk, goal_of
     from rack.tools.live.holds import resume_command
-    from rack.tools.live.watched import LocalRack
 
     check_timeout(timeout, wait)
     if lease and wait:
         raise Failure("--lease, --wait: a lease stays anyway", 2)
     # An exception, not an end at once, so that a command that has not been given yet is withdrawn.
-    with INTERRUPT.raising(), LocalRack(rack) as one:
-        desk = LiveDesk(one)
+    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
+        desk = LiveDesk(segment)
         if is_list:
             print_answer(desk.levels(), desk.text(), as_json)
             return
@@ -139,7 +136,7 @@ def command(
             return
         reply = desk.give(given, wait, timeout)
     print_reply(reply, as_json)
-    if reply.is_standing and what not in DONE_AT_ONCE and not as_json:
+    if reply.is_standing and Operation[what.upper()] in EFFECTS and not as_json:
         print(f"in force until: {resume_command(rack, level)}")
 
 

@@ -17,49 +17,48 @@ from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.held import waits
 from rack.tools.console.parameters import Json, named, rack_names
 
-AnyRack = Annotated[
-    str,
-    typer.Argument(
-        metavar="RACK",
-        help="running rack by name, as 'rack list' shows it; on another machine: HOST[:PORT]/RACK",
-        autocompletion=rack_names,
-        callback=named,
-    ),
-]
-Certificates = Annotated[
-    str,
-    typer.Option(
-        metavar="DIR",
-        envvar="RACK_CERTIFICATES",
-        help="for HOST/RACK: folder with certificates; see rack lan certificates --help",
-    ),
-]
-Name = Annotated[
-    str,
-    typer.Option(
-        "--as",
-        metavar="NAME",
-        help="for HOST/RACK: your name, as in adapter.lan.estop_from of that rack",
-    ),
-]
-Reset = Annotated[
-    bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")
-]
-Ready = Annotated[
-    bool,
-    typer.Option("--ready", help="for HOST/RACK: connect now, and set it when Enter is pressed"),
-]
-
 OBEY_S = 2.0
 """Longest wait for the clock, which reads the latch every tick."""
 
 
 def estop(
-    rack: AnyRack,
-    reset: Reset = False,
-    ready: Ready = False,
-    certificates: Certificates = "",
-    name: Name = OPERATOR,
+    rack: Annotated[
+        str,
+        typer.Argument(
+            metavar="RACK",
+            help=(
+                "running rack by name, as 'rack list' shows it; on another machine:"
+                " HOST[:PORT]/RACK"
+            ),
+            autocompletion=rack_names,
+            callback=named,
+        ),
+    ],
+    reset: Annotated[
+        bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")
+    ] = False,
+    ready: Annotated[
+        bool,
+        typer.Option(
+            "--ready", help="for HOST/RACK: connect now, and set it when Enter is pressed"
+        ),
+    ] = False,
+    certificates: Annotated[
+        str,
+        typer.Option(
+            metavar="DIR",
+            envvar="RACK_CERTIFICATES",
+            help="for HOST/RACK: folder with certificates; see rack lan certificates --help",
+        ),
+    ] = "",
+    name: Annotated[
+        str,
+        typer.Option(
+            "--as",
+            metavar="NAME",
+            help="for HOST/RACK: your name, as in adapter.lan.estop_from of that rack",
+        ),
+    ] = OPERATOR,
     as_json: Json = False,
 ) -> None:
     """Engage the brakes of the arm at once, and keep them engaged until --reset.

@@ -13,13 +13,15 @@ from rack.tools.console.parameters import Json, RunFolder
 from rack.tools.console.progress import reading_progress
 from rack.tools.recording.recording import Recording
 
-To = Annotated[Literal["mcap"], typer.Option("--to", help="kind of the file")]
-Out = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="file to write; default: RUN/run.mcap")
-]
 
-
-def export(run: RunFolder, to: To = "mcap", out: Out = None, as_json: Json = False) -> None:
+def export(
+    run: RunFolder,
+    to: Annotated[Literal["mcap"], typer.Option("--to", help="kind of the file")] = "mcap",
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="file to write; default: RUN/run.mcap")
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Write a recorded run as an MCAP file, which Foxglove and others read.
 
     Each mailbox is a channel of JSON messages, whose schema has units and meanings; events are one,

@@ -21,46 +21,43 @@ LATEST_MS = 1e10
 MANY_SPANS = 10_000
 """Spans from which on drawing takes a second or two."""
 
-SubjectName = Annotated[
-    str,
-    typer.Argument(
-        metavar="CONFIG|RUN",
-        help="config by name or path, or the folder of a run, as in runs/fig2-...",
-    ),
-]
-From = Annotated[
-    float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="start of the window, ms")
-]
-To = Annotated[
-    float | None, typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms")
-]
-Process = Annotated[
-    list[str],
-    typer.Option(
-        metavar="LEVEL=MS,MS",
-        help="times of X in the schedule of a level, one a cycle, in turn; repeatable",
-    ),
-]
-Figure = Annotated[
-    int | None,
-    typer.Option(metavar="5", help="instead: the paper's figure 5 with the levels of this rack"),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR", help="folder for the pictures; default: the run's, or runs/<rack>-gantt"
-    ),
-]
-
 
 def gantt(
-    subject: SubjectName,
-    from_ms: From = None,
-    to_ms: To = None,
-    process: Process = [],  # noqa: B006  typer copies it
-    figure: Figure = None,
+    subject: Annotated[
+        str,
+        typer.Argument(
+            metavar="CONFIG|RUN",
+            help="config by name or path, or the folder of a run, as in runs/fig2-...",
+        ),
+    ],
+    from_ms: Annotated[
+        float | None,
+        typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="start of the window, ms"),
+    ] = None,
+    to_ms: Annotated[
+        float | None,
+        typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms"),
+    ] = None,
+    process: Annotated[
+        list[str],
+        typer.Option(
+            metavar="LEVEL=MS,MS",
+            help="times of X in the schedule of a level, one a cycle, in turn; repeatable",
+        ),
+    ] = [],  # noqa: B006  typer copies it
+    figure: Annotated[
+        int | None,
+        typer.Option(
+            metavar="5", help="instead: the paper's figure 5 with the levels of this rack"
+        ),
+    ] = None,
     settings: Settings = [],  # noqa: B006
-    out: Out = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="folder for the pictures; default: the run's, or runs/<rack>-gantt"
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a

@@ -12,74 +12,69 @@ from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, Timeout, check_timeout, named
 from rack.tools.console.tables import fitted
 
-Rack = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named
-    ),
-]
-BoardName = Annotated[
-    str | None,
-    typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock"),
-]
-KindName = Annotated[
-    str | None, typer.Argument(metavar="KIND", help="kind of fault; the kinds are listed below")
-]
-Parameters = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="KEY=VALUE", help="parameters of the kind, as in size=0.05"),
-]
-For = Annotated[
-    str | None,
-    typer.Option("--for", metavar="TIME", help="duration in simulated time, as in 0.5s or 20ms"),
-]
-Cycles = Annotated[str | None, typer.Option(metavar="N", help="duration in cycles of the task")]
-Mailbox = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="mailbox to strike; default: all that the task writes"),
-]
-Tick = Annotated[
-    str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")
-]
-When = Annotated[
-    str | None,
-    typer.Option(
-        metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"'
-    ),
-]
-Phase = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1"
-    ),
-]
-Seed = Annotated[str | None, typer.Option(metavar="N", help="seed of its random choices")]
-Wait = Annotated[bool, typer.Option("--wait", help="wait until the fault, or the run, is over")]
-Withdraw = Annotated[
-    int | None,
-    typer.Option(metavar="NO", help="withdraw a fault that still waits; --list shows its number"),
-]
-List = Annotated[
-    bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")
-]
-
 
 def inject(
-    rack: Rack = None,
-    board: BoardName = None,
-    kind: KindName = None,
-    parameters: Parameters = None,
-    lasts: For = None,
-    cycles: Cycles = None,
-    mailbox: Mailbox = None,
-    tick: Tick = None,
-    when: When = None,
-    phase: Phase = None,
-    seed: Seed = None,
-    wait: Wait = False,
+    rack: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named
+        ),
+    ] = None,
+    board: Annotated[
+        str | None,
+        typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock"),
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Argument(metavar="KIND", help="kind of fault; the kinds are listed below")
+    ] = None,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="KEY=VALUE", help="parameters of the kind, as in size=0.05"),
+    ] = None,
+    lasts: Annotated[
+        str | None,
+        typer.Option(
+            "--for", metavar="TIME", help="duration in simulated time, as in 0.5s or 20ms"
+        ),
+    ] = None,
+    cycles: Annotated[
+        str | None, typer.Option(metavar="N", help="duration in cycles of the task")
+    ] = None,
+    mailbox: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="mailbox to strike; default: all that the task writes"),
+    ] = None,
+    tick: Annotated[
+        str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")
+    ] = None,
+    when: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"'
+        ),
+    ] = None,
+    phase: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1"
+        ),
+    ] = None,
+    seed: Annotated[
+        str | None, typer.Option(metavar="N", help="seed of its random choices")
+    ] = None,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="wait until the fault, or the run, is over")
+    ] = False,
     timeout: Timeout = None,
-    withdraw: Withdraw = None,
-    is_list: List = False,
+    withdraw: Annotated[
+        int | None,
+        typer.Option(
+            metavar="NO", help="withdraw a fault that still waits; --list shows its number"
+        ),
+    ] = None,
+    is_list: Annotated[
+        bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Inject a fault into a running rack.
@@ -137,12 +132,13 @@ def inject(
 
 def _values(parameters: list[str]) -> dict[str, str]:
     """Return parameters by name. Raises `Failure`."""
+    values = {}
     for text in parameters:
-        if not text.partition("=")[0] or not text.partition("=")[2]:
+        key, _, value = text.partition("=")
+        if not key or not value:
             raise Failure(f"'{text}': a parameter must be key=value, as in size=0.05", 2)
-    return {
-        key.strip(): value.strip() for key, _, value in (text.partition("=") for text in parameters)
-    }
+        values[key.strip()] = value.strip()
+    return values
 
 
 class KindsCommand(TyperCommand):

@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
-from rack.tools.console.tables import console, fitted
+from rack.tools.console.tables import console, fitted_records
 from rack.tools.live.message_text import DROPPED, MessageText, list_mailboxes
 from rack.tools.live.watched import looks
 from rack.tools.recording.signal import mailbox_of
@@ -21,15 +21,18 @@ from rack.tools.recording.signal import mailbox_of
 LOOK_S = 0.1
 PLAIN_S = 1.0
 """Times between looks, real time: on a terminal or as JSON, and as plain text."""
-Name = Annotated[
-    str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
-]
-Watch = Annotated[
-    bool, typer.Option("--watch", help="show each message, until Ctrl-C or the end of the run")
-]
 
 
-def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Json = False) -> None:
+def mailbox(
+    rack: RackName,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
+    ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="show each message, until Ctrl-C or the end of the run")
+    ] = False,
+    as_json: Json = False,
+) -> None:
     """Show the newest message in a mailbox of a running rack, field by field with units; or list
     the rack's mailboxes.
 
@@ -48,8 +51,7 @@ def mailbox(rack: RackName, name: Name = None, watch: Watch = False, as_json: Js
         if watch:
             raise Failure("--watch needs the NAME of a mailbox", 2)
         rows = list_mailboxes(segment)
-        cells = [[*map(str, row.values())] for row in rows]
-        print_answer(rows, fitted([*rows[0]], cells, DROPPED), as_json)
+        print_answer(rows, fitted_records(rows, DROPPED), as_json)
         return
     box = mailbox_of(name, segment.layout.mailboxes)
     ring = MailboxRing(segment, box.name)

@@ -3,11 +3,13 @@ arm comes to rest on its path, and goes on from there."""
 
 from __future__ import annotations
 
+from contextlib import closing
+
+from rack.backplane.segment import Segment
 from rack.tools.console.answer import print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live import pausing
-from rack.tools.live.watched import LocalRack
 
 
 def pause(rack: RackName, as_json: Json = False) -> None:
@@ -25,8 +27,8 @@ def pause(rack: RackName, as_json: Json = False) -> None:
       rack pause nasrem
       rack resume nasrem
     """
-    with INTERRUPT.raising(), LocalRack(rack) as one:
-        tick, levels = pausing.pause(one)
+    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
+        tick, levels = pausing.pause(segment)
     what = f"held before tick {tick}"
     if levels:
         what = f"'{levels[0]}' held by the operator, at rest since tick {tick}"
@@ -44,7 +46,7 @@ def resume(rack: RackName, as_json: Json = False) -> None:
     Examples:
       rack resume nasrem
     """
-    with INTERRUPT.raising(), LocalRack(rack) as one:
-        levels = pausing.resume(one)
+    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
+        levels = pausing.resume(segment)
     document = {"rack": rack, "paused": False, "levels": levels}
     print_answer(document, f"rack '{rack}' goes on", as_json)

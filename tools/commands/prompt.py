@@ -24,19 +24,22 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT, SIGNALS
 from rack.tools.console.parameters import RackName
 
-HostName = Annotated[
-    str | None,
-    typer.Argument(metavar="BOARD", help="external host board; not needed when the rack has one"),
-]
-Script = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="SCRIPT", help="Python script to run, in place of a prompt", dir_okay=False
-    ),
-]
 
-
-def prompt(rack: RackName, board: HostName = None, script: Script = None) -> None:
+def prompt(
+    rack: RackName,
+    board: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="BOARD", help="external host board; not needed when the rack has one"
+        ),
+    ] = None,
+    script: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="SCRIPT", help="Python script to run, in place of a prompt", dir_okay=False
+        ),
+    ] = None,
+) -> None:
     """Open a Python prompt on the host side of a running rack, or run a script there.
 
     It takes the place of the program of a host board with `external = true`, one process at a time.

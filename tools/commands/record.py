@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -20,10 +20,16 @@ from rack.tools.console.answer import Document, Failure, fail, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, View, named_here
 from rack.tools.live.folder import folder_of
-from rack.tools.live.watched import LocalRack
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink, is_opening
-from rack.tools.recording.recorder_process import recorded_by, size_of, size_text, sizes, unwritable
+from rack.tools.recording.recorder_process import (
+    recorded_by,
+    recorded_line,
+    size_of,
+    size_text,
+    sizes,
+    unwritable,
+)
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import save as save_run
 from rack.tools.viewer.parts import FILE
@@ -33,32 +39,29 @@ from rack.tools.viewer.window import ViewerWindow, free_port, url
 LOOK_S = 0.1
 """Longest time until a signal is handled that came to another thread than the first."""
 
-Out = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>"),
-]
-With = Annotated[
-    list[str],
-    typer.Option(
-        "--with",
-        metavar="RACK",
-        help="record this rack as well; repeatable",
-    ),
-]
-Save = Annotated[
-    bool,
-    typer.Option(
-        "--save", help="save what the recorder of its run has taken so far; the run is untouched"
-    ),
-]
-
 
 def record(
     rack: RackName,
-    others: With = [],  # noqa: B006  typer copies it
-    out: Out = None,
+    others: Annotated[
+        list[str],
+        typer.Option(
+            "--with",
+            metavar="RACK",
+            help="record this rack as well; repeatable",
+        ),
+    ] = [],  # noqa: B006  typer copies it
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>"),
+    ] = None,
     view: View = False,
-    save: Save = False,
+    save: Annotated[
+        bool,
+        typer.Option(
+            "--save",
+            help="save what the recorder of its run has taken so far; the run is untouched",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Record a running rack until its run is over, or until Ctrl-C.
@@ -89,22 +92,22 @@ def record(
     if save and (others or view):
         raise Failure(f"--save, {'--with' if others else '--view'}: give one of them", 2)
     with ExitStack() as stack:
-        found = [stack.enter_context(LocalRack(str(named_here(each)))).segment for each in racks]
+        attached = (closing(Segment.attach(str(named_here(each)))) for each in racks)
+        found = [stack.enter_context(one) for one in attached]
+        segment = found[0]
         folder = folder_of(out, rack)
         if save:
-            print_answer(*_saved(found[0], folder), as_json)
+            print_answer(*_saved(segment, folder), as_json)
             return
-        segment = found[0]
         clock_ns = segment.layout.clock_ns
         begun = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
-        with _ending_when_full(found[0], folder):
-            notes = _record_together(found, folder) if others else _record(found[0], folder, view)
+        with _ending_when_full(segment, folder):
+            notes = _record(found, folder, view)
         lasted_s = (segment.words[System.TICK] - begun) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
     answer = {"rack": rack, "folder": str(folder), "notes": notes, **sizes(folder, lasted_s)}
-    line = f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
-    print_answer(answer, line, as_json)
+    print_answer(answer, recorded_line(folder, lasted_s), as_json)
     if is_opening():
         _end_at_once(0)
 
@@ -137,26 +140,11 @@ def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
     return {"rack": name, "folder": str(folder), **times, "bytes": size}, line
 
 
-def _begin(segment: Segment, folder: Path, notes: list[str], port: int | None = None) -> Recorder:
+def _begin(segment: Segment, folder: Path, notes: list[str], port: int | None) -> Recorder:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).write_text(segment.config)
     view = SafeSink.of(segment, port, lambda: ViewSink(segment, folder, port), notes.append)
     return Recorder(segment, folder, view)
-
-
-def _record(segment: Segment, folder: Path, view: bool) -> list[str]:
-    notes: list[str] = []
-    port = free_port() if view else None
-    # Ctrl-C ends the recording, not the run; leaving the context finishes the files.
-    with (
-        INTERRUPT.orderly(),
-        _begin(segment, folder, notes, port) as recorder,
-        INTERRUPT.orderly(recorder.stop),
-    ):
-        if port is not None:
-            ViewerWindow(url(port))
-        recorder.follow()
-    return notes
 
 
 @contextmanager
@@ -174,20 +162,29 @@ def _ending_when_full(segment: Segment, folder: Path) -> Iterator[None]:
             _end_at_once(1)
 
 
-def _record_together(racks: Sequence[Segment], folder: Path) -> list[str]:
-    """Record each rack into its folder, then all of them into one file; return messages for the
-    user."""
+def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
+    """Record a rack into a folder; or each of several into its own, then all of them into one
+    file. Return messages for the user."""
     notes: list[str] = []
     names = [rack.layout.rack for rack in racks]
     if twice := [name for at, name in enumerate(names) if name in names[:at]]:
         raise Failure(f"--with {twice[0]}: this rack is to be recorded already", 2)
-    folders = [folder / name for name in names]
-    unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' makes it"
+    folders = [folder / name for name in names] if len(racks) > 1 else [folder]
+    unfinished = ""
+    if len(racks) > 1:
+        unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' makes it"
+    port = free_port() if view else None
+    # Ctrl-C ends the recording, not the run; leaving the inner context finishes the files.
     with INTERRUPT.orderly(unfinished=unfinished):
         with ExitStack() as stack:
-            begun = (_begin(rack, into, notes) for rack, into in zip(racks, folders, strict=True))
+            pairs = zip(racks, folders, strict=True)
+            begun = (_begin(rack, into, notes, port) for rack, into in pairs)
             recorders = [stack.enter_context(recorder) for recorder in begun]
+            if port is not None:
+                ViewerWindow(url(port))
             _follow(recorders, unfinished)
+        if len(racks) == 1:
+            return notes
         if INTERRUPT.number:
             return [*notes, unfinished]
         try:

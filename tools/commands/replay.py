@@ -21,33 +21,35 @@ from rack.tools.recording.time_line import RackPlace, on_one_time_line, side_by_
 from rack.tools.viewer.parts import FILE, parts_of
 from rack.tools.viewer.window import ViewerWindow, has_screen
 
-Runs = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="RUN...",
-        help="folder of a run, as in runs/nasrem-20250101-120000; one for each rack",
-    ),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE.rrd", help="make the viewer's file from what is recorded, and open nothing"
-    ),
-]
-Against = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="RUN",
-        help=(
-            "another run of the same rack, or 'origin', the one that RUN continues: both, tick by"
-            " tick"
-        ),
-    ),
-]
 Places = Callable[[Sequence[Recording]], list[RackPlace]]
 
 
-def replay(runs: Runs, out: Out = None, against: Against = None) -> None:
+def replay(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...",
+            help="folder of a run, as in runs/nasrem-20250101-120000; one for each rack",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.rrd",
+            help="make the viewer's file from what is recorded, and open nothing",
+        ),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help=(
+                "another run of the same rack, or 'origin', the one that RUN continues: both,"
+                " tick by tick"
+            ),
+        ),
+    ] = None,
+) -> None:
     """Open the recording of a run in the viewer; return when it is closed.
 
     It shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may also be a

@@ -12,35 +12,34 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.parameters import Json, RunFolder
 from rack.tools.timing.analysis.stored import print_report, show_report
 
-Against = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="RUN",
-        help="another run, or 'origin', the one that RUN continues: where the two diverge, and why",
-    ),
-]
-Of = Annotated[
-    str,
-    typer.Option(
-        metavar="MAILBOX",
-        help="with --against: from where this mailbox first differs, back to the cause",
-    ),
-]
-Repeat = Annotated[
-    bool,
-    typer.Option(
-        "--repeat",
-        help="with --against: if the recordings leave it open, run both racks again, with the"
-        " levels that their configs name",
-    ),
-]
-
 
 def report(
     run: RunFolder,
-    against: Against = None,
-    of: Of = "",
-    repeat: Repeat = False,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help=(
+                "another run, or 'origin', the one that RUN continues: where the two diverge,"
+                " and why"
+            ),
+        ),
+    ] = None,
+    of: Annotated[
+        str,
+        typer.Option(
+            metavar="MAILBOX",
+            help="with --against: from where this mailbox first differs, back to the cause",
+        ),
+    ] = "",
+    repeat: Annotated[
+        bool,
+        typer.Option(
+            "--repeat",
+            help="with --against: if the recordings leave it open, run both racks again, with the"
+            " levels that their configs name",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Report on a run, from its recording.

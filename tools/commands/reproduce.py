@@ -21,34 +21,32 @@ continues."""
 NO_LAB = "the page needs jinja2: pip install 'nasrem-rack[lab]'"
 STAYS = "{}: what is finished is kept; the same command goes on from there"
 
-Out = Annotated[
-    Path, typer.Option(metavar="DIR", help="folder of the page; one that exists is continued")
-]
-Only = Annotated[
-    list[str],
-    typer.Option(
-        "--only", metavar="SECTION", help='only this section, as in 3.4 or "abstract"; repeatable'
-    ),
-]
-Again = Annotated[
-    bool,
-    typer.Option(
-        "--again", help="repeat finished experiments: of the sections of --only, or of all"
-    ),
-]
-Share = Annotated[
-    bool,
-    typer.Option(
-        "--share", help="run even on cores held by another rack's real-time boards: figures suffer"
-    ),
-]
-
 
 def reproduce(
-    out: Out = PAGE,
-    only: Only = [],  # noqa: B006  typer copies it
-    again: Again = False,
-    share: Share = False,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="folder of the page; one that exists is continued")
+    ] = PAGE,
+    only: Annotated[
+        list[str],
+        typer.Option(
+            "--only",
+            metavar="SECTION",
+            help='only this section, as in 3.4 or "abstract"; repeatable',
+        ),
+    ] = [],  # noqa: B006  typer copies it
+    again: Annotated[
+        bool,
+        typer.Option(
+            "--again", help="repeat finished experiments: of the sections of --only, or of all"
+        ),
+    ] = False,
+    share: Annotated[
+        bool,
+        typer.Option(
+            "--share",
+            help="run even on cores held by another rack's real-time boards: figures suffer",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Reproduce the paper on this machine, and write a page that goes through it claim by claim.

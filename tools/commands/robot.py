@@ -20,7 +20,7 @@ from rack.boards.config import load, names
 from rack.levels.errors import RobotError
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json
-from rack.tools.console.tables import fitted
+from rack.tools.console.tables import fitted_records
 
 if TYPE_CHECKING:
     from rack.tools.robot.draft import Wishes
@@ -31,46 +31,36 @@ app = typer.Typer(
     rich_markup_mode=None, no_args_is_help=True, help="Bring up any arm, from MJCF or URDF."
 )
 
-Model = Annotated[Path, typer.Argument(metavar="MODEL", help="model file: MJCF, or URDF")]
-ModelOrConfig = Annotated[
-    str, typer.Argument(metavar="MODEL|CONFIG", help="model file, or config by name or path")
-]
-Picture = Annotated[
-    Path | None, typer.Option(metavar="PNG", help="file of the picture; default: NAME.png")
-]
-Tip = Annotated[
-    str, typer.Option(metavar="NAME", help="body or site at the end of the arm, if there are two")
-]
-Joints = Annotated[
-    str, typer.Option(metavar="J,J,...", help="joints of the arm, base to tool, in place of --tip")
-]
-Tool = Annotated[
-    str, typer.Option(metavar="NAME", help="site or body whose pose is the tool's, z outward")
-]
-Gripper = Annotated[
-    str, typer.Option(metavar="NAME|none", help="joint that drives the gripper, or none")
-]
-Home = Annotated[
-    str, typer.Option(metavar="NAME|Q,Q,...", help="keyframe, or positions of the joints, rad")
-]
-Torque = Annotated[
-    str, typer.Option(metavar="T,T,...", help="torque limits, N m, for a model without any")
-]
-Name = Annotated[str, typer.Option(metavar="NAME", help="name of the rack; default: the model's")]
-Out = Annotated[Path | None, typer.Option(metavar="DIR", help="new folder; default: NAME")]
-
 
 @app.command("new")
 def new(
-    model: Model,
-    name: Name = "",
-    tip: Tip = "",
-    joints: Joints = "",
-    tool: Tool = "",
-    gripper: Gripper = "",
-    home: Home = "",
-    torque: Torque = "",
-    out: Out = None,
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="model file: MJCF, or URDF")],
+    name: Annotated[
+        str, typer.Option(metavar="NAME", help="name of the rack; default: the model's")
+    ] = "",
+    tip: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="body or site at the end of the arm, if there are two"),
+    ] = "",
+    joints: Annotated[
+        str,
+        typer.Option(metavar="J,J,...", help="joints of the arm, base to tool, in place of --tip"),
+    ] = "",
+    tool: Annotated[
+        str, typer.Option(metavar="NAME", help="site or body whose pose is the tool's, z outward")
+    ] = "",
+    gripper: Annotated[
+        str, typer.Option(metavar="NAME|none", help="joint that drives the gripper, or none")
+    ] = "",
+    home: Annotated[
+        str, typer.Option(metavar="NAME|Q,Q,...", help="keyframe, or positions of the joints, rad")
+    ] = "",
+    torque: Annotated[
+        str, typer.Option(metavar="T,T,...", help="torque limits, N m, for a model without any")
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="new folder; default: NAME")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Write a folder with a config, a scene and a task for the arm of a model file.
@@ -111,7 +101,15 @@ def new(
 
 
 @app.command("check")
-def check(model: ModelOrConfig, out: Picture = None, as_json: Json = False) -> None:
+def check(
+    model: Annotated[
+        str, typer.Argument(metavar="MODEL|CONFIG", help="model file, or config by name or path")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="file of the picture; default: NAME.png")
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Examine an arm before it moves, and draw it: everything at once.
 
     Of a config its arm, of a model file the arm that `rack robot new` would make of it: axes,
@@ -161,9 +159,7 @@ def _examined(given: str, folder: Path) -> tuple[Examined, str]:
 
 
 def _report(found: Document) -> Iterator[str]:
-    head = list(found["joints"][0])
-    rows = [[str(row[key]) for key in head] for row in found["joints"]]
-    yield from fitted(head, rows)
+    yield from fitted_records(found["joints"])
     yield f"reach {found['reach_m']} m, payload {found['payload_kg']} kg wherever it reaches"
     for finding in found["findings"]:
         verdict = "FAILS" if finding["fails"] else "ok"

@@ -22,90 +22,81 @@ if TYPE_CHECKING:
     from rack.boards.crate.line import CrateLine
     from rack.tools.live.launch import RunResult
 
-RunConfig = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="CONFIG",
-        help="config by name, or path to a .toml file",
-        autocompletion=config_names,
-    ),
-]
-Lockstep = Annotated[
-    bool,
-    typer.Option(
-        "--lockstep",
-        help="start a tick only when every due task has finished: exact and repeatable",
-    ),
-]
-Seconds = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until its end"
-    ),
-]
-Speed = Annotated[
-    float | None, typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5")
-]
-Out = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>")
-]
-Share = Annotated[
-    bool,
-    typer.Option(
-        "--share",
-        help="run even on cores held by another rack's real-time boards: both will be late",
-    ),
-]
-Step = Annotated[
-    bool,
-    typer.Option(
-        "--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on"
-    ),
-]
-FromRun = Annotated[
-    Path | None,
-    typer.Option(
-        "--entries",
-        metavar="RUN",
-        help=(
-            "start no host boards and no other racks: what they sent in this recorded run enters"
-            " again, at the same ticks; for host boards in real time, or with a prompt: other runs"
-            " repeat in lockstep by themselves"
-        ),
-    ),
-]
-Origin = Annotated[
-    str | None,
-    typer.Option(
-        "--from",
-        metavar="RUN@TIME",
-        help=(
-            "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or --faults a"
-            " branch of it from there; one without checkpoints, as in real time, is repeated from"
-            " its beginning"
-        ),
-    ),
-]
-NoRecord = Annotated[
-    bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")
-]
-
 
 def run(
     context: typer.Context,
-    config: RunConfig = None,
-    lockstep: Lockstep = False,
-    step: Step = False,
-    seconds: Seconds = None,
-    speed: Speed = None,
+    config: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="CONFIG",
+            help="config by name, or path to a .toml file",
+            autocompletion=config_names,
+        ),
+    ] = None,
+    lockstep: Annotated[
+        bool,
+        typer.Option(
+            "--lockstep",
+            help="start a tick only when every due task has finished: exact and repeatable",
+        ),
+    ] = False,
+    step: Annotated[
+        bool,
+        typer.Option(
+            "--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on"
+        ),
+    ] = False,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until its end"
+        ),
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5"),
+    ] = None,
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
-    entries: FromRun = None,
-    origin: Origin = None,
-    out: Out = None,
-    no_record: NoRecord = False,
+    entries: Annotated[
+        Path | None,
+        typer.Option(
+            "--entries",
+            metavar="RUN",
+            help=(
+                "start no host boards and no other racks: what they sent in this recorded run"
+                " enters again, at the same ticks; for host boards in real time, or with a prompt:"
+                " other runs repeat in lockstep by themselves"
+            ),
+        ),
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="RUN@TIME",
+            help=(
+                "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or"
+                " --faults a branch of it from there; one without checkpoints, as in real time, is"
+                " repeated from its beginning"
+            ),
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>"),
+    ] = None,
+    no_record: Annotated[
+        bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")
+    ] = False,
     view: View = False,
-    share: Share = False,
+    share: Annotated[
+        bool,
+        typer.Option(
+            "--share",
+            help="run even on cores held by another rack's real-time boards: both will be late",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Run a rack until its task ends, and report on the run.
@@ -226,7 +217,7 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
 def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> Document:
     """Make the report, print it and return it. A run that has no report where one is wanted has
     failed."""
-    from rack.tools.recording.recorder_process import size_of, size_text
+    from rack.tools.recording.recorder_process import recorded_line
     from rack.tools.timing.analysis.report import unrecorded, write_report
     from rack.tools.timing.analysis.report_markdown import summary
     from rack.tools.timing.analysis.stored import print_report
@@ -247,7 +238,7 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
         return data
     if folder is not None:
         lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
-        print(f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}")
+        print(recorded_line(folder, lasted_s))
     for other in result.others:
         ended = f"{other.rack}: {other.cause} after {other.ticks} ticks"
         print(f"{ended}, digest {other.digest}, {other.folder or 'not recorded'}")

@@ -18,24 +18,25 @@ if TYPE_CHECKING:
 DROPPED = ("default", "permitted", "type")
 """Columns that a narrow terminal leaves out, in this order."""
 
-TableName = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params"
-    ),
-]
-Of = Annotated[
-    str,
-    typer.Option(
-        "--config",
-        metavar="CONFIG",
-        help="config whose levels declare [task] and params",
-        autocompletion=config_names,
-    ),
-]
 
-
-def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False) -> None:
+def schema(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params"
+        ),
+    ] = None,
+    config: Annotated[
+        str,
+        typer.Option(
+            "--config",
+            metavar="CONFIG",
+            help="config whose levels declare [task] and params",
+            autocompletion=config_names,
+        ),
+    ] = "nasrem",
+    as_json: Json = False,
+) -> None:
     """Show the keys of a config: type, unit, permitted values, default and meaning.
 
     Without TABLE it lists the tables. The levels' own tables, [task] and [board.<name>.params], are
@@ -56,13 +57,11 @@ def schema(name: TableName = None, config: Of = "nasrem", as_json: Json = False)
         found = key_tables(rack) if name is None else find_tables(name, rack)
     except LookupError as error:
         raise Failure(f'TABLE = "{name}": {error.args[0]}', 2) from None
-    lines = _names(found) if name is None else _keys(found)
+    lines = _keys(found)
+    if name is None:
+        rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
+        lines = fitted(["table", "in TOML", "meaning"], rows, ("in TOML",))
     print_answer([asdict(entry) for entry in found], lines, as_json)
-
-
-def _names(found: list[KeyTable]) -> Iterator[str]:
-    rows = [[entry.name, entry.heading, entry.meaning] for entry in found]
-    return fitted(["table", "in TOML", "meaning"], rows, ("in TOML",))
 
 
 def _keys(found: list[KeyTable]) -> Iterator[str]:

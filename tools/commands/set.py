@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Annotated
 
 import typer
 
+from rack.backplane.segment import Segment
 from rack.tools.commands.command import At, Tick, print_reply
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live.desk import LiveDesk
-from rack.tools.live.watched import LocalRack
-
-Setting = Annotated[
-    str,
-    typer.Argument(metavar="KEY=VALUE", help="as in board.servo.params.bandwidth=80"),
-]
 
 
 def set_param(
-    rack: RackName, setting: Setting, tick: Tick = None, at: At = None, as_json: Json = False
+    rack: RackName,
+    setting: Annotated[
+        str,
+        typer.Argument(metavar="KEY=VALUE", help="as in board.servo.params.bandwidth=80"),
+    ],
+    tick: Tick = None,
+    at: At = None,
+    as_json: Json = False,
 ) -> None:
     """Set a live parameter of a running rack, between two cycles of its level.
 
@@ -35,6 +38,6 @@ def set_param(
       rack set nasrem board.servo.params.bandwidth=80
       rack set nasrem board.servo.params.damping=0.8 --at 12.5
     """
-    with INTERRUPT.raising(), LocalRack(rack) as one:
-        reply = LiveDesk(one).set_param(setting, tick, at)
+    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
+        reply = LiveDesk(segment).set_param(setting, tick, at)
     print_reply(reply, as_json)

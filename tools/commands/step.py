@@ -13,33 +13,27 @@ from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 from rack.tools.live.stepper import Stepper
 
-Cycles = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N", min=1, max=1_000_000, help="cycles of the slowest level, or of --until"
-    ),
-]
-Count = Annotated[
-    int | None,
-    typer.Argument(metavar="N", min=1, max=1_000_000, help="cycles; the same as --cycles"),
-]
-Ticks = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=1, max=10**9, help="ticks of the clock, instead of cycles"),
-]
-Until = Annotated[
-    str | None, typer.Option(metavar="LEVEL", help="hold after the next cycle of this level")
-]
-LetGo = Annotated[bool, typer.Option("--run", help="let the rack run on without steps")]
-
 
 def step(
     rack: RackName,
-    count: Count = None,
-    cycles: Cycles = None,
-    ticks: Ticks = None,
-    until: Until = None,
-    run: LetGo = False,
+    count: Annotated[
+        int | None,
+        typer.Argument(metavar="N", min=1, max=1_000_000, help="cycles; the same as --cycles"),
+    ] = None,
+    cycles: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=1, max=1_000_000, help="cycles of the slowest level, or of --until"
+        ),
+    ] = None,
+    ticks: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, max=10**9, help="ticks of the clock, instead of cycles"),
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option(metavar="LEVEL", help="hold after the next cycle of this level")
+    ] = None,
+    run: Annotated[bool, typer.Option("--run", help="let the rack run on without steps")] = False,
     as_json: Json = False,
 ) -> None:
     """Let a rack in lockstep go on by single cycles, and show each level's state, and the row of

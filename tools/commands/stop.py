@@ -14,12 +14,14 @@ from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName
 
-Wait = Annotated[
-    float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the run's end")
-]
 
-
-def stop(rack: RackName, wait: Wait = 10.0, as_json: Json = False) -> None:
+def stop(
+    rack: RackName,
+    wait: Annotated[
+        float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the run's end")
+    ] = 10.0,
+    as_json: Json = False,
+) -> None:
     """End a run and wait until it is gone.
 
     The run ends in order at its next tick, and writes its report.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from contextlib import closing
 from importlib.util import find_spec
 
 from rack.tools.commands.answers import only_rack
@@ -37,25 +38,25 @@ def top(rack: OnlyRack = None) -> None:
       rack top
       rack top nasrem
     """
+    from rack.backplane.segment import Segment
     from rack.tools.console.tables import console
     from rack.tools.live.display import display_for
     from rack.tools.live.snapshot import RackMonitor
-    from rack.tools.live.watched import LocalRack
 
     ended = threading.Event()
-    with INTERRUPT.orderly(ended.set), LocalRack(rack or only_rack()) as one:
+    with INTERRUPT.orderly(ended.set), closing(Segment.attach(rack or only_rack())) as segment:
         if console().is_terminal and sys.stdin.isatty():
             if find_spec("textual") is not None:
                 from rack.tools.live.full_screen import RackScreen
 
-                screen = RackScreen(one, ended.is_set)
+                screen = RackScreen(segment, ended.is_set)
                 screen.run()
                 sys.exit(screen.return_code)
             print(
                 "no full screen without textual: pip install 'nasrem-rack[live]'", file=sys.stderr
             )
-        monitor = RackMonitor(one.segment)
+        monitor = RackMonitor(segment)
         with display_for(silent=False) as display:
             display.show(monitor.look())
-            while not one.segment.run_is_over and not ended.wait(LOOK_S):
+            while not segment.run_is_over and not ended.wait(LOOK_S):
                 display.show(monitor.look())

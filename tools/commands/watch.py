@@ -29,40 +29,36 @@ SHOWN_S = 10.0
 MOST_S = 600.0
 """Longest time kept before or after a moment: all of it is in memory."""
 
-Signals = Annotated[
-    list[str],
-    typer.Argument(metavar="SIGNAL...", help="as in servo.status.position[2], or a whole field"),
-]
-When = Annotated[
-    str | None,
-    typer.Option(
-        metavar="CONDITION", help='wait until this holds, as in "servo.status.position[2] > 1.2"'
-    ),
-]
-Before = Annotated[
-    str, typer.Option(metavar="TIME", help="with --when: simulated time to save before it")
-]
-After = Annotated[
-    str, typer.Option(metavar="TIME", help="with --when: simulated time to save after it")
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="with --when: CSV file; default: RACK-TICK.csv"),
-]
-Every = Annotated[
-    str,
-    typer.Option(metavar="TIME", help="simulated time between two lines; 0s: a line a message"),
-]
-
 
 def watch(
     rack: RackName,
-    signals: Signals,
-    when: When = None,
-    before: Before = "0.5s",
-    after: After = "1s",
-    out: Out = None,
-    every: Every = "0.1s",
+    signals: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SIGNAL...", help="as in servo.status.position[2], or a whole field"
+        ),
+    ],
+    when: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CONDITION",
+            help='wait until this holds, as in "servo.status.position[2] > 1.2"',
+        ),
+    ] = None,
+    before: Annotated[
+        str, typer.Option(metavar="TIME", help="with --when: simulated time to save before it")
+    ] = "0.5s",
+    after: Annotated[
+        str, typer.Option(metavar="TIME", help="with --when: simulated time to save after it")
+    ] = "1s",
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="with --when: CSV file; default: RACK-TICK.csv"),
+    ] = None,
+    every: Annotated[
+        str,
+        typer.Option(metavar="TIME", help="simulated time between two lines; 0s: a line a message"),
+    ] = "0.1s",
     as_json: Json = False,
 ) -> None:
     """Show signals of a running rack until its run is over, or until Ctrl-C.

@@ -54,6 +54,14 @@ def fitted(
     return table(head, rows, terminal_width(), dropped)
 
 
+def fitted_records(
+    records: Sequence[Mapping[str, object]], dropped: Sequence[str] = ()
+) -> Iterator[str]:
+    """Yield the lines of such a table, with a row for each record, at least one, and a column for
+    each key."""
+    return fitted([*records[0]], [[*map(str, one.values())] for one in records], dropped)
+
+
 def grid(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
@@ -174,9 +182,9 @@ def decimal(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def figure(found: Mapping[str, Any] | None, key: str, digits: int = 3) -> str:
+def figure(found: Mapping[str, Any] | None, key: str) -> str:
     """Return one figure of a distribution; "-" where there is none."""
-    return "-" if found is None else decimal(found[key], digits)
+    return "-" if found is None else decimal(found[key])
 
 
 def ms(time_ns: float | None) -> str:

@@ -16,6 +16,7 @@ from rack.backplane.operator_table import (
     RequestEntry,
     RequestStage,
 )
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import read_stored
 from rack.boards.config.commands import asked, request, takes
@@ -30,7 +31,6 @@ from rack.tools.console.tables import fitted
 from rack.tools.live.holds import resume_command
 from rack.tools.live.newest import Newest
 from rack.tools.live.replies import LastCycle, Replies, Reply, answering
-from rack.tools.live.watched import LocalRack
 
 SILENT_S = 5.0
 """Time without a tick after which a wait is given up."""
@@ -44,8 +44,8 @@ GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 class LiveDesk:
     """The desk of one rack."""
 
-    def __init__(self, rack: LocalRack) -> None:
-        self._segment = rack.segment
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
         self._config = read_stored(self._segment.config)
         levels = PublishedRack.of_rack(self._segment).levels
         self._levels = {name: one for name, one in levels.items() if one.commands}

@@ -23,7 +23,7 @@ from rack.tools.console.tables import console, decimal, grid
 from rack.tools.live.holds import is_news
 from rack.tools.live.host_side import EntryRow, HostRow
 from rack.tools.live.network import ExportRow, ImportRow, PeerRow
-from rack.tools.live.snapshot import DEAD, LOST, Snapshot, TaskProgress, TaskRow
+from rack.tools.live.snapshot import DEAD, LOST, Snapshot, TaskRow
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -196,8 +196,9 @@ class RackView:
             is_long = len(hold.line) > width
             shown = hold.line.replace("; to release", "\n  to release") if is_long else hold.line
             yield Text(shown, style=HELD)
-        if snapshot.progress is not None:
-            yield Text(_progress(snapshot.progress))
+        if (at := snapshot.progress) is not None:
+            actions = f"{at.actions_done}/{at.actions}"
+            yield Text(f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}")
 
 
 def _cell(column: str, value: Any) -> str:
@@ -271,12 +272,6 @@ def _style(column: str, text: str) -> str:
     if column == "state":
         return STATES.get(text.partition(" (")[0], "")
     return COUNTED.get(column, "") if text != "0" else ""
-
-
-def _progress(at: TaskProgress) -> str:
-    """Return the progress of the task, as one line."""
-    actions = f"{at.actions_done}/{at.actions}"
-    return f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}"
 
 
 def is_shown(event: Event) -> bool:

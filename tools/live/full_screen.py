@@ -22,6 +22,7 @@ from textual.widgets import Footer, Input, OptionList, Static, TabbedContent, Ta
 from textual.widgets.option_list import Option
 
 from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.faults import KINDS
 from rack.levels.timing.trace_times import lateness_ns
@@ -32,7 +33,6 @@ from rack.tools.live import display
 from rack.tools.live.desk import LiveDesk, goal_of
 from rack.tools.live.message_text import DROPPED, list_mailboxes
 from rack.tools.live.snapshot import RackMonitor, Snapshot
-from rack.tools.live.watched import LocalRack
 
 LOOK_S = 0.2
 LATE_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
@@ -72,10 +72,9 @@ class RackScreen(App[None]):
         *(Binding(str(number), f"pane({number})", show=False) for number in (1, 2, 3, 4)),
     ]
 
-    def __init__(self, rack: LocalRack, has_ended: Callable[[], bool]) -> None:
+    def __init__(self, segment: Segment, has_ended: Callable[[], bool]) -> None:
         super().__init__()
-        segment = rack.segment
-        self._rack = rack
+        self._segment = segment
         self._has_ended = has_ended
         self._monitor = RackMonitor(segment, keeps_longest=True)
         self._alarms = AlarmWatch(segment)
@@ -113,7 +112,7 @@ class RackScreen(App[None]):
 
     def _look(self) -> None:
         """Show the rack as it is now."""
-        if self._rack.segment.run_is_over or self._has_ended():
+        if self._segment.run_is_over or self._has_ended():
             self.exit()
             return
         snapshot = self._monitor.look()
@@ -139,7 +138,7 @@ class RackScreen(App[None]):
         return Text(" > ").join(levels)
 
     def _mailboxes(self, snapshot: Snapshot) -> RenderableType:
-        rows = list_mailboxes(self._rack.segment)
+        rows = list_mailboxes(self._segment)
         cells = [[*map(str, row.values())] for row in rows]
         return grid([*rows[0]], cells, self.size.width - GAP, DROPPED)
 
@@ -236,10 +235,10 @@ class RackScreen(App[None]):
                 if kind in OWN_PROCESS:
                     raise Failure(f"{kind}: needs a process of its own: rack inject")
                 values = dict(word.partition("=")[::2] for word in given)
-                live = LiveRack(self._rack.segment)
+                live = LiveRack(self._segment)
                 fault = {"board": board, "kind": kind, **values}
                 return str(live.inject(fault, wait=False)["message"])
             case [level, what, *goal]:
                 command = {"level": level, "what": what, **goal_of(what, goal)}
-                return LiveDesk(self._rack).give(command, wait=False).line
+                return LiveDesk(self._segment).give(command, wait=False).line
         raise Failure(f"'{' '.join(words)}': permitted: LEVEL WHAT [GOAL], {INJECT} BOARD KIND ...")

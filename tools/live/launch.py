@@ -212,15 +212,9 @@ def run_rack(
             others=others.ends(),
             failed=failed,
         )
-        return _end_log(log, result)
-
-
-def _end_log(log: EventLog, result: RunResult) -> RunResult:
-    """Write the end of a run; return its result, which fails without all events."""
-    log.end(asdict(result))
-    if log.has_failed:
-        return replace(result, recording="events.jsonl ends before the run")
-    return result
+        log.end(asdict(result))
+        cut_off = replace(result, recording="events.jsonl ends before the run")
+        return cut_off if log.has_failed else result
 
 
 def _viewer(port: int) -> News:
@@ -272,7 +266,7 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
     # Here, not above: its libraries would delay the launch.
     from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recording import Recording
-    from rack.tools.recording.run_files import tally
+    from rack.tools.recording.run_files import find_missing, tally
 
     try:
         retention = Retention.of(segment)
@@ -281,7 +275,7 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
         if retention is None or left is None:
             missing = Recording(folder).missing(segment)
         else:
-            missing = left.missing(segment)
+            missing = find_missing(segment, left.taken, left.lost)
             if not missing and (absent := retention.absent(segment, left.kept, ticks)):
                 first, last = absent[0]
                 return f"ticks {first:,} to {last:,} had to be kept, and are not there", {}

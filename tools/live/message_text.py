@@ -12,7 +12,7 @@ from rack.tools.console.answer import Document
 from rack.tools.console.tables import fitted
 from rack.tools.live.signals import cell
 from rack.tools.recording.parquet import HEAD
-from rack.tools.recording.signal import Signal
+from rack.tools.recording.signal import signals_of
 
 DROPPED = ("bytes", "message", "protocol", "readers")
 """Columns of the list of mailboxes that a narrow terminal leaves out, in this order."""
@@ -41,7 +41,7 @@ class MessageText:
     def __init__(self, box: MailboxSpec, clock_ns: int) -> None:
         self._box = box
         self._clock_ns = clock_ns
-        self._signals = [*Signal.all([box]).values()]
+        self._signals = signals_of(box)
 
     def document(self, row: np.ndarray, tick: int) -> Document:
         """Return a message, a row of the mailbox's ring, as a document, as of `tick`."""
@@ -50,10 +50,7 @@ class MessageText:
             "mailbox": self._box.name,
             **{name: int(row[name]) for name in HEAD},
             "age_ticks": tick - int(row["tick"]),
-            "fields": {
-                signal.name.removeprefix(f"{self._box.name}."): signal.plain(message)[0]
-                for signal in self._signals
-            },
+            "fields": {".".join(signal.path): signal.plain(message)[0] for signal in self._signals},
         }
 
     def lines(self, document: Document) -> list[str]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 from rack.tools.live.desk import LiveDesk
 from rack.tools.live.stepper import Stepper
-from rack.tools.live.watched import LocalRack
 
 
 class Pause(NamedTuple):
@@ -19,15 +19,14 @@ class Pause(NamedTuple):
     levels: list[str]
 
 
-def pause(rack: LocalRack) -> Pause:
+def pause(segment: Segment) -> Pause:
     """Pause a rack, and return when it is held, or its arm at rest.
 
     Raises `Failure` where no level is above all others that take a hold, or it is refused.
     """
-    segment = rack.segment
     if segment.words[System.LOCKSTEP]:
         return Pause(Stepper(segment).hold(), [])
-    desk = LiveDesk(rack)
+    desk = LiveDesk(segment)
     levels = desk.highest("", "hold")
     if len(levels) != 1:
         found = ", ".join(levels) or "none"
@@ -39,17 +38,16 @@ def pause(rack: LocalRack) -> Pause:
     return Pause(reply.done, levels)
 
 
-def resume(rack: LocalRack) -> list[str]:
+def resume(segment: Segment) -> list[str]:
     """Let a paused rack go on; return the levels that were held. Raises `Failure` when it is not
     paused."""
-    segment = rack.segment
     words = segment.words
     levels: list[str] = []
     if words[System.LOCKSTEP]:
         is_paused = words[System.HOLD_AT] > 0
         Stepper(segment).let_go()
     else:
-        desk = LiveDesk(rack)
+        desk = LiveDesk(segment)
         levels = desk.highest("hold")
         is_paused = bool(levels)
         for level in levels:

@@ -101,17 +101,17 @@ class Strip:
             for tick, values in rows
             if tick <= last
         ]
-        newest: dict[str, list[Any]] = {}
+        names = {
+            mailbox: [signal.name for signal in self.signals if signal.mailbox == mailbox]
+            for mailbox in self._rows
+        }
+        newest: dict[str, Any] = {}
         table: dict[int, list[Any]] = {}
         for tick, mailbox, values in sorted(changes, key=lambda change: change[0]):
-            newest[mailbox] = values
+            newest.update(zip(names[mailbox], values, strict=True))
             if tick >= first:
-                table[tick] = self._row(newest)
+                table[tick] = [newest.get(signal.name) for signal in self.signals]
         return [*table.items()]
-
-    def _row(self, newest: dict[str, list[Any]]) -> list[Any]:
-        values = {name: iter(own) for name, own in newest.items()}
-        return [next(values.get(signal.mailbox, iter(())), None) for signal in self.signals]
 
     def time_s(self, tick: int) -> float:
         """Return the simulated time of a tick, s."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import fitted
+from rack.tools.console.tables import fitted_records
 from rack.tools.live.snapshot import RackMonitor
 
 LOOK_S = 0.001
@@ -27,8 +27,7 @@ class Stepped:
     def lines(self) -> Iterator[str]:
         """Yield the same as readable text."""
         yield f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s"
-        rows = [[*level.values()] for level in self.levels]
-        yield from fitted(["level", "state", "row", "reason"], rows)
+        yield from fitted_records(self.levels)
 
 
 class Stepper:

@@ -1,26 +1,12 @@
-"""A running rack to look at and to command."""
+"""Repeated looks at a running rack."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from typing import Self
 
 from rack.backplane.segment import Segment
 from rack.tools.console.interrupt import INTERRUPT
-
-
-class LocalRack:
-    """A rack on this machine, in a context. Raises `SegmentError` when there is none."""
-
-    def __init__(self, rack: str) -> None:
-        self.segment = Segment.attach(rack)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.segment.close()
 
 
 def looks(segment: Segment, look_s: float) -> Iterator[bool]:

@@ -13,22 +13,6 @@ from rack.tools.console.parameters import Json
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 YEAR = 365
 
-Folder = Annotated[
-    Path, typer.Argument(metavar="DIR", help="folder of the set; made if it does not exist")
-]
-For = Annotated[
-    list[str],
-    typer.Option(
-        "--for",
-        metavar="NAME[=ADDRESS,...]",
-        help=(
-            "rack, or person, that gets a certificate, with the addresses at which others reach it;"
-            " repeatable"
-        ),
-    ),
-]
-Days = Annotated[int, typer.Option(metavar="N", min=1, max=3650, help="validity, days")]
-
 
 @app.callback()
 def lan() -> None:
@@ -36,7 +20,24 @@ def lan() -> None:
 
 
 @app.command()
-def certificates(folder: Folder, names: For, days: Days = YEAR, as_json: Json = False) -> None:
+def certificates(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="folder of the set; made if it does not exist")
+    ],
+    names: Annotated[
+        list[str],
+        typer.Option(
+            "--for",
+            metavar="NAME[=ADDRESS,...]",
+            help=(
+                "rack, or person, that gets a certificate, with the addresses at which others"
+                " reach it; repeatable"
+            ),
+        ),
+    ],
+    days: Annotated[int, typer.Option(metavar="N", min=1, max=3650, help="validity, days")] = YEAR,
+    as_json: Json = False,
+) -> None:
     """Make a set of certificates for tests: an authority, and a pair for each name.
 
     Racks know each other by name: the common name of a certificate is the name of the rack, and

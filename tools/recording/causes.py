@@ -25,7 +25,7 @@ from rack.boards.config.schema import LAN
 from rack.tools.recording.divergence import UnlikeMessage, common_ticks, row_of, unlike_messages
 from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import Signal, mailbox_of
+from rack.tools.recording.signal import Signal, mailbox_of, signals_of
 
 ClueKind = Literal["fault", "died", "command", "demand", "late", "skipped", "config", "outside"]
 EVENTS: Mapping[str | None, ClueKind] = {
@@ -148,7 +148,7 @@ class Divergence:
             return
         if here["visible_at"] != there["visible_at"]:
             yield InBoth("visible_at", int(here["visible_at"]), int(there["visible_at"]))
-        for signal in Signal.all([box]).values():
+        for signal in signals_of(box):
             yield from _unlike_signal(signal, here["message"][None], there["message"][None])
         if here["basis"] != there["basis"]:
             yield InBoth("basis", int(here["basis"]), int(there["basis"]))

@@ -8,6 +8,7 @@ by core. A core that runs at a lower frequency computes longer; cpufreq shows it
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -113,12 +114,11 @@ class CoreMeter:
 def _counts() -> dict[int, int]:
     """Return steal by core, in the kernel's ticks; empty where the kernel does not count it."""
     lines = [line.split() for line in STAT.read_text().splitlines()]
-    cores = [
-        line
+    return {
+        int(line[0].removeprefix("cpu")): int(line[STEAL])
         for line in lines
-        if line[0].startswith("cpu") and line[0] != "cpu" and len(line) > STEAL
-    ]
-    return {int(line[0].removeprefix("cpu")): int(line[STEAL]) for line in cores}
+        if re.fullmatch(r"cpu\d+", line[0]) and len(line) > STEAL
+    }
 
 
 def _frequencies() -> Iterator[tuple[int, float]]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import COMMAND_ID
 from rack.backplane.operator_table import Request
 from rack.boards.classes import find_class
@@ -42,7 +42,13 @@ def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str
             continue
         boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in ports}
         for box in boxes.values():
-            _check(box, ran.get(box.name), recording, asked)
+            needed = _type_of(box)
+            there = _type_of(ran[box.name]) if box.name in ran else "no such mailbox"
+            if there != needed:
+                raise Failure(f"{asked}: {box.name}: {there}; needed: {needed}", 2)
+            if recording.kept:
+                raise Failure(f"{asked}: {recording.kept_text}", 2)
+            _check_whole(box, recording, asked)
         found[task.task] = {port: _rows(recording, box, ports[port]) for port, box in boxes.items()}
     if not found:
         raise Failure(f"{asked}: '{config.name}' has no adapter", 2)
@@ -55,11 +61,10 @@ def recorded_commands(recording: Recording) -> tuple[Request, ...]:
 
     Raises `Failure` if the recording lacks some.
     """
-    layout = recording.layout
-    commanded = _issued(recording, layout)
+    commanded = _issued(recording)
     if commanded and recording.kept:
         raise Failure(f"--from {recording.folder}: {recording.kept_text}", 2)
-    for known in requests(recording.rack_config, layout):
+    for known in requests(recording.rack_config, recording.layout):
         # Issued at its tick, or later in real time: the same may have been commanded before it.
         later = (r for r in commanded if r.tick >= known.tick)
         given = (r for r in later if replace(r, tick=known.tick) == known)
@@ -75,39 +80,27 @@ def commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
     Raises `Failure` if the recording lacks some.
     """
     end = next((end for _, end in recording.kept if tick < end), None)
-    issued = _issued(recording, recording.layout)
+    issued = _issued(recording)
     return tuple(one for one in issued if tick <= one.tick and (end is None or one.tick < end))
 
 
-def _issued(recording: Recording, layout: Layout) -> list[Request]:
+def _issued(recording: Recording) -> list[Request]:
     """Return what the clock issued, in its order. Raises `Failure` if the recording lacks some."""
+    layout = recording.layout
     found: list[tuple[int, int, Request]] = []
     for box in layout.mailboxes:
         if box.writer != CLOCK or box.name not in recording.mailboxes:
             continue
         _check_whole(box, recording, f"--from {recording.folder}")
-        messages = recording.messages(box)
+        rows = recording.rows(box.name)
+        messages = rows["message"]
         ids = messages[COMMAND_ID].tolist()
         # The clock numbers commands when it issues them.
         messages[COMMAND_ID] = 0
-        for tick, number, message in zip(
-            recording.signal(box.name, "tick").tolist(), ids, messages, strict=True
-        ):
+        for tick, number, message in zip(rows["tick"].tolist(), ids, messages, strict=True):
             found.append((tick, number, Request(layout.index(box.name), message.tobytes(), tick)))
     found.sort(key=lambda command: command[:2])
     return [request for _, _, request in found]
-
-
-def _check(
-    box: MailboxSpec, recorded: MailboxSpec | None, recording: Recording, asked: str
-) -> None:
-    needed = _type_of(box)
-    found = "no such mailbox" if recorded is None else _type_of(recorded)
-    if found != needed:
-        raise Failure(f"{asked}: {box.name}: {found}; needed: {needed}", 2)
-    if recording.kept:
-        raise Failure(f"{asked}: {recording.kept_text}", 2)
-    _check_whole(box, recording, asked)
 
 
 def _type_of(box: MailboxSpec) -> str:
@@ -123,8 +116,8 @@ def _rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> Rows:
     """Return the messages of a mailbox as `rack.boards.wiring` has them."""
     if box.name not in recording.mailboxes:
         return []
-    ticks = recording.signal(box.name, "tick").tolist()
-    bases = recording.signal(box.name, "basis").tolist()
-    contents = [message.tobytes() for message in recording.messages(box)]
-    rows = list(zip(ticks, bases, contents, strict=True))
+    rows = [
+        (int(row["tick"]), int(row["basis"]), row["message"].tobytes())
+        for row in recording.rows(box.name)
+    ]
     return [row for at, row in enumerate(rows) if is_sent or not at or row[2] != rows[at - 1][2]]

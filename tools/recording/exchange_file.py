@@ -7,7 +7,7 @@ clock when it was written. Events are a channel of their own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from heapq import merge
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from rack.backplane.layout import MailboxSpec
 from rack.tools.console.answer import Document
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import Signal
+from rack.tools.recording.signal import signals_of
 
 EVENTS = "events"
 EVENT_SCHEMA = {
@@ -80,26 +80,20 @@ def _schema(box: MailboxSpec) -> Document:
         "serial": {"type": "integer", "description": "of the message, rising by one"},
         "tick": {"type": "integer", "description": "release of the cycle that wrote it"},
     }
-    for signal in Signal.all([box]).values():
-        column = signal.column
-        field = _of_shape(signal.json_type, column.shape)
-        field["description"] = f"{column.meaning} ({signal.unit})".removesuffix(" ()")
-        head[".".join(column.path)] = field
+    for signal in signals_of(box):
+        field: Document = {"type": signal.json_type}
+        for _ in signal.shape:
+            field = {"type": "array", "items": field}
+        field["description"] = f"{signal.spec.meaning} ({signal.unit})".removesuffix(" ()")
+        head[".".join(signal.path)] = field
     return {"type": "object", "properties": head}
-
-
-def _of_shape(kind: str, shape: Sequence[int]) -> Document:
-    found: Document = {"type": kind}
-    for _ in shape:
-        found = {"type": "array", "items": found}
-    return found
 
 
 def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[ChannelMessage]:
     """Yield the messages of a mailbox, oldest first."""
     rows = recording.rows(box.name)
-    signals = [*Signal.all([box]).values()]
-    names = ["serial", "tick", *(".".join(signal.column.path) for signal in signals)]
+    signals = signals_of(box)
+    names = ["serial", "tick", *(".".join(signal.path) for signal in signals)]
     clock_ns = recording.layout.clock_ns
     wall_ns = recording.launch.wall_offset_ns
     for first in range(0, len(rows), BLOCK):

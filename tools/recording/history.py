@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -31,7 +32,7 @@ def misses(recording: Recording) -> list[Document]:
     found = []
     for task in recording.layout.tasks:
         found += _misses_of(task, recording.trace(task.name))
-        done = recording.ended.get("tasks", {}).get(task.name, {}).get("done")
+        done = recording.counts(task.name).get("done")
         if done is None:
             # The end is not recorded, or was by an earlier version.
             continue
@@ -112,26 +113,21 @@ def fired_rows(recording: Recording) -> dict[str, list[Document]]:
     for mailbox in recording.mailboxes:
         if not {"table", "row", "fired"} <= recording.fields(mailbox):
             continue
-        ticks = recording.signal(mailbox, "tick")
-        row = recording.signal(mailbox, "row")
-        texts = recording.signal(mailbox, "table"), recording.signal(mailbox, "fired")
-        cycles: dict[tuple[str, int, str], list[int]] = {}
-        for tick, key in zip(
-            ticks.tolist(), zip(texts[0], row.tolist(), texts[1], strict=True), strict=True
-        ):
-            cycles.setdefault(key, [0, tick])[0] += 1
-        tick_s = recording.layout.clock_ns * 1e-9
+        columns = ("table", "row", "fired")
+        rows = [*zip(*(recording.signal(mailbox, name).tolist() for name in columns), strict=True)]
+        times_s = recording.signal(mailbox, "tick") * recording.layout.clock_ns * 1e-9
+        # Backwards, so that the earliest time of each row stays.
+        first_s = dict(zip(reversed(rows), reversed(times_s.tolist()), strict=True))
         found[mailbox.removesuffix(".status")] = [
             {
                 "table": table,
                 "row": number,
                 "name": name,
                 "cycles": count,
-                "first_s": round(first * tick_s, 6),
+                "first_s": round(first_s[table, number, name], 6),
             }
-            for (table, number, name), (count, first) in sorted(
-                cycles.items(), key=lambda item: item[1][1]
-            )
+            # In the order in which they fired first.
+            for (table, number, name), count in Counter(rows).items()
         ]
     return found
 

@@ -106,29 +106,19 @@ class CyclesFile:
         self._writer.close()
 
 
-class SignalTables:
-    """signals/, being written; what a killed recorder has left there is replaced."""
-
-    def __init__(self, folder: Path, layout: Layout) -> None:
-        if folder.exists():
-            rmtree(folder)
-        self._tables = {
-            mailbox.name: _SignalTable(folder / TABLE.format(mailbox.name), mailbox, layout)
-            for mailbox in layout.timed
-        }
-
-    def add(self, mailbox: str, rows: np.ndarray) -> None:
-        """Add rows of a mailbox's ring, shape (rows,), at least one."""
-        self._tables[mailbox].add(rows)
-
-    def close(self) -> None:
-        """Finish the tables."""
-        for table in self._tables.values():
-            table.close()
+def signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
+    """Return the tables of signals/, by mailbox; what a killed recorder has left there is
+    replaced."""
+    if folder.exists():
+        rmtree(folder)
+    return {
+        mailbox.name: SignalTable(folder / TABLE.format(mailbox.name), mailbox, layout)
+        for mailbox in layout.timed
+    }
 
 
-class _SignalTable:
-    """The table of a mailbox, a folder of parts."""
+class SignalTable:
+    """The table of a mailbox, being written: a folder of parts."""
 
     def __init__(self, folder: Path, mailbox: MailboxSpec, layout: Layout) -> None:
         folder.mkdir(parents=True)
@@ -140,7 +130,7 @@ class _SignalTable:
             pa.field(TIME, pa.float64(), metadata={"unit": "s"}),
             *(pa.field(name, pa.uint64() if name == "chain" else pa.int64()) for name in HEAD),
         ]
-        self._schema = pa.schema([*head, *(column.field for column in self._columns)])
+        self._schema = pa.schema([*head, *(column.arrow_field for column in self._columns)])
         self._parts = 0
         self._begin_part()
 
@@ -151,13 +141,13 @@ class _SignalTable:
             self._folder / PART.format(self._parts),
             self._schema,
             compression="zstd",
-            use_dictionary=[column.label for column in self._columns if column.kind[1] == "S"],
+            use_dictionary=[column.label for column in self._columns if column.is_text],
             write_statistics=["tick"],
             write_page_checksum=True,
         )
 
     def add(self, rows: np.ndarray) -> None:
-        """Add rows of the mailbox's ring."""
+        """Add rows of the mailbox's ring, shape (rows,), at least one."""
         self._waiting.append(rows)
         if (
             sum(map(len, self._waiting)) >= MESSAGE_ROWS
@@ -190,18 +180,21 @@ class _SignalTable:
 
 @dataclass(frozen=True)
 class Column:
-    """One field of a mailbox, a column of its table: `name` is `<mailbox>.<path>`.
+    """A field of a mailbox's messages, a column of its table.
 
-    `shape` is () for a single value, otherwise that of one row's list.
+    Attributes:
+        name: Mailbox, groups and field, as in `servo.status.position`.
+        mailbox: Name of the mailbox.
+        path: Names of the groups that hold the field, and of the field.
+        shape: Shape of the field in a message, () for a single value.
+        spec: The field.
     """
 
     name: str
+    mailbox: str
     path: tuple[str, ...]
-    kind: str
     shape: tuple[int, ...]
-    unit: str
-    values: tuple[tuple[str, int], ...]  # names and numbers of an enum
-    meaning: str
+    spec: FieldSpec
 
     @property
     def label(self) -> str:
@@ -210,15 +203,19 @@ class Column:
         return f"message.{name}" if name in (TIME, *HEAD) else name
 
     @property
-    def field(self) -> pa.Field:
-        """The column's Arrow field; shape and unit are in its metadata."""
-        element = pa.string() if self.kind[1] == "S" else pa.from_numpy_dtype(np.dtype(self.kind))
-        arrow = pa.list_(element, prod(self.shape)) if self.shape else element
-        return pa.field(
-            self.label, arrow, metadata={"shape": encode_json(self.shape), "unit": self.unit}
-        )
+    def is_text(self) -> bool:
+        """Whether it is text."""
+        return self.spec.kind[1] == "S"
 
-    def of(self, messages: np.ndarray) -> np.ndarray:
+    @property
+    def arrow_field(self) -> pa.Field:
+        """The column's Arrow field; shape and unit are in its metadata."""
+        element = pa.string() if self.is_text else pa.from_numpy_dtype(np.dtype(self.spec.kind))
+        arrow = pa.list_(element, prod(self.shape)) if self.shape else element
+        metadata = {"shape": encode_json(self.shape), "unit": self.spec.unit}
+        return pa.field(self.label, arrow, metadata=metadata)
+
+    def values(self, messages: np.ndarray) -> np.ndarray:
         """Return the field in a block of messages, shape (rows, *shape): a view."""
         for key in self.path:
             messages = messages[key]
@@ -226,10 +223,8 @@ class Column:
 
     def array(self, messages: np.ndarray) -> pa.Array:
         """Return the column of a block of messages, shape (rows,)."""
-        flat = np.ascontiguousarray(self.of(messages)).reshape(-1)
-        values = pa.array(
-            np.strings.decode(flat, "ascii", "replace") if self.kind[1] == "S" else flat
-        )
+        flat = np.ascontiguousarray(self.values(messages)).reshape(-1)
+        values = pa.array(np.strings.decode(flat, "ascii", "replace") if self.is_text else flat)
         if not self.shape:
             return values
         return pa.FixedSizeListArray.from_arrays(values, prod(self.shape))
@@ -250,5 +245,4 @@ def _columns(
         if field.fields:
             yield from _columns(mailbox, inner, shape, field.fields)
         else:
-            name = ".".join((mailbox, *inner))
-            yield Column(name, inner, field.kind, shape, field.unit, field.values, field.meaning)
+            yield Column(".".join((mailbox, *inner)), mailbox, inner, shape, field)

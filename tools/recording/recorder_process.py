@@ -52,6 +52,22 @@ def unwritable(folder: Path, error: OSError, tick: int) -> str:
     return f"{folder}: {why}: {ENDS} {tick}"
 
 
+class IdleLooks:
+    """Counts the looks in a row at which a process has used no processor time."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._used_ns = 0
+        self._count = 0
+
+    def look(self) -> int:
+        """Return the number of such looks, this one included; 0 if it has used some."""
+        used_ns = processor_ns(self._pid)
+        self._count = self._count + 1 if used_ns == self._used_ns else 0
+        self._used_ns = used_ns
+        return self._count
+
+
 class RecorderProcess:
     """A recorder for a rack that is about to run; it imports its libraries while the rack is being
     launched.
@@ -83,8 +99,7 @@ class RecorderProcess:
         self._has_begun = False
         self._is_gone = False
         self._is_killed = False
-        self._used_ns = 0
-        self._idle_looks = 0
+        self._idle = IdleLooks(self.pid)
 
     @property
     def pid(self) -> int:
@@ -136,11 +151,8 @@ class RecorderProcess:
         return lines
 
     def _kill_hung(self) -> None:
-        used_ns = processor_ns(self.pid)
-        self._idle_looks = self._idle_looks + 1 if used_ns == self._used_ns else 0
-        self._used_ns = used_ns
         bound = STOPPED_LOOKS if state_of(self.pid) in STOPPED else IDLE_LOOKS
-        if self._idle_looks > bound and not self._is_killed:
+        if self._idle.look() > bound and not self._is_killed:
             self._is_killed = True
             self._lines.append("the recorder is not responding: killed")
             self._process.kill()
@@ -251,6 +263,11 @@ def size_text(size: int, lasted_s: float) -> str:
     """Return the bytes of a recording, and of a second of it, as text."""
     rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
     return f"{size * 1e-6:.1f} MB{rate}"
+
+
+def recorded_line(folder: Path, lasted_s: float) -> str:
+    """Return where a run is recorded, and how large that is, as text."""
+    return f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
 
 
 def sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:

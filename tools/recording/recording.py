@@ -15,9 +15,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rack.backplane.layout import MailboxSpec, TaskSpec
+from rack.backplane.layout import TaskSpec
 from rack.backplane.mailbox.history import row_dtype
-from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import printable
 from rack.backplane.segment import Launch, Segment, layout_of
 from rack.backplane.trace import FIELDS, RECORD
@@ -43,7 +42,7 @@ from rack.tools.recording.parquet import (
     TABLE,
     columns_of,
 )
-from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, mend
+from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, find_missing, mend
 from rack.tools.recording.spool import STRETCHES, rings
 
 
@@ -110,7 +109,10 @@ class Recording:
             removed nothing."""
             self._gaps = json.loads(metadata[b"gaps"])
             self._lost_before_the_end = dict[str, int](json.loads(metadata[b"lost"]))
-        self._columns = {box.name: columns_of(box) for box in self.layout.mailboxes}
+        self._shapes = {
+            box.name: {column.label: column.shape for column in columns_of(box)}
+            for box in self.layout.mailboxes
+        }
         self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
         self.events = self._read_events()
         """The events of the run by tick, then its outcome."""
@@ -141,8 +143,7 @@ class Recording:
         parts = [path / PART.format(number) for number in range(1, count + 1)]
         if absent := [part.name for part in parts if not part.exists()]:
             raise Failure(f"{path}: {absent[0]} is missing", 2)
-        names = (*HEAD, *(column.label for column in self._columns[mailbox]))
-        return [self._opened(part, names) for part in parts]
+        return [self._opened(part, (*HEAD, *self._shapes[mailbox])) for part in parts]
 
     def _opened(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
         """Return an undamaged parquet file that has these columns. Raises `Failure`."""
@@ -254,20 +255,18 @@ class Recording:
     def missing(self, segment: Segment) -> dict[str, Missing]:
         """Return what the files lack of the rings of a rack that has ended, by task and by
         mailbox."""
-        found = {}
+        taken = {}
+        lost = dict(self.lost)
         for name, ring in rings(segment).items():
-            lost = self.lost[name]
             if name in self.cycles:
-                rows = len(self.cycles[name])
-                at = ring.before + lost + rows
+                taken[name] = ring.before + lost[name] + len(self.cycles[name])
             else:
                 serials = self.signal(name, "serial")
-                rows = len(serials)
-                at = int(serials[-1]) if rows else ring.before
-            # Messages that every reader rejects are absent and not lost; those lost last are
-            # overwritten.
-            found[name] = Missing.of(ring, at, min(lost, at - ring.before - rows))
-        return {name: missing for name, missing in found.items() if missing.rows}
+                taken[name] = int(serials[-1]) if len(serials) else ring.before
+                # Messages that every reader rejects are absent and not lost; those lost last are
+                # overwritten.
+                lost[name] = min(lost[name], taken[name] - ring.before - len(serials))
+        return find_missing(segment, taken, lost)
 
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
@@ -281,10 +280,14 @@ class Recording:
                 rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
 
+    def counts(self, task: str) -> Document:
+        """Return the counts of a task at the end of the run; empty where they are not recorded."""
+        return dict(self.ended.get("tasks", {}).get(task, {}))
+
     def place(self, task: TaskSpec) -> tuple[int, int]:
         """Return core and priority that a task obtained; those of the config where the run's end is
         not recorded."""
-        counted = self.ended.get("tasks", {}).get(task.name, {})
+        counted = self.counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)
 
     def trace(self, task: str) -> np.ndarray:
@@ -298,9 +301,7 @@ class Recording:
         "serial", "tick", "visible_at", "basis", "stamp_ns" and "chain" are fields of every mailbox;
         a field of its own with such a name is "message.<name>". Raises `KeyError`.
         """
-        shape: tuple[int, ...] = ()
-        if field not in HEAD:
-            shape = {column.label: column.shape for column in self._columns[mailbox]}[field]
+        shape = () if field in HEAD else self._shapes[mailbox][field]
         read = []
         for file in self._tables.get(mailbox, ()):
             with _naming(self.folder / SIGNALS / TABLE.format(mailbox)):
@@ -320,14 +321,6 @@ class Recording:
         has_reason = "reason" in self.fields(mailbox)
         return printable(str(self.signal(mailbox, "reason")[row])) if has_reason else ""
 
-    def messages(self, box: MailboxSpec) -> np.ndarray:
-        """Return every message of a mailbox as it was written, oldest first; `box` with its
-        fields."""
-        found = np.zeros(len(self.signal(box.name, "tick")), message_dtype(box.fields, box.size))
-        for column in columns_of(box):
-            column.of(found)[...] = self.signal(box.name, column.label)
-        return found
-
     def rows(self, name: str) -> np.ndarray:
         """Return what a recorder took from a ring, oldest first: trace records of a task, or
         messages of a mailbox."""
@@ -337,12 +330,13 @@ class Recording:
         found = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
         for field in HEAD:
             found[field] = self.signal(name, field)
-        found["message"] = self.messages(box)
+        for column in columns_of(box):
+            column.values(found["message"])[...] = self.signal(name, column.label)
         return found
 
     def fields(self, mailbox: str) -> set[str]:
         """Return the fields of a mailbox's messages."""
-        return {column.label for column in self._columns[mailbox]}
+        return {*self._shapes[mailbox]}
 
     @property
     def mailboxes(self) -> list[str]:

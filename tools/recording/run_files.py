@@ -8,18 +8,17 @@ from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from shutil import copyfile, rmtree
-from typing import IO, NamedTuple, Self
+from typing import IO, NamedTuple
 
 import numpy as np
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
-from rack.backplane.ring import Ring
 from rack.backplane.segment import Launch, Segment
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import CONFIG, PUBLISHED, SIGNALS, CyclesFile, SignalTables
+from rack.tools.recording.parquet import CONFIG, PUBLISHED, SIGNALS, CyclesFile, signal_tables
 from rack.tools.recording.recorder_process import LOOK_S, ORIGIN, SPOOL
 from rack.tools.recording.spool import (
     OPEN,
@@ -31,6 +30,7 @@ from rack.tools.recording.spool import (
     locked,
     read,
     read_head,
+    ring_dtypes,
     rings,
     stretch_files,
 )
@@ -50,14 +50,28 @@ class Missing(NamedTuple):
     rows: int
     written: int
 
-    @classmethod
-    def of(cls, ring: Ring, taken: int, lost: int) -> Self:
-        """Return it for the ring of a rack that has ended, from which `taken` records were taken,
-        and `lost` of them were not."""
-        ring.resume(taken)
-        written = taken - ring.before + ring.waiting
+
+def find_missing(
+    segment: Segment, taken: Mapping[str, int], lost: Mapping[str, int]
+) -> dict[str, Missing]:
+    """Return what a recording lacks of the rings of a rack that has ended.
+
+    Args:
+        segment: The rack.
+        taken: Number of the last record that was taken, by ring.
+        lost: Number of rows before it that are not in the recording, by ring.
+
+    Returns:
+        The rows missing, by task and by mailbox.
+    """
+    found = {}
+    for name, ring in rings(segment).items():
+        ring.resume(taken[name])
+        written = taken[name] - ring.before + ring.waiting
         left, overwritten = ring.drain()
-        return cls(lost + overwritten + len(left), written)
+        if rows := lost[name] + overwritten + len(left):
+            found[name] = Missing(rows, written)
+    return found
 
 
 class Tally:
@@ -70,7 +84,8 @@ class Tally:
 
     def __init__(self, layout: Layout, before: Mapping[str, int] | None = None) -> None:
         self.tasks = [task.name for task in layout.tasks]
-        self.lost = dict.fromkeys([*self.tasks, *(mailbox.name for mailbox in layout.timed)], 0)
+        self._dtypes = ring_dtypes(layout)
+        self.lost = dict.fromkeys(self._dtypes, 0)
         self.taken = {**self.lost, **(before or {})}
         self.rows = dict(self.lost)
         self.kept: list[tuple[int, int]] = []
@@ -85,7 +100,8 @@ class Tally:
             case StretchEnd():
                 self.end(part.tick)
             case Frame():
-                self.add(part.ring, part.unpack(), part.lost)
+                for block in part.unpack(self._dtypes):
+                    self.add(*block)
 
     def begin(self, stretch: StretchHead) -> None:
         """Go on with a stretch; others before it may have been removed."""
@@ -124,15 +140,6 @@ class Tally:
             first = self.kept[-1][0]
             self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN else tick
 
-    def missing(self, segment: Segment) -> dict[str, Missing]:
-        """Return what was written into the rings of a rack that has ended, and was lost or never
-        taken, by task and by mailbox."""
-        found = {
-            name: Missing.of(ring, self.taken[name], self.lost[name])
-            for name, ring in rings(segment).items()
-        }
-        return {name: missing for name, missing in found.items() if missing.rows}
-
 
 class RunFiles(Tally):
     """cycles.parquet and signals/ of a folder, being written.
@@ -153,7 +160,7 @@ class RunFiles(Tally):
         self._reached = dict.fromkeys(self.lost, (-1, 0))
         """Of each ring the newest tick, and the rows lost by then."""
         self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}", layout, launch)
-        self._signals = SignalTables(folder / f"{SIGNALS}{suffix}", layout)
+        self._signals = signal_tables(folder / f"{SIGNALS}{suffix}", layout)
 
     def begin(self, stretch: StretchHead) -> None:
         """Go on with a stretch: what is not there before it was removed, not lost."""
@@ -172,12 +179,13 @@ class RunFiles(Tally):
         if name in self.tasks:
             self._cycles.add(name, rows)
         elif len(rows):
-            self._signals.add(name, rows)
+            self._signals[name].add(rows)
 
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
         """Finish all files; the trace keeps what the machine did to its cores."""
         self.end()
-        self._signals.close()
+        for table in self._signals.values():
+            table.close()
         self._cycles.close(self.lost, cores, self.gaps, self.kept)
 
 
@@ -197,7 +205,7 @@ def mend(folder: Path) -> bool:
             return False
         layout, launch = read_head(file, path)
         files = RunFiles(folder, layout, launch, MENDED)
-        for part in read(file, folder, layout):
+        for part in read(file, folder):
             files.take(part)
         # Still locked: another process that opens this run waits until the files are in place.
         files.close()
@@ -212,7 +220,7 @@ def mend(folder: Path) -> bool:
 
 
 def tally(folder: Path) -> Tally | None:
-    """Return what a flight recorder has left in a folder, by the heads and checks of its frames;
+    """Return what a flight recorder has left in a folder, by the counts of its frames;
     None where none has. Raises `Failure` when it cannot be read."""
     path = folder / SPOOL
     if not path.is_file() or not (folder / STRETCHES).is_dir():
@@ -220,9 +228,10 @@ def tally(folder: Path) -> Tally | None:
     with path.open("rb") as file:
         layout, _ = read_head(file, path)
         found = Tally(layout)
-        for part in read(file, folder, layout):
+        for part in read(file, folder):
             if isinstance(part, Frame):
-                found.count(part.ring, part.length, part.lost)
+                for counts in part.counts:
+                    found.count(*counts)
             else:
                 found.take(part)
     found.end()

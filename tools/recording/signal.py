@@ -33,21 +33,21 @@ NEAREST = 3
 
 
 @dataclass(frozen=True)
-class Signal:
-    """Numbers, or text, in every message of a mailbox."""
+class Signal(Column):
+    """Numbers, or text, in every message of a mailbox: a field, or part of an array field.
 
-    name: str
-    mailbox: str
-    column: Column
-    index: tuple[int, ...]  # of an array field, as far as it is given
+    Attributes:
+        index: Indices into an array field, as far as they are given.
+    """
+
+    index: tuple[int, ...] = ()
 
     @classmethod
     def all(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
         """Return every whole field of these mailboxes by its name."""
+        columns = (column for box in boxes for column in columns_of(box))
         return {
-            column.name: cls(column.name, box.name, column, ())
-            for box in boxes
-            for column in columns_of(box)
+            one.name: cls(one.name, one.mailbox, one.path, one.shape, one.spec) for one in columns
         }
 
     @classmethod
@@ -59,27 +59,25 @@ class Signal:
         if found is None or found[1] not in known:
             raise _unknown("signal", text, known, boxes)
         whole = known[found[1]]
-        column = whole.column
         index = tuple(int(number) for number in re.findall(r"\d+", found[2]))
-        shape = column.shape[: len(index)]
+        shape = whole.shape[: len(index)]
         if len(shape) < len(index) or any(i >= n for i, n in zip(index, shape, strict=True)):
-            ends = "".join(f"[0 to {size - 1}]" for size in column.shape)
-            raise Failure(f"{text}: no such index; permitted: {column.name}{ends}", 2)
+            ends = "".join(f"[0 to {size - 1}]" for size in whole.shape)
+            raise Failure(f"{text}: no such index; permitted: {whole.name}{ends}", 2)
         return replace(whole, name=text, index=index)
 
     @property
     def unit(self) -> str:
         """Its unit; empty for counts, names and text."""
-        column = self.column
-        return "" if column.values or column.kind[1] == "S" or column.unit == "1" else column.unit
+        unit = self.spec.unit
+        return "" if self.spec.values or self.is_text or unit == "1" else unit
 
     @property
     def json_type(self) -> str:
         """The JSON type of one of its values."""
-        kind = np.dtype(self.column.kind).kind
-        if kind == "S" or self.column.values:
+        if self.is_text or self.spec.values:
             return "string"
-        return "number" if kind == "f" else "integer"
+        return "number" if np.dtype(self.spec.kind).kind == "f" else "integer"
 
     @property
     def head(self) -> str:
@@ -89,11 +87,12 @@ class Signal:
     @property
     def is_number(self) -> bool:
         """Whether it is a single number."""
-        return len(self.index) == len(self.column.shape) and self.column.kind[1] != "S"
+        return len(self.index) == len(self.shape) and not self.is_text
 
     def values(self, messages: np.ndarray) -> np.ndarray:
-        """Return it in each of these messages, shape (messages, *what is left of its own)."""
-        return self.part(self.column.of(messages))
+        """Return it in each of these messages, shape (messages, *what is left of its own): a
+        view."""
+        return self.part(super().values(messages))
 
     def part(self, values: np.ndarray) -> np.ndarray:
         """Return it out of the values of its whole field, (messages, *shape of the field)."""
@@ -108,9 +107,9 @@ class Signal:
 
     def named(self, values: np.ndarray) -> np.ndarray:
         """Return its values with names in place of the numbers that stand for them."""
-        if not self.column.values:
+        if not self.spec.values:
             return values
-        names = {number: name for name, number in self.column.values}
+        names = {number: name for name, number in self.spec.values}
         return np.asarray(np.vectorize(lambda number: names.get(number, number), "O")(values))
 
     def plain(self, messages: np.ndarray) -> list[Any]:
@@ -119,12 +118,17 @@ class Signal:
         values = self.values(messages)
         if values.dtype.kind == "S":
             values = np.vectorize(text_of, "O")(values)
-        elif self.column.values:
+        elif self.spec.values:
             values = self.named(values)
         elif values.dtype.kind == "f" and not np.isfinite(values).all():
             values = np.where(np.isfinite(values), values, np.array(None))
         found: list[Any] = values.tolist()
         return found
+
+
+def signals_of(box: MailboxSpec) -> list[Signal]:
+    """Return the fields of a mailbox in their order."""
+    return [*Signal.all([box]).values()]
 
 
 def mailbox_of(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
@@ -160,10 +164,10 @@ class Trigger:
             raise Failure(f'"{text}": not a condition; permitted: as in "{example}"', 2)
         signal = Signal.of(found[1], boxes)
         if not signal.is_number:
-            shape = list(signal.column.shape[len(signal.index) :])
+            shape = list(signal.shape[len(signal.index) :])
             what = f"numbers of shape {shape}" if shape else "text"
             raise Failure(f"{signal.name}: {what}; a condition needs a single number", 2)
-        names = dict(signal.column.values)
+        names = dict(signal.spec.values)
         try:
             number = names[found[3]] if found[3] in names else float(found[3])
         except ValueError:

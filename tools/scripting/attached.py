@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,6 +16,7 @@ import numpy as np
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import Segment
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure, as_failure
@@ -26,7 +27,6 @@ from rack.tools.live.folder import folder_of
 from rack.tools.live.replies import Reply
 from rack.tools.live.signals import SignalTap
 from rack.tools.live.snapshot import RackMonitor, Snapshot
-from rack.tools.live.watched import LocalRack
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.recording.signal import Signal, Trigger, mailbox_of
@@ -48,12 +48,11 @@ class AttachedRack:
 
     @as_failure()
     def __init__(self, rack: str) -> None:
-        self._rack = LocalRack(rack)
-        segment = self._segment = self._rack.segment
+        segment = self._segment = Segment.attach(rack)
         self._closing = ExitStack()
-        self._closing.enter_context(self._rack)
+        self._closing.enter_context(closing(segment))
         self._boxes = segment.layout.mailboxes
-        self._desk = LiveDesk(self._rack)
+        self._desk = LiveDesk(segment)
         self._monitor = RackMonitor(segment)
         self._alarms = AlarmWatch(segment)
         self._alarms.drain()
@@ -116,12 +115,12 @@ class AttachedRack:
     @as_failure()
     def pause(self) -> pausing.Pause:
         """Pause the rack: in lockstep between two ticks, in real time with the arm at rest."""
-        return pausing.pause(self._rack)
+        return pausing.pause(self._segment)
 
     @as_failure()
     def resume(self) -> None:
         """Let the paused rack go on."""
-        pausing.resume(self._rack)
+        pausing.resume(self._segment)
 
     @as_failure()
     def estop(self, reset: bool = False) -> None:

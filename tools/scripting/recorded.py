@@ -14,7 +14,7 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.live.continued import tick_in
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import Signal, mailbox_of
+from rack.tools.recording.signal import Signal, mailbox_of, signals_of
 from rack.tools.scripting.moment import RecordedMoment
 from rack.tools.timing.analysis.stored import newest_report
 
@@ -58,7 +58,7 @@ class RecordedRun:
     def to_pandas(self, mailbox: str) -> DataFrame:
         """Return a table of all messages of a mailbox, as `RecordedSignal.to_pandas` does."""
         box = mailbox_of(mailbox, self._recording.layout.mailboxes)
-        return _table([self.signals[name] for name in Signal.all([box])])
+        return _table([self.signals[signal.name] for signal in signals_of(box)])
 
 
 class RecordedSignals(dict[str, "RecordedSignal"]):
@@ -86,7 +86,7 @@ class RecordedSignal:
     def values(self) -> np.ndarray:
         """Its value in every message, (messages, *shape), in `unit`; states are numbers."""
         signal = self.signal
-        return signal.part(self._recording.signal(signal.mailbox, signal.column.label))
+        return signal.part(self._recording.signal(signal.mailbox, signal.label))
 
     @cached_property
     def ticks(self) -> np.ndarray:

@@ -37,7 +37,6 @@ from rack.tools.faults.ending import arm_of, levels_of, strikes
 from rack.tools.faults.live import LiveRack
 from rack.tools.live.desk import LiveDesk
 from rack.tools.live.snapshot import RackMonitor
-from rack.tools.live.watched import LocalRack
 from rack.tools.recording.spool import rings
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, named, wait_until
@@ -112,7 +111,7 @@ def looks(segment: Segment) -> dict[str, Callable[[], object]]:
     config = read_stored(segment.config)
     joints = config.joints
     ending = Ending(segment, None, 1000)
-    one = LocalRack(segment.rack)
+    one = Segment.attach(segment.rack)
     heartbeat = Heartbeat(segment)
     return {
         "monitor": lambda: RackMonitor(segment).look(),

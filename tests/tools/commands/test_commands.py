@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ import pytest
 from rack.backplane.segment import racks
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.cli import COMMANDS
 from rack.tools.console.interrupt import descendants
 from tests.processes import RACK, runs, wait_until
 from tests.shared_runs import small_run
@@ -110,16 +108,6 @@ def test_a_report_that_is_there_is_shown_without_any(
     rack("report", folder)
     assert imported("report", folder) == set()
     assert imported("report", folder, "--json") == set()
-
-
-def test_help_has_a_whole_line_for_every_command() -> None:
-    shown = rack("--help").stdout
-    assert "..." not in shown.partition("Commands:")[2]
-    for command, source, line in COMMANDS:
-        assert f"  {command} " in shown
-        assert line in shown
-        module, _, attribute = source.partition(":")
-        assert hasattr(import_module(module), attribute)
 
 
 @pytest.mark.slow

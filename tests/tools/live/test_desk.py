@@ -22,7 +22,6 @@ from rack.tools.console.answer import Failure
 from rack.tools.live import desk
 from rack.tools.live.desk import LiveDesk, goal_of
 from rack.tools.live.replies import Replies
-from rack.tools.live.watched import LocalRack
 from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, wait_until
@@ -141,7 +140,7 @@ def test_waiting_ends_at_its_time_out_and_the_command_stays_in_force(
     )
     still = f", not done; in force until: rack command {running} upper resume$"
     with pytest.raises(Failure, match=f"^timed out after 0 s: command .*{still}"):
-        LiveDesk(LocalRack(running)).give(
+        LiveDesk(Segment.attach(running)).give(
             {"level": "upper", "what": "hold"}, wait=True, timeout_s=0.0
         )
     assert rack("command", running, "upper", "resume").returncode == 0
@@ -190,7 +189,7 @@ def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None
         assert rack("command", running, "upper", "resume").returncode == 0
         assert process.wait(BOUND_S) == 0
     assert not OperatorTable(segment).leased()
-    assert LiveDesk(LocalRack(running)).highest("hold") == []
+    assert LiveDesk(Segment.attach(running)).highest("hold") == []
 
 
 @pytest.mark.slow
@@ -205,7 +204,7 @@ def test_a_paused_rack_goes_on_from_there(running: str) -> None:
         assert again.startswith(f"rack '{running}': held before tick {paused['tick']}; ")
     else:
         assert paused["levels"] == ["upper"]
-        assert LiveDesk(LocalRack(running)).highest("hold") == ["upper"]
+        assert LiveDesk(Segment.attach(running)).highest("hold") == ["upper"]
         tick = words[System.TICK]
         wait_until(lambda: words[System.TICK] > tick)
     done = rack("resume", running)
@@ -220,7 +219,7 @@ def test_a_paused_rack_goes_on_from_there(running: str) -> None:
 def test_a_level_that_does_a_command_of_its_operator_keeps_it_in_a_pause(
     running: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    desk = LiveDesk(LocalRack(running))
+    desk = LiveDesk(Segment.attach(running))
     in_force = {"upper": "goto", "lower": ""}
     monkeypatch.setattr(desk, "_in_force", in_force.get)
     assert (desk.highest("", "hold"), desk.highest("hold")) == (["lower"], [])
@@ -386,7 +385,7 @@ def test_a_clock_without_ticks_is_not_waited_for(
     # Launched and not started: there is a rack, and no clock yet.
     with Rack(load(path, [f"name={rack_name}"])):
         with pytest.raises(Failure, match="has not ticked for"):
-            LiveDesk(LocalRack(rack_name)).give({"level": "upper", "what": "hold"}, wait=False)
+            LiveDesk(Segment.attach(rack_name)).give({"level": "upper", "what": "hold"}, wait=False)
         assert OperatorTable(Segment.attach(rack_name)).waiting() == []
 
 

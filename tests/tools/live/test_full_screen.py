@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Awaitable, Callable, Iterator
+from contextlib import closing
 from html import unescape
 
 import pytest
@@ -15,7 +16,6 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import System
 from rack.tools.live.full_screen import RackScreen
-from rack.tools.live.watched import LocalRack
 from tests.processes import wait_until
 from tests.tools.command_line import BOUND_S, rack
 from tests.tools.live.test_desk import end, start
@@ -38,7 +38,7 @@ def on_screen(
     """Do something at the screen of a rack."""
 
     async def attached() -> None:
-        with LocalRack(name) as one:
+        with closing(Segment.attach(name)) as one:
             async with RackScreen(one, lambda: False).run_test(size=size) as pilot:
                 await act(pilot)
                 # As a user leaves: what is taken down without it may be looked at once more.

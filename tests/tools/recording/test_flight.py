@@ -27,7 +27,7 @@ from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import save, tally
+from rack.tools.recording.run_files import find_missing, save, tally
 from rack.tools.recording.spool import STRETCHES
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.viewer.parts import FILE
@@ -164,7 +164,7 @@ def what_lacks(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int
     assert left is not None
     assert keeping is not None
     absent = keeping.absent(segment, left.kept, segment.words[System.STOP_TICK])
-    return {*left.missing(segment)}, [tuple(ends) for ends in absent]
+    return {*find_missing(segment, left.taken, left.lost)}, [tuple(ends) for ends in absent]
 
 
 def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(

@@ -16,7 +16,7 @@ from rack.backplane.message import State
 from rack.boards.config import loads
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import Checksums, checked_line, read_line
-from rack.tools.recording.parquet import HEAD, SignalTables
+from rack.tools.recording.parquet import HEAD, signal_tables
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import TABLES
 from rack.tools.timing.analysis.analysis import Analysis
@@ -126,12 +126,13 @@ def test_a_field_named_like_a_column_of_every_mailbox_keeps_its_own_values(
     box = recording.layout.mailbox("servo.state")
     rows = recording.rows(box.name)
     rows["message"]["tick"] += 7
-    tables = SignalTables(recording.folder / "signals", recording.layout)
-    tables.add(box.name, rows)
-    tables.close()
+    tables = signal_tables(recording.folder / "signals", recording.layout)
+    tables[box.name].add(rows)
+    for table in tables.values():
+        table.close()
     Checksums(recording.folder).store(*TABLES)
     again = Recording(recording.folder)
-    assert np.array_equal(again.messages(box), rows["message"])
+    assert np.array_equal(again.rows(box.name)["message"], rows["message"])
     assert np.array_equal(
         again.signal(box.name, "tick") + 7, again.signal(box.name, "message.tick")
     )
@@ -150,12 +151,13 @@ def test_a_long_run_has_many_parts_which_are_one_table(
         shutil.copy(damaged / name, folder / name)
     # What a killed recorder has left is replaced.
     for _ in range(2):
-        signals = SignalTables(folder / "signals", recording.layout)
+        signals = signal_tables(folder / "signals", recording.layout)
         for box in recording.layout.timed:
             rows = recording.rows(box.name)
             for begin in range(0, len(rows), 16):
-                signals.add(box.name, rows[begin : begin + 16])
-        signals.close()
+                signals[box.name].add(rows[begin : begin + 16])
+        for table in signals.values():
+            table.close()
     Checksums(folder).store("config.toml", *TABLES)
     assert len([*(folder / TABLE).iterdir()]) > 10
     again = Recording(folder)

@@ -12,8 +12,7 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Field, MessageType
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
-from rack.tools.recording.parquet import columns_of
-from rack.tools.recording.signal import Signal, Trigger
+from rack.tools.recording.signal import Signal, Trigger, signals_of
 
 
 class Gait(IntEnum):
@@ -89,7 +88,7 @@ def test_a_text_is_shown_with_escapes_in_place_of_control_characters(messages: n
 
 
 def test_units_are_those_of_numbers() -> None:
-    units = {column.path[0]: Signal("", "", column, ()).unit for column in columns_of(BOX)}
+    units = {signal.path[0]: signal.unit for signal in signals_of(BOX)}
     assert units == {"gait": "", "speed": "m/s", "name": "", "legs": "rad"}
     heads = [Signal.of(f"walker.status.{name}", [BOX]).head for name in ("gait", "legs.angle[1]")]
     assert heads == ["walker.status.gait", "walker.status.legs.angle[1], rad"]

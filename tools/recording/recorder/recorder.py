@@ -15,7 +15,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rack.backplane.process import is_alive, processor_ns
+from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
@@ -25,7 +25,7 @@ from rack.tools.recording.cores import UNMEASURED, CoreMeter
 from rack.tools.recording.occasions import Retention
 from rack.tools.recording.parquet import PUBLISHED
 from rack.tools.recording.recorder.flight import FlightRecorder
-from rack.tools.recording.recorder_process import LOOK_S
+from rack.tools.recording.recorder_process import LOOK_S, IdleLooks
 from rack.tools.recording.run_files import TABLES, RunFiles, Tally
 from rack.tools.recording.spool import Spool, rings
 
@@ -126,13 +126,11 @@ class SafeSink:
         """Finish the sink, once it is open."""
         self._waiting.append(lambda sink: sink.close(tick, lost))
         until = time.monotonic() + self._patience_s
-        used_ns = 0
-        idle_looks = 0
-        while self._opening.is_alive() and time.monotonic() < until and idle_looks < OPENING_LOOKS:
+        idle = IdleLooks(os.getpid())
+        while self._opening.is_alive() and time.monotonic() < until:
             self._opening.join(min(LOOK_S, self._patience_s))
-            before_ns = used_ns
-            used_ns = processor_ns(os.getpid())
-            idle_looks = idle_looks + 1 if used_ns == before_ns else 0
+            if idle.look() >= OPENING_LOOKS:
+                break
         if self._opening.is_alive():
             self._tell(f"run.rrd is missing: {self._why_late}; 'rack replay' makes it")
         else:

@@ -165,7 +165,7 @@ def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
     period_ns = layout.clock_ns if is_lockstep else config.tick_ns
     entry = {
         **_about(task, layout),
-        **recording.ended.get("tasks", {}).get(task.name, {}),
+        **recording.counts(task.name),
         **task_times(task, cycles, period_ns, is_lockstep, stretches=stretches),
     }
     if task.role == "executor" and f"{task.board}.plan" in recording.mailboxes:
