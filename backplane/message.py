@@ -22,7 +22,7 @@ from difflib import get_close_matches
 from enum import IntEnum
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Self, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_type_hints
 
 import numpy as np
 
@@ -37,6 +37,7 @@ NOT_SENT = (
     " send it"
 )
 _SET = object.__setattr__
+B = TypeVar("B", bound="Message")
 _KINDS: Mapping[type, tuple[str, str]] = {
     bool: ("u1", "u"),
     int: ("i8", "iu"),
@@ -63,7 +64,7 @@ class Declaration:
     """What `field` says of a field of a message class; its name and type stand beside it."""
 
     kind: str | type[Message]
-    unit: str
+    unit: str | type[IntEnum]
     doc: str
     shape: tuple[int | str, ...]
     length: tuple[float, float] | None
@@ -93,7 +94,7 @@ def field(
     kind: str | type[Message] = "",
     *,
     doc: str,
-    unit: str = "",
+    unit: str | type[IntEnum] = "",
     shape: int | str | tuple[int | str, ...] = (),
     length: tuple[float, float] | None = None,
     default: Any = None,
@@ -105,8 +106,8 @@ def field(
             `i8` of an int, `u1` of a bool or an `IntEnum`, `S120` of a str); or a message class:
             the field is one such group or, with a shape, an array of them.
         doc: What it says.
-        unit: Its unit, "1" for a pure number; not given for a bool, a str, an enumeration and a
-            group.
+        unit: Its unit, "1" for a pure number, an `IntEnum` for an array of names; not given for a
+            bool, a str, an enumeration and a group.
         shape: Shape of an array, of integers and symbolic sizes ("joints").
         length: The least and the greatest length of a vector, or magnitude of a number, that is
             taken from another rack.
@@ -114,6 +115,20 @@ def field(
     """
     sizes = shape if isinstance(shape, tuple) else (shape,)
     return Declaration(kind, unit, doc, sizes, length, default)
+
+
+def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
+    """Return a message class whose fields a config decides: integers, and groups.
+
+    Args:
+        name: Of the message.
+        version: Of the message.
+        base: Class whose fields come first.
+        fields: What `field` returns, by name.
+    """
+    body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
+    made: type[B] = type(base)(name, (base,), body, version=version, message=name)
+    return made
 
 
 class _Slotted(type):
@@ -155,10 +170,14 @@ class Message(metaclass=_Slotted):
         for name, declaration in own.items():
             try:
                 if name.startswith("_") or hasattr(Message, name) or name not in hints:
-                    raise ValueError("permitted: annotated, no leading '_', no attribute of Message")
+                    raise ValueError(
+                        "permitted: annotated, no leading '_', no attribute of Message"
+                    )
                 fields[name] = declaration.named(name, hints[name])
             except (TypeError, ValueError) as error:
-                raise MailboxError(f"message class {cls.__name__}: field '{name}': {error}") from None
+                raise MailboxError(
+                    f"message class {cls.__name__}: field '{name}': {error}"
+                ) from None
         known_as = message or re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
         cls.message_type = MessageType(known_as, version, tuple(fields.values()))
 

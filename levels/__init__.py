@@ -3,11 +3,11 @@ level must do.
 
 - Write a level: `Executor`, `Planner`, with `Input`, `Ports`, `Program`, `Reading`, `Verdict`,
   `LevelContext`, `Pace`.
-- Declare messages: `MessageType`, `Field`, `command`, `status`, `Message`, `State`; the default
-  levels' messages are in `rack.levels.messages`, and their error codes in `Error`.
+- Declare messages: `Message`, `Command`, `Status`, `field`, `State`; the default levels' messages
+  are in `rack.levels.messages`, and their error codes in `Error`.
 - Declare parameters: `Table`, `Positive`, `Finite`, `read_params`, `LIVE`, `set_live`; arm and
   cell: `RobotConfig`, `SceneConfig`.
-- Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OPERATOR_COMMAND`, `ANSWER`,
+- Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OperatorCommand`, `AnsweringStatus`,
   `RESTS_ON`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
 - Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 from rack.backplane.exports import on_first_use
 
 if TYPE_CHECKING:
-    from rack.backplane.message import Field, Message, MessageType, State, command, status
+    from rack.backplane.message import Command, Message, State, Status, field
     from rack.backplane.watch.alarms import Alarm
     from rack.levels.errors import LevelError, ProgramError, Refused, RobotError
     from rack.levels.level import (
@@ -44,12 +44,12 @@ if TYPE_CHECKING:
     )
     from rack.levels.messages import Error
     from rack.levels.operator import (
-        ANSWER,
-        OPERATOR_COMMAND,
         RESTS_ON,
+        AnsweringStatus,
         Commands,
         Goal,
         Operation,
+        OperatorCommand,
         Orders,
     )
     from rack.levels.tables import (
@@ -64,17 +64,16 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "ANSWER",
     "LIVE",
-    "OPERATOR_COMMAND",
     "RESTS_ON",
     "Alarm",
+    "AnsweringStatus",
+    "Command",
     "Commands",
     "Demand",
     "Error",
     "Executor",
     "Fault",
-    "Field",
     "Finding",
     "Finite",
     "Goal",
@@ -82,8 +81,8 @@ __all__ = [
     "LevelContext",
     "LevelError",
     "Message",
-    "MessageType",
     "Operation",
+    "OperatorCommand",
     "Orders",
     "Pace",
     "Planner",
@@ -97,15 +96,15 @@ __all__ = [
     "RobotError",
     "SceneConfig",
     "State",
+    "Status",
     "Table",
     "Verdict",
-    "command",
+    "field",
     "read_params",
     "set_live",
-    "status",
 ]
 _PLACES = {
-    "rack.backplane.message": ("Field", "Message", "MessageType", "State", "command", "status"),
+    "rack.backplane.message": ("Command", "Message", "State", "Status", "field"),
     "rack.backplane.watch.alarms": ("Alarm",),
     "rack.levels.errors": ("LevelError", "ProgramError", "Refused", "RobotError"),
     "rack.levels.level": (
@@ -124,12 +123,12 @@ _PLACES = {
     ),
     "rack.levels.messages": ("Error",),
     "rack.levels.operator": (
-        "ANSWER",
-        "OPERATOR_COMMAND",
         "RESTS_ON",
+        "AnsweringStatus",
         "Commands",
         "Goal",
         "Operation",
+        "OperatorCommand",
         "Orders",
     ),
     "rack.levels.tables": (

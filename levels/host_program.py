@@ -30,7 +30,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import MessageType
+from rack.backplane.message import Message
 from rack.levels.level import Input, LevelContext, Program
 from rack.levels.tables import Table
 
@@ -94,7 +94,7 @@ class HostProgram:
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     """Ports that it reads: mailboxes of a bus adapter, one per port, as in "below.motion"."""
-    outputs: ClassVar[Mapping[str, MessageType]] = {}
+    outputs: ClassVar[Mapping[str, type[Message]]] = {}
     """Ports that it writes, each the mailbox `<board>.<port>`, for a bus adapter to read."""
     params: ClassVar[type[Table] | None] = None
     """Keys of `[host.<name>.params]`, checked before the launch; None: unchecked, the program reads

@@ -89,7 +89,7 @@ from pydantic import ValidationError, model_validator
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.queue import ALL
-from rack.backplane.message import Message, MessageType
+from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.compiled import preload
@@ -119,7 +119,7 @@ __all__ = [
 class Input(NamedTuple):
     """A port that a level reads."""
 
-    type: MessageType
+    message: type[Message]
     source: str
     """A mailbox ("world.model"), or relative to the level: "above.command", "below.status",
     "own.plan". A config may wire the port elsewhere."""
@@ -134,7 +134,7 @@ class Output(NamedTuple):
     """A port that a level writes; its type alone for one of every cycle that rests on the input of
     the same name."""
 
-    type: MessageType
+    message: type[Message]
     cycles: int = 1
     """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, counted from
     the board's phase, so that readers released then find it fresh. If that cycle is missed, the
@@ -306,7 +306,7 @@ class Executor(LevelSection, ABC):
     to cycle; each is written to its mailbox `<board>.<port>` at the end of every cycle.
     """
 
-    outputs: ClassVar[Mapping[str, MessageType | Output]] = {}
+    outputs: ClassVar[Mapping[str, type[Message] | Output]] = {}
     faults: ClassVar[tuple[type, ...]] = ()
     """Classes of steps by which faults can strike what the level drives: see
     `rack.levels.faults`."""
@@ -358,7 +358,7 @@ class Executor(LevelSection, ABC):
         return cls.names(params)
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that
         classes declare."""
         return MadePorts()
@@ -378,7 +378,7 @@ class Planner(LevelSection, ABC):
     is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
     """
 
-    output: ClassVar[MessageType | Output]
+    output: ClassVar[type[Message] | Output]
 
     def wanted(self, read: Ports, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is

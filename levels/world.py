@@ -10,7 +10,7 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, each
 from rack.levels.level import Executor, Input, LevelContext, Ports
-from rack.levels.messages import SCENE, WORLD_MODEL
+from rack.levels.messages import Scene, WorldState
 from rack.levels.tables import Positive, Table, read_params
 
 
@@ -35,8 +35,8 @@ class WorldModel(Executor):
     board. Until it receives a scene, a restarted board publishes its last model, with its age.
     """
 
-    inputs = {"scene": Input(SCENE, "servo.scene"), "last": Input(WORLD_MODEL, "own.model")}
-    outputs = {"model": WORLD_MODEL}
+    inputs = {"scene": Input(Scene, "servo.scene"), "last": Input(WorldState, "own.model")}
+    outputs = {"model": WorldState}
     params = WorldParams
 
     def __init__(self, context: LevelContext) -> None:

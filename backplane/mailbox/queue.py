@@ -35,23 +35,20 @@ from struct import Struct
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.message import Field, Message, MessageType, copied, sending
+from rack.backplane.message import Message, copied, field, sending
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
-TAKEN = MessageType(
-    "queue_taken",
-    1,
-    (
-        Field(
-            "taken",
-            "i8",
-            "1",
-            "serial of the newest message that the reader of the queue has taken; 0: none",
-        ),
-        Field("unread", "i8", "1", "messages that this reader could see, and left in the queue"),
-    ),
-)
+
+class QueueTaken(Message, version=1):
+    """How far the reader of a queue has come, written by that reader."""
+
+    taken: int = field(
+        unit="1", doc="serial of the newest message that the reader of the queue has taken; 0: none"
+    )
+    unread: int = field(unit="1", doc="messages that this reader could see, and left in the queue")
+
+
 # Plain integers for the hot path.
 _PUT_POSITION = Struct("@2q").pack_into
 ALL = 1 << 62
@@ -65,7 +62,7 @@ def taken_name(queue: str) -> str:
 
 def is_position(spec: MailboxSpec) -> bool:
     """Say whether a mailbox holds the position of a queue's reader: the board itself writes it."""
-    return spec.message == TAKEN.name
+    return spec.message == QueueTaken.message_type.name
 
 
 def queues_of(layout: Layout) -> list[MailboxSpec]:

@@ -18,7 +18,8 @@ from pydantic import BaseModel
 
 from rack.backplane.errors import ClockError
 from rack.backplane.layout import Protocol, Role
-from rack.backplane.message import MessageType
+from rack.backplane.message import Message
+from rack.backplane.message_type import MessageType
 from rack.boards.classes import find_class
 from rack.boards.config.schema import (
     LAN,
@@ -32,7 +33,7 @@ from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
 from rack.levels.level import Executor, Input, Output, Planner, Program
-from rack.levels.operator import OPERATOR_COMMAND, Commands
+from rack.levels.operator import Commands, OperatorCommand
 
 OWN_OPERATOR = "own.operator"
 LevelClass = type[Executor] | type[Planner] | type[HostProgram]
@@ -132,7 +133,7 @@ def declared_ports(config: RackConfig, place: TaskPlace) -> TaskPorts:
 
 
 def with_made_ports(
-    config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]
+    config: RackConfig, ports: TaskPorts, types: Mapping[str, type[Message]]
 ) -> TaskPorts:
     """Add the ports that the config makes: their types may be those of other mailboxes."""
     if not issubclass(ports.kind, Executor):
@@ -169,12 +170,12 @@ def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
         executor = find_class(wanted, Executor)
         return executor, _outputs(executor.outputs)
     planner = find_class(wanted, Planner)
-    if not isinstance(output := getattr(planner, "output", None), MessageType | Output):
-        raise LookupError("the class has no 'output', the message type of its plan")
+    if (output := getattr(planner, "output", None)) is None:
+        raise LookupError("the class has no 'output', the message class of its plan")
     return planner, _outputs({"plan": output})
 
 
-def _outputs(given: Mapping[str, MessageType | Output]) -> dict[str, Output]:
+def _outputs(given: Mapping[str, type[Message] | Output]) -> dict[str, Output]:
     return {
         port: kind if isinstance(kind, Output) else Output(kind) for port, kind in given.items()
     }
@@ -227,7 +228,9 @@ class Wiring:
                 self.writers.setdefault(mailbox, (ports, ports.outputs[port]))
             for port, mailbox in ports.sources:
                 self.reading.setdefault(mailbox, []).append((ports, port))
-        self.operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
+        self.operated = {
+            f"{board}.operator": OperatorCommand.message_type for board in commandable(config)
+        }
         """The message types of operators' mailboxes."""
         self.from_host = {mailbox for ports in self.hosts for mailbox in ports.writes.values()}
         """The mailboxes that host boards write."""
@@ -257,7 +260,7 @@ class Wiring:
     def _connected(self) -> dict[TaskPlace, TaskPorts]:
         config = self.config
         declared = dict[TaskPlace, TaskPorts]()
-        types = dict[str, MessageType]()
+        types = dict[str, type[Message]]()
         for place in (*config.tasks(), *config.hosts()):
             try:
                 declared[place] = declared_ports(config, place)
@@ -269,7 +272,9 @@ class Wiring:
         while len(types) != before:
             before = len(types)
             types = {
-                box: p.outputs[port].type for p in found.values() for port, box in p.writes.items()
+                box: p.outputs[port].message
+                for p in found.values()
+                for port, box in p.writes.items()
             }
             found = {
                 place: with_made_ports(config, ports, types) for place, ports in declared.items()
@@ -305,7 +310,9 @@ class Wiring:
     def type_of(self, mailbox: str) -> MessageType | None:
         """Return the message type of a mailbox; None if it does not exist."""
         return (
-            self.writers[mailbox][1].type if mailbox in self.writers else self.operated.get(mailbox)
+            self.writers[mailbox][1].message.message_type
+            if mailbox in self.writers
+            else self.operated.get(mailbox)
         )
 
     def names(self) -> str:

@@ -37,13 +37,13 @@ from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Field, Message, MessageType, State, status
+from rack.backplane.message import Message, State, Status, field, make_message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.host.entries import (
-    ENTRY,
     NEVER,
+    AdapterEntry,
     AdapterParams,
     Crossing,
     EntryConfig,
@@ -81,12 +81,12 @@ class BusAdapter(Adapter):
         self._statuses: Replayed | None = None
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return a port to read and one to write for each entry, and the status."""
         entries = AdapterParams.entries_of(params)
         known = {port: entry for port, entry in entries.items() if entry.source in types}
         inputs = {
-            port: Input(types.get(entry.source, ENTRY), entry.source)
+            port: Input(types.get(entry.source, AdapterEntry), entry.source)
             for port, entry in entries.items()
         }
         # A message that is passed once must not be sampled; to host boards a bridge writes by
@@ -226,8 +226,7 @@ class HostTurn(ReleasedTask):
             block[Block.LOST] = tick + 1
 
 
-def status_of(entries: Mapping[str, EntryConfig]) -> MessageType:
-    """Return the type of a bridge's status: one group of counts for each entry."""
-    return status(
-        "adapter_status", 1, *(Field(port, ENTRY, "1", f"entry {port}") for port in entries)
-    )
+def status_of(entries: Mapping[str, EntryConfig]) -> type[Status]:
+    """Return the class of a bridge's status: one group of counts for each entry."""
+    groups = {port: field(AdapterEntry, doc=f"entry {port}") for port in entries}
+    return make_message("adapter_status", 1, Status, groups)

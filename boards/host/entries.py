@@ -14,12 +14,11 @@ from pydantic import ValidationError, model_validator
 from rack.backplane.mailbox.host_ring import HostReader
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer, open_writer
-from rack.backplane.message import MessageType, fill_counts
+from rack.backplane.message import Message, field, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block
 from rack.boards.wiring import Rows
-from rack.levels.fields import number, tick
 from rack.levels.level import Ports
 from rack.levels.tables import LAST_TICK, Table
 
@@ -28,20 +27,27 @@ PORT = re.compile(r"[a-z][a-z0-9_]*")
 RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clear", "copy_from")
 """Names that the status of a bridge needs for itself."""
 
-ENTRY = MessageType(
-    "adapter_entry",
-    1,
-    (
-        number("passed", "messages passed to the other side"),
-        number("refused", "messages refused: damaged, forged, or not what its type permits"),
-        number("superseded", "messages that a newer one overtook before the exchange"),
-        number("full", "messages that the host board could not send, since too many waited"),
-        number("waiting", "messages that wait for the next cycles"),
-        tick("arrived", "tick at which the newest message reached the other side; -1: none yet"),
-        tick("age", "time since that message was written; -1: none yet"),
-    ),
-)
-"""One entry, in the status of its bridge."""
+
+class AdapterEntry(Message, version=1):
+    """One entry, in the status of its bridge."""
+
+    passed: int = field("u4", unit="1", doc="messages passed to the other side")
+    refused: int = field(
+        "u4", unit="1", doc="messages refused: damaged, forged, or not what its type permits"
+    )
+    superseded: int = field(
+        "u4", unit="1", doc="messages that a newer one overtook before the exchange"
+    )
+    full: int = field(
+        "u4", unit="1", doc="messages that the host board could not send, since too many waited"
+    )
+    waiting: int = field("u4", unit="1", doc="messages that wait for the next cycles")
+    arrived: int = field(
+        unit="tick", doc="tick at which the newest message reached the other side; -1: none yet"
+    )
+    age: int = field(unit="tick", doc="time since that message was written; -1: none yet")
+
+
 _COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
 
 
@@ -100,7 +106,8 @@ class AdapterParams(Table):
 
 @dataclass
 class EntryCount:
-    """The counts of one entry: the fields of `ENTRY`. `written`: tick at which the newest message
+    """The counts of one entry: the fields of `AdapterEntry`. `written`: tick at which the newest
+    message
     was written."""
 
     passed: int = 0

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.boards.host.adapter import STATUS
 from rack.boards.host.entries import NEVER, Replayed
@@ -18,7 +17,7 @@ from rack.boards.lan.entries import Import
 from rack.boards.lan.peers import NONE, Peers
 from rack.boards.wiring import Entries, Rows
 from rack.levels.level import Ports
-from rack.levels.peer import PEER, Presence, peer_port
+from rack.levels.peer import PeerPresence, Presence, peer_port
 
 
 class ReplayedNetwork:
@@ -74,7 +73,7 @@ def _sent(segment: Segment, board: str, port: str, rows: Rows) -> Replayed:
 
 def _seen(rack: str, rows: Rows) -> Iterator[tuple[int, str, bool]]:
     """Yield when a rack came, and when it was lost."""
-    message = Message(PEER.dtype({}))
+    message = PeerPresence.zeros({})
     before = int(Presence.AWAITED)
     for tick, _, content in rows:
         message.raw[:] = content

@@ -20,7 +20,7 @@ from rack.boards.exchange import EXCHANGE, ExchangeRecord
 from rack.boards.run.task import ClockGuard, Task, in_turn, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ArmState
 
 _DEMANDS = tuple(Demand)
 
@@ -50,7 +50,7 @@ class VirtualControlLoop(Task):
             (
                 writer.message
                 for writer in self.outputs.writers.values()
-                if writer.spec.message == ARM_STATE.name
+                if writer.spec.message == ArmState.message_type.name
             ),
             None,
         )

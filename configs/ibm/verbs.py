@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input
-from rack.levels.systems.joint_boards.messages import ARM_STATUS
+from rack.levels.systems.joint_boards.messages import ArmStatus
 from rack.levels.systems.trajectory.commands import Motions
-from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, RequestEnd
+from rack.levels.systems.trajectory.messages import MotionRequest, MotionStatus, RequestEnd
 
 PRESSED = 6.0
 """Change of a joint's torque that counts as touch, N m."""
@@ -34,10 +34,10 @@ class Assembly(HostProgram):
     """Puts a block on the table, and the other one on it; how high that is, only touch tells."""
 
     inputs = {
-        "motion": Input(MOTION_STATUS, "below.motion"),
-        "sensors": Input(ARM_STATUS, "below.sensors"),
+        "motion": Input(MotionStatus, "below.motion"),
+        "sensors": Input(ArmStatus, "below.sensors"),
     }
-    outputs = {"requests": MOTION_REQUEST}
+    outputs = {"requests": MotionRequest}
 
     def run(self, bus: Bus) -> None:
         """Carry both blocks."""

@@ -8,13 +8,13 @@ from rack.backplane.message import Message, State
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import (
-    MOVE_COMMAND,
-    MOVE_PLAN,
-    MOVE_STATUS,
-    PRIMITIVE_STATUS,
-    TASK_COMMAND,
     Error,
+    MoveCommand,
+    MovePlan,
+    MoveStatus,
+    PrimitiveStatus,
     SegmentKind,
+    TaskCommand,
     Verb,
 )
 from rack.levels.operator import (
@@ -22,7 +22,7 @@ from rack.levels.operator import (
     BELOW_LOST,
     HELD_FROM_ABOVE,
     HOLDABLE,
-    OPERATOR_COMMAND,
+    OperatorCommand,
     Orders,
 )
 from rack.levels.tables import read_params
@@ -37,16 +37,16 @@ class ElementalMoveExecutor(Executor):
     """
 
     inputs = {
-        "command": Input(TASK_COMMAND, "above.command"),
-        "status": Input(PRIMITIVE_STATUS, "below.status"),
-        "plan": Input(MOVE_PLAN, "own.plan"),
-        "last_command": Input(MOVE_COMMAND, "own.command"),
-        "last_status": Input(MOVE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(TaskCommand, "above.command"),
+        "status": Input(PrimitiveStatus, "below.status"),
+        "plan": Input(MovePlan, "own.plan"),
+        "last_command": Input(MoveCommand, "own.command"),
+        "last_status": Input(MoveStatus, "own.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
     # The status first: a board killed between the two finds done moves still in its window, and
     # removes them again.
-    outputs = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
+    outputs = {"status": MoveStatus, "command": MoveCommand}
     commands = HOLDABLE
     params = ElementalMoveParams
 

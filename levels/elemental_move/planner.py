@@ -14,16 +14,16 @@ from rack.levels.elemental_move.pipeline import ElementalMoveParams, SegmentWind
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports
 from rack.levels.messages import (
-    MOVE_COMMAND,
-    MOVE_PLAN,
-    MOVE_STATUS,
-    PRIMITIVE_STATUS,
-    SCENE,
-    TASK_COMMAND,
-    WORLD_MODEL,
     Error,
+    MoveCommand,
+    MovePlan,
+    MoveStatus,
+    PrimitiveStatus,
+    Scene,
     SegmentKind,
+    TaskCommand,
     Verb,
+    WorldState,
 )
 from rack.levels.motion.path import Path
 from rack.levels.planning.moves import Move, Situation, read_window
@@ -72,14 +72,14 @@ class ElementalMovePlanner(Planner):
     """
 
     inputs = {
-        "command": Input(TASK_COMMAND, "above.command"),
-        "status": Input(MOVE_STATUS, "own.status"),
-        "handed_down": Input(MOVE_COMMAND, "own.command"),
-        "primitive": Input(PRIMITIVE_STATUS, "below.status"),
-        "scene": Input(SCENE, "servo.scene"),
-        "world": Input(WORLD_MODEL, "world.model"),
+        "command": Input(TaskCommand, "above.command"),
+        "status": Input(MoveStatus, "own.status"),
+        "handed_down": Input(MoveCommand, "own.command"),
+        "primitive": Input(PrimitiveStatus, "below.status"),
+        "scene": Input(Scene, "servo.scene"),
+        "world": Input(WorldState, "world.model"),
     }
-    output = MOVE_PLAN
+    output = MovePlan
     params = ElementalMoveParams
 
     @classmethod
@@ -269,6 +269,6 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 
 def grip_of(row: int, tool: Pose, seen: Message) -> Pose:
-    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a SCENE or a
-    WORLD_MODEL."""
+    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a Scene or a
+    WorldState."""
     return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])

@@ -8,17 +8,17 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, LevelContext, Ports
 from rack.levels.messages import (
-    JOINT_SET_POINT,
-    MOVE_COMMAND,
-    PRIMITIVE_STATUS,
-    SERVO_STATUS,
-    TRAJECTORY,
-    WORLD_MODEL,
     Error,
+    JointCommand,
+    MoveCommand,
+    PrimitiveStatus,
     SegmentKind,
+    ServoStatus,
+    TrajectoryPlan,
+    WorldState,
 )
 from rack.levels.motion import path as paths
-from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLDABLE, OperatorCommand, Orders
 from rack.levels.planning import collision
 from rack.levels.primitive.guard import Guard, Sight
 from rack.levels.primitive.path_motion import JointSetPoint
@@ -59,15 +59,15 @@ class PrimitiveExecutor(Executor):
     """
 
     inputs = {
-        "command": Input(MOVE_COMMAND, "above.command"),
-        "status": Input(SERVO_STATUS, "below.status"),
-        "plan": Input(TRAJECTORY, "own.plan"),
-        "world": Input(WORLD_MODEL, "world.model"),
-        "last_command": Input(JOINT_SET_POINT, "own.command"),
-        "last_status": Input(PRIMITIVE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(MoveCommand, "above.command"),
+        "status": Input(ServoStatus, "below.status"),
+        "plan": Input(TrajectoryPlan, "own.plan"),
+        "world": Input(WorldState, "world.model"),
+        "last_command": Input(JointCommand, "own.command"),
+        "last_status": Input(PrimitiveStatus, "own.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": JOINT_SET_POINT, "status": PRIMITIVE_STATUS}
+    outputs = {"command": JointCommand, "status": PrimitiveStatus}
     commands = HOLDABLE
     preloads = (collision, paths)
     params = PrimitiveParams

@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.level import Input, LevelContext, Planner, Ports, Reading
-from rack.levels.messages import MOVE_COMMAND, PRIMITIVE_STATUS, TRAJECTORY, Error
+from rack.levels.messages import Error, MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory, make_trajectory
 from rack.levels.primitive.segment import MotionSegment, SegmentFault, read_segment, window
@@ -23,10 +23,10 @@ class PrimitivePlanner(Planner):
     a path was held."""
 
     inputs = {
-        "command": Input(MOVE_COMMAND, "above.command"),
-        "status": Input(PRIMITIVE_STATUS, "own.status"),
+        "command": Input(MoveCommand, "above.command"),
+        "status": Input(PrimitiveStatus, "own.status"),
     }
-    output = TRAJECTORY
+    output = TrajectoryPlan
     params = PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:

@@ -29,7 +29,7 @@ from rack.levels.level import (
     Ports,
     Reading,
 )
-from rack.levels.messages import SCENE, Error
+from rack.levels.messages import Error, Scene
 from rack.levels.operator import Operation, Orders
 from rack.levels.robot.cell import cell_of, sensed_by
 from rack.levels.robot.dynamics import Terms
@@ -42,7 +42,7 @@ from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Cause, Reaction, Stopping
 from rack.levels.tables import read_params
 
-SCENES = Output(SCENE, cycles=8)
+SCENES = Output(Scene, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
 
 

@@ -11,8 +11,8 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.level import Input, LevelContext, Misfits, Ports, Verdict
-from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SERVO_PLAN, SERVO_STATUS
-from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Goal, Operation
+from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
+from rack.levels.operator import DRIVES, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import control, curves, reference
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams, SetPointLaw
@@ -34,12 +34,12 @@ class ServoExecutor(ArmDriver):
     """
 
     inputs = {
-        "command": Input(JOINT_SET_POINT, "above.command"),
-        "plan": Input(SERVO_PLAN, "own.plan"),
-        "before": Input(ARM_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(JointCommand, "above.command"),
+        "plan": Input(ServoPlan, "own.plan"),
+        "before": Input(ArmState, "own.state"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENES}
+    outputs = {"status": ServoStatus, "state": ArmState, "scene": SCENES}
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),

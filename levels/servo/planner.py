@@ -8,7 +8,7 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import mat_vec, transposed_mat_vec
 from rack.levels.level import Input, LevelContext, Planner, Ports
-from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.levels.messages import JointCommand, Scene, ServoPlan, ServoStatus
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
 
@@ -17,11 +17,11 @@ class ServoPlanner(Planner):
     """Plans the inertia at the set point due next, with the object held, at every release."""
 
     inputs = {
-        "command": Input(JOINT_SET_POINT, "above.command"),
-        "status": Input(SERVO_STATUS, "own.status"),
-        "scene": Input(SCENE, "own.scene"),
+        "command": Input(JointCommand, "above.command"),
+        "status": Input(ServoStatus, "own.status"),
+        "scene": Input(Scene, "own.scene"),
     }
-    output = SERVO_PLAN
+    output = ServoPlan
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -40,7 +40,7 @@ class ServoPlanner(Planner):
         return True
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Fill a `SERVO_PLAN`."""
+        """Fill a `ServoPlan`."""
         command: Message = read.command.value
         held = -1
         payload = Payload(0.0, np.zeros(3))

@@ -8,26 +8,29 @@ from typing import Annotated
 
 from pydantic import Field as Parameter
 
-from rack.backplane.message import Message, MessageType, State, status
+from rack.backplane.message import Message, State, Status, field
 from rack.backplane.process import compute_until
-from rack.levels.fields import tick
 from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
 from rack.levels.tables import Table, read_params
 
-FIGURE_PLAN = MessageType(
-    "figure_plan",
-    1,
-    (
-        tick("made_at", "release that the plan answers"),
-        tick("cycle", "cycle of the executor whose status the plan rests on; -1: none was there"),
-    ),
-)
-FIGURE_STATUS = status(
-    "figure_status",
-    1,
-    tick("cycle", "release of this cycle"),
-    tick("plan", "release that the plan in force answers; -1: there is none yet"),
-)
+
+class FigurePlan(Message, version=1):
+    """A plan of the level of the paper's Gantt charts."""
+
+    made_at: int = field(unit="tick", doc="release that the plan answers")
+    cycle: int = field(
+        unit="tick", doc="cycle of the executor whose status the plan rests on; -1: none was there"
+    )
+
+
+class FigureStatus(Status, version=1):
+    """Status of the level of the paper's Gantt charts."""
+
+    cycle: int = field(unit="tick", doc="release of this cycle")
+    plan: int = field(
+        unit="tick", doc="release that the plan in force answers; -1: there is none yet"
+    )
+
 
 NS_PER_MS = 1e6
 Milliseconds = Annotated[float, Parameter(ge=0, le=10_000, allow_inf_nan=False)]
@@ -46,7 +49,7 @@ class FigureParams(Table):
 class FigureLoop(Executor):
     """Computes for X of processor time in every cycle: a level without a planner."""
 
-    outputs = {"status": FIGURE_STATUS}
+    outputs = {"status": FigureStatus}
     params = FigureParams
     plan = -1
     """Release that the plan in force answers; -1: there is none."""
@@ -72,7 +75,7 @@ class FigureLoop(Executor):
 class FigureExecutor(FigureLoop):
     """Reports which plan is in force, too."""
 
-    inputs = {"plan": Input(FIGURE_PLAN, "own.plan")}
+    inputs = {"plan": Input(FigurePlan, "own.plan")}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Report, with the plan in force, then compute."""
@@ -84,8 +87,8 @@ class FigureExecutor(FigureLoop):
 class FigurePlanner(Planner):
     """Computes for P of processor time, then begins the next plan: one is always wanted."""
 
-    inputs = {"status": Input(FIGURE_STATUS, "own.status")}
-    output = FIGURE_PLAN
+    inputs = {"status": Input(FigureStatus, "own.status")}
+    output = FigurePlan
     params = FigureParams
 
     def __init__(self, context: LevelContext) -> None:

@@ -6,13 +6,13 @@ from typing import ClassVar
 
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, LevelContext, Ports, Program, Reading
-from rack.levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
+from rack.levels.messages import Error, MoveStatus, TaskCommand, TaskPlan, TaskStatus
 from rack.levels.operator import (
     BELOW_LOST,
     HELD_FROM_ABOVE,
-    OPERATOR_COMMAND,
     Goal,
     Operation,
+    OperatorCommand,
     Orders,
     answered,
 )
@@ -28,13 +28,13 @@ class TaskExecutor(Executor):
     """
 
     inputs = {
-        "status": Input(MOVE_STATUS, "below.status"),
-        "plan": Input(TASK_PLAN, "own.plan"),
-        "last_command": Input(TASK_COMMAND, "own.command"),
-        "last_status": Input(TASK_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "status": Input(MoveStatus, "below.status"),
+        "plan": Input(TaskPlan, "own.plan"),
+        "last_command": Input(TaskCommand, "own.command"),
+        "last_status": Input(TaskStatus, "own.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": TASK_COMMAND, "status": TASK_STATUS}
+    outputs = {"command": TaskCommand, "status": TaskStatus}
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
@@ -91,7 +91,7 @@ class TaskExecutor(Executor):
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
     def _plan_to_follow(self, read: Ports, write: Ports, tick: int) -> Message:
-        """Return the `TASK_PLAN` of the present actions; one of zeros if there is none yet."""
+        """Return the `TaskPlan` of the present actions; one of zeros if there is none yet."""
         plan: Message = read.plan.value
         return plan
 

@@ -11,7 +11,7 @@ import numpy as np
 from rack.backplane.message import Message, copied
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Planner, Ports, Program
-from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
+from rack.levels.messages import MOVES, Error, ServoStatus, TaskPlan, TaskStatus, WorldState
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
@@ -32,12 +32,12 @@ class TaskPlanner(Planner):
     """
 
     inputs = {
-        "status": Input(TASK_STATUS, "own.status"),
-        "made": Input(TASK_PLAN, "own.plan"),
-        "servo": Input(SERVO_STATUS, "servo.status"),
-        "world": Input(WORLD_MODEL, "world.model"),
+        "status": Input(TaskStatus, "own.status"),
+        "made": Input(TaskPlan, "own.plan"),
+        "servo": Input(ServoStatus, "servo.status"),
+        "world": Input(WorldState, "world.model"),
     }
-    output = TASK_PLAN
+    output = TaskPlan
     params: ClassVar[type[TaskParams]] = TaskParams
     program: ClassVar[type[Program] | None] = TaskConfig
 

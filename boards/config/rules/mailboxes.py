@@ -63,7 +63,7 @@ def reads(wiring: Wiring) -> Mistakes:
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
             place = _wired_at(ports, port)
-            wanted = ports.inputs[port].type
+            wanted = ports.inputs[port].message.message_type
             if not wiring.is_known(mailbox):
                 yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names()}")
             elif (
@@ -179,7 +179,8 @@ def exchange(wiring: Wiring) -> Mistakes:
             elif entry.phase >= entry.every:
                 why = f"must be less than every; permitted: 0 to {entry.every - 1} cycles"
                 yield Mistake(f"{place}.phase", entry.phase, why)
-        if ports.outputs[EXCHANGE].type != exchange_message(ports.reads):
+        made = exchange_message(ports.reads).message_type
+        if ports.outputs[EXCHANGE].message.message_type != made:
             why = "the executor writes a mailbox of that name itself; rename its output"
             yield Mistake(f"board.{ports.task}.exchange", None, why)
 

@@ -2,20 +2,31 @@
 
 from time import monotonic
 
-from rack.backplane.message import Field, State, status
+from rack.backplane.message import State, Status, field
 from rack.levels.level import Executor, Input
-from rack.levels.messages import SERVO_STATUS
+from rack.levels.messages import ServoStatus
 
-SMOOTH = status("smooth_status", 1, Field("speed", "f8", "rad/s", "speed of the arm, smoothed"))
-RISES = status("rises_status", 1, Field("rises", "i8", "1", "how often the speed has risen"))
+
+class SmoothStatus(Status, version=1):
+    """The speed of the arm, smoothed."""
+
+    speed: float = field(unit="rad/s", doc="speed of the arm, smoothed")
+
+
+class RisesStatus(Status, version=1):
+    """How often the speed has risen."""
+
+    rises: int = field(unit="1", doc="how often the speed has risen")
+
+
 TIME_CONSTANT_S = 0.1
 
 
 class Smooth(Executor):
     """A low-pass filter of the fastest joint's speed."""
 
-    inputs = {"servo": Input(SERVO_STATUS, "servo.status")}
-    outputs = {"status": SMOOTH}
+    inputs = {"servo": Input(ServoStatus, "servo.status")}
+    outputs = {"status": SmoothStatus}
 
     def __init__(self, context):
         super().__init__(context)
@@ -33,8 +44,8 @@ class Smooth(Executor):
 class Rises(Executor):
     """Counts how often the smoothed speed begins to rise."""
 
-    inputs = {"smooth": Input(SMOOTH, "smooth.status")}
-    outputs = {"status": RISES}
+    inputs = {"smooth": Input(SmoothStatus, "smooth.status")}
+    outputs = {"status": RisesStatus}
 
     def __init__(self, context):
         super().__init__(context)

@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels import Error, Input, LevelContext, Planner, Ports
-from rack.levels.messages import MOVE_COMMAND, PRIMITIVE_STATUS, TRAJECTORY
+from rack.levels.messages import MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
 from rack.levels.primitive.segment import read_segment, window
 from rack.levels.robot.cell import build_cell
@@ -25,10 +25,10 @@ class TrapezoidPlanner(Planner):
     acceleration."""
 
     inputs = {
-        "command": Input(MOVE_COMMAND, "above.command"),
-        "status": Input(PRIMITIVE_STATUS, "own.status"),
+        "command": Input(MoveCommand, "above.command"),
+        "status": Input(PrimitiveStatus, "own.status"),
     }
-    output = TRAJECTORY
+    output = TrajectoryPlan
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -7,7 +7,7 @@ import numpy as np
 from rack.backplane.message import State
 from rack.levels.arm import SimulatedArm
 from rack.levels.level import Executor, Input, LevelContext, Ports
-from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.levels.messages import ArmState, JointCommand, Scene, ServoPlan, ServoStatus
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo.control import Grip
@@ -28,11 +28,11 @@ class PdServo(Executor):
     joint."""
 
     inputs = {
-        "command": Input(JOINT_SET_POINT, "above.command"),
-        "plan": Input(SERVO_PLAN, "own.plan"),
-        "before": Input(ARM_STATE, "own.state"),
+        "command": Input(JointCommand, "above.command"),
+        "plan": Input(ServoPlan, "own.plan"),
+        "before": Input(ArmState, "own.state"),
     }
-    outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
+    outputs = {"status": ServoStatus, "state": ArmState, "scene": Scene}
     params = Gains
 
     def __init__(self, context: LevelContext) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints, ValidationError
 
-from rack.backplane.message import Message, MessageType, State, fill_counts
+from rack.backplane.message import Message, State, fill_counts
 from rack.levels.level import (
     Executor,
     Input,
@@ -21,15 +21,15 @@ from rack.levels.level import (
     Program,
     Reading,
 )
-from rack.levels.messages import TASK_STATUS, Error
-from rack.levels.operator import HOLDABLE, MAX_JOINTS, OPERATOR_COMMAND, Orders
+from rack.levels.messages import Error, TaskStatus
+from rack.levels.operator import HOLDABLE, MAX_JOINTS, OperatorCommand, Orders
 from rack.levels.systems.cell.actions import write_action
 from rack.levels.systems.cell.agreement import Agreement
 from rack.levels.systems.cell.messages import (
-    CELL_ORDER,
-    CELL_PROGRESS,
-    CELL_REPORT,
     OBJECT_BYTES,
+    CellOrder,
+    CellProgress,
+    CellReport,
     MailboxName,
     OrderVerb,
     Phase,
@@ -149,12 +149,12 @@ class Coordinator(Executor):
     """
 
     inputs = {
-        "last_progress": Input(CELL_PROGRESS, "own.progress"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "last_progress": Input(CellProgress, "own.progress"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
     # The progress first: a board killed before it has written its orders writes them when it is
     # back.
-    outputs = {"progress": CELL_PROGRESS, "status": TASK_STATUS}
+    outputs = {"progress": CellProgress, "status": TaskStatus}
     commands = HOLDABLE
     params = CoordinatorParams
     program = CellProgram
@@ -174,14 +174,14 @@ class Coordinator(Executor):
         self._moved_at = 0  # tick of the last such change
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the orders and the report of each arm."""
         try:
             arms = CoordinatorParams.model_validate(params).arms
         except ValidationError:
             return MadePorts(is_whole=False)
-        reports = {f"report_{arm}": Input(CELL_REPORT, mailbox) for arm, mailbox in arms.items()}
-        return MadePorts(reports, {f"order_{arm}": Output(CELL_ORDER) for arm in arms})
+        reports = {f"report_{arm}": Input(CellReport, mailbox) for arm, mailbox in arms.items()}
+        return MadePorts(reports, {f"order_{arm}": Output(CellOrder) for arm in arms})
 
     @classmethod
     def misfits(

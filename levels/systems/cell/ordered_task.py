@@ -11,18 +11,18 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import StringConstraints, ValidationError
 
-from rack.backplane.message import Message, MessageType, State, fill_counts
+from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.rack_name import RACK_NAME
 from rack.levels.errors import ProgramError, Refused
 from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
-from rack.levels.messages import TASK_PLAN, WORLD_MODEL, Error
-from rack.levels.peer import PEER, peer_port
+from rack.levels.messages import Error, TaskPlan, WorldState
+from rack.levels.peer import PeerPresence, peer_port
 from rack.levels.systems.cell.actions import copy_action, read_action
 from rack.levels.systems.cell.agreement import TakenOrder
 from rack.levels.systems.cell.messages import (
-    CELL_ORDER,
-    CELL_REPORT,
-    CELL_REQUEST,
+    CellOrder,
+    CellReport,
+    CellRequest,
     MailboxName,
     Response,
 )
@@ -59,12 +59,12 @@ class OrderedTaskExecutor(TaskExecutor):
 
     inputs = {
         **TaskExecutor.inputs,
-        "world": Input(WORLD_MODEL, "world.model"),
-        "last_request": Input(CELL_REQUEST, "own.request"),
-        "last_report": Input(CELL_REPORT, "own.report"),
+        "world": Input(WorldState, "world.model"),
+        "last_request": Input(CellRequest, "own.request"),
+        "last_report": Input(CellReport, "own.report"),
     }
     # The report last: what it says has begun is in the status.
-    outputs = {**TaskExecutor.outputs, "request": CELL_REQUEST, "report": CELL_REPORT}
+    outputs = {**TaskExecutor.outputs, "request": CellRequest, "report": CellReport}
     params = OrderedTaskParams
     program = None
 
@@ -85,18 +85,18 @@ class OrderedTaskExecutor(TaskExecutor):
         self._held = ""  # why the coordinator holds the arm
         self._waits = ""  # why an order cannot be planned yet
         self._is_end_reported = False
-        self._nothing = Message(TASK_PLAN.dtype(context.sizes))  # the plan of no order
+        self._nothing = TaskPlan.zeros(context.sizes)  # the plan of no order
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the mailboxes of the orders and, over the network, of the other rack's time."""
         try:
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
             return MadePorts(is_whole=False)
-        ports = {"order": Input(CELL_ORDER, table.orders)}
+        ports = {"order": Input(CellOrder, table.orders)}
         if table.coordinator:
-            ports["peer"] = Input(PEER, f"lan.{peer_port(table.coordinator)}")
+            ports["peer"] = Input(PeerPresence, f"lan.{peer_port(table.coordinator)}")
         return MadePorts(ports)
 
     def _first_actions(self) -> tuple[AnyAction, ...]:
@@ -336,7 +336,7 @@ class OrderedTaskExecutor(TaskExecutor):
 class OrderedTaskPlanner(TaskPlanner):
     """Plans what its executor requests: the action of an order, to begin later or at once."""
 
-    inputs = {**TaskPlanner.inputs, "request": Input(CELL_REQUEST, "own.request")}
+    inputs = {**TaskPlanner.inputs, "request": Input(CellRequest, "own.request")}
     params = OrderedTaskParams
     program = None
 

@@ -14,12 +14,12 @@ from rack.levels.servo.executor import ServoExecutor
 from rack.levels.systems.cell.shared_bodies import (
     MOST_SHARED,
     NAME_BYTES,
-    SHARED_BODIES,
+    SharedBodies,
     SharedBody,
 )
 from rack.levels.systems.cell.sharing_arm import SharingArm
 
-SHARED = Output(SHARED_BODIES, cycles=8)
+SHARED = Output(SharedBodies, cycles=8)
 """At 400 Hz 50 Hz: the fastest exchange between racks."""
 
 
@@ -51,8 +51,8 @@ class SharingServoExecutor(ServoExecutor):
 
     inputs = {
         **ServoExecutor.inputs,
-        "others": Input(SHARED_BODIES, "lan.shared", many=True),
-        "last": Input(SHARED_BODIES, "own.shared"),
+        "others": Input(SharedBodies, "lan.shared", many=True),
+        "last": Input(SharedBodies, "own.shared"),
     }
     outputs = {**ServoExecutor.outputs, "shared": SHARED}
     params = SharingServoParams

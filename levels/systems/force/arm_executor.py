@@ -15,7 +15,7 @@ from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Cause, Reaction
 from rack.levels.systems.force.contact import HALVES, WristLevel
 from rack.levels.systems.force.contact_wrench import ContactWrench
-from rack.levels.systems.force.messages import WRENCH
+from rack.levels.systems.force.messages import Wrench
 from rack.levels.systems.joint_boards import ArmExecutor
 from rack.levels.tables import read_params
 
@@ -48,8 +48,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     is 2.6 N; their velocities would make 10 N of noise.)
     """
 
-    inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
-    outputs = {**ArmExecutor.outputs, "wrench": WRENCH}
+    inputs = {**ArmExecutor.inputs, "felt": Input(Wrench, "own.wrench")}
+    outputs = {**ArmExecutor.outputs, "wrench": Wrench}
     params = ForceArmParams
 
     def __init__(self, context: LevelContext) -> None:

@@ -27,7 +27,7 @@ from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
 from rack.levels.level import Input, LevelContext, Misfits, Program
 from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
-from rack.levels.systems.force.messages import SERVER_REQUEST, SERVER_STATUS, Mode
+from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
 from rack.levels.systems.trajectory.messages import MotionKind
 from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, Vector
@@ -213,8 +213,8 @@ class ForceMotions(Motions):
 class ForceClient(CommandEnvironment):
     """Runs a script that commands forces and motions by name; a prompt offers the same names."""
 
-    inputs = {"motion": Input(SERVER_STATUS, "below.motion")}
-    outputs = {"requests": SERVER_REQUEST}
+    inputs = {"motion": Input(ServerStatus, "below.motion")}
+    outputs = {"requests": ServerRequest}
     program = ForceProgram
 
     def motions(self, bus: Bus) -> Motions:

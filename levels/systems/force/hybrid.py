@@ -17,8 +17,8 @@ from rack.levels.servo import curves, reference
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.force.contact import AXIS_NAMES, HALVES, WristLevel
 from rack.levels.systems.force.hybrid_law import ForceTask, HybridGains, HybridLaw, turned
-from rack.levels.systems.force.messages import AXES, COMPLIANCE, FORCE_STATUS, WRENCH
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.force.messages import AXES, Compliance, ForceStatus, Wrench
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.tables import read_params
 
@@ -47,7 +47,7 @@ class ComplianceWatch:
         self.reason = ""  # why, or why the force wanted is another; empty: all is as commanded
 
     def recall(self, last: Reading) -> None:
-        """Continue after a restart from the last `FORCE_STATUS`: a guard strikes once."""
+        """Continue after a restart from the last `ForceStatus`: a guard strikes once."""
         if last.is_there:
             self.struck = last.value.struck
             self.axis = last.value.axis
@@ -160,16 +160,16 @@ class HybridExecutor(WristLevel):
     """
 
     inputs = {
-        "command": Input(JOINT_REFERENCE, "above.command"),
-        "compliance": Input(COMPLIANCE, "above.compliance"),
-        "wrench": Input(WRENCH, "arm.wrench"),
-        "statuses": Input(JOINT_STATUS, "below.status", many=True),
-        "last_force": Input(FORCE_STATUS, "own.force"),
+        "command": Input(JointReference, "above.command"),
+        "compliance": Input(Compliance, "above.compliance"),
+        "wrench": Input(Wrench, "arm.wrench"),
+        "statuses": Input(JointStatus, "below.status", many=True),
+        "last_force": Input(ForceStatus, "own.force"),
     }
     outputs = {
-        "command": JOINT_REFERENCE,
-        "status": Output(JOINT_STATUS, rests_on="statuses"),
-        "force": Output(FORCE_STATUS, rests_on="wrench"),
+        "command": JointReference,
+        "status": Output(JointStatus, rests_on="statuses"),
+        "force": Output(ForceStatus, rests_on="wrench"),
     }
     params = HybridGains
     preloads = (curves, dynamics, reference)

@@ -19,12 +19,12 @@ from rack.levels.systems.force.contact import (
     misfit,
 )
 from rack.levels.systems.force.messages import (
-    COMPLIANCE,
-    FORCE_STATUS,
-    SERVER_REQUEST,
-    SERVER_STATE,
-    SERVER_STATUS,
+    Compliance,
+    ForceStatus,
     Mode,
+    ServerRequest,
+    ServerState,
+    ServerStatus,
 )
 from rack.levels.systems.trajectory import TrajectoryExecutor
 from rack.levels.systems.trajectory.boards import JointBoards
@@ -59,7 +59,7 @@ class ServerParams(TrajectoryParams):
 
 
 class ServerWork(RequestWork):
-    """Begins and ends compliance, and judges contacts: see `SERVER_REQUEST`.
+    """Begins and ends compliance, and judges contacts: see `ServerRequest`.
 
     Motion begins anew from where the arm is when axes cease to be of force, or are others: the
     boards below come to rest and hold, and fall into step again.
@@ -73,7 +73,7 @@ class ServerWork(RequestWork):
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         super().__init__(agenda, motion, tools)
         self.contact = Contact()
-        # FORCE_STATUS that answers the contact in force; None: none does yet.
+        # ForceStatus that answers the contact in force; None: none does yet.
         self.force: Message | None = None
         self.guarded = 0  # newest request that a guard has ended
         self.axis = -1  # of that guard
@@ -206,17 +206,17 @@ class ForceServer(WristLevel, TrajectoryExecutor):
 
     inputs = {
         **TrajectoryExecutor.inputs,
-        "requests": Input(SERVER_REQUEST, "above.requests"),
-        "force": Input(FORCE_STATUS, "below.force"),
-        "last_status": Input(SERVER_STATUS, "own.status"),
-        "last_state": Input(SERVER_STATE, "own.state"),
-        "last_compliance": Input(COMPLIANCE, "own.compliance"),
+        "requests": Input(ServerRequest, "above.requests"),
+        "force": Input(ForceStatus, "below.force"),
+        "last_status": Input(ServerStatus, "own.status"),
+        "last_state": Input(ServerState, "own.state"),
+        "last_compliance": Input(Compliance, "own.compliance"),
     }
     outputs = {
         **TrajectoryExecutor.outputs,
-        "status": Output(SERVER_STATUS, rests_on="boards"),
-        "state": SERVER_STATE,
-        "compliance": COMPLIANCE,
+        "status": Output(ServerStatus, rests_on="boards"),
+        "state": ServerState,
+        "compliance": Compliance,
     }
     params = ServerParams
     work = ServerWork

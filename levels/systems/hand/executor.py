@@ -15,13 +15,13 @@ from rack.levels.arm import substeps
 from rack.levels.arm.above import CommandsAbove
 from rack.levels.faults import TendonStep
 from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Misfits, Ports, Reading
-from rack.levels.messages import ARM_STATE, Error
-from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.messages import ArmState, Error
+from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
 from rack.levels.servo.driver import SCENES
-from rack.levels.systems.hand.messages import HAND_STATUS, TENSION_COMMAND
+from rack.levels.systems.hand.messages import HandStatus, TensionCommand
 from rack.levels.systems.hand.simulated import HandSample, SimulatedHand
 from rack.levels.tables import Table
 
@@ -41,11 +41,11 @@ class HandExecutor(Executor):
     """
 
     inputs = {
-        "tensions": Input(TENSION_COMMAND, "above.command", many=True),
-        "before": Input(ARM_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "tensions": Input(TensionCommand, "above.command", many=True),
+        "before": Input(ArmState, "own.state"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"status": HAND_STATUS, "state": ARM_STATE, "scene": SCENES}
+    outputs = {"status": HandStatus, "state": ArmState, "scene": SCENES}
     commands = HOLDABLE
     params = Table
     faults = (TendonStep,)
@@ -226,7 +226,7 @@ kept them."""
 
 
 class Tensions(CommandsAbove):
-    """Joins the `TENSION_COMMAND`s of the boards above, each for the joints that it drives."""
+    """Joins the `TensionCommand`s of the boards above, each for the joints that it drives."""
 
     def __init__(self, context: LevelContext, hand: Hand, patience: MotorPatience) -> None:
         # A tension takes a cycle of its board, and one of the board that gave that the torque.

@@ -12,8 +12,8 @@ from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Ports, Reading
-from rack.levels.messages import WORLD_MODEL, Error
-from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.messages import Error, WorldState
+from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import cell_of
 from rack.levels.systems.hand.grasp_program import (
@@ -29,11 +29,11 @@ from rack.levels.systems.hand.grasp_steps import WORKS, FingersBelow, Grasp, Gra
 from rack.levels.systems.hand.grip import HandGrip
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import (
-    FINGER_STATUS,
-    GRASP_PLAN,
-    GRASP_STATUS,
-    GRASP_TARGET,
+    FingerStatus,
     GraspKind,
+    GraspPlan,
+    GraspStatus,
+    GraspTarget,
 )
 from rack.levels.tables import read_params
 
@@ -53,16 +53,16 @@ class GraspExecutor(Executor):
     """
 
     inputs = {
-        "fingers": Input(FINGER_STATUS, "below.status", many=True),
-        "world": Input(WORLD_MODEL, "world.model"),
-        "plan": Input(GRASP_PLAN, "above.plan", many=True, optional=True),
-        "last_command": Input(GRASP_TARGET, "own.command"),
-        "last_status": Input(GRASP_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "fingers": Input(FingerStatus, "below.status", many=True),
+        "world": Input(WorldState, "world.model"),
+        "plan": Input(GraspPlan, "above.plan", many=True, optional=True),
+        "last_command": Input(GraspTarget, "own.command"),
+        "last_status": Input(GraspStatus, "own.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
     outputs = {
-        "command": Output(GRASP_TARGET, rests_on="fingers"),
-        "status": Output(GRASP_STATUS, rests_on="fingers"),
+        "command": Output(GraspTarget, rests_on="fingers"),
+        "status": Output(GraspStatus, rests_on="fingers"),
     }
     commands = HOLDABLE
     params = GraspParams
@@ -86,7 +86,7 @@ class GraspExecutor(Executor):
             postures={name: self._posture(given) for name, given in self._program.posture.items()},
             period_s=context.period_s,
             fingers=FingersBelow(context, kinematics.joints),
-            target=Message(GRASP_TARGET.dtype(context.sizes)),
+            target=GraspTarget.zeros(context.sizes),
             grip=HandGrip(params, np.full(len(names), False), self._opposing, context.period_s),
             touching=np.full(len(names), False),
         )
@@ -95,7 +95,7 @@ class GraspExecutor(Executor):
         self._passed_s = 0.0  # since the step under way began, without waiting
         self._waited_s = 0.0  # in a row, other than for an operator
         self._failed = Refused(Error.NONE, "")
-        self._plan = Message(GRASP_PLAN.dtype(context.sizes))  # in use; id 0: none
+        self._plan = GraspPlan.zeros(context.sizes)  # in use; id 0: none
         self._started = False  # the first cycle has begun
 
     @classmethod

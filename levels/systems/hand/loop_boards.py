@@ -15,7 +15,7 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Mask
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
-from rack.levels.operator import BELOW_LOST, HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.operator import BELOW_LOST, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
@@ -30,13 +30,13 @@ from rack.levels.systems.hand.laws import (
     TendonLaw,
 )
 from rack.levels.systems.hand.messages import (
-    FINGER_STATUS,
-    FINGER_TARGET,
-    GRASP_TARGET,
-    HAND_STATUS,
-    LOOP_STATUS,
-    TENDON_TORQUE,
-    TENSION_COMMAND,
+    FingerStatus,
+    FingerTarget,
+    GraspTarget,
+    HandStatus,
+    LoopStatus,
+    TendonTorque,
+    TensionCommand,
 )
 from rack.levels.tables import read_params
 
@@ -61,10 +61,10 @@ class HandLoop(Executor):
         assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand: Hand = self.cell.hand
         self.orders = Orders(self.commands)
-        command = self.inputs["command"].type
-        self.command = Message(command.dtype(context.sizes))  # that is followed
+        command = self.inputs["command"].message
+        self.command = command.zeros(context.sizes)  # that is followed
         # Names of its fields that must be finite.
-        self._numbers = [field.name for field in command.fields if field.kind == "f8"]
+        self._numbers = [field.name for field in command.message_type.fields if field.kind == "f8"]
         self.commanded = False  # there was one
         # (joints,) or (fingers,), as in the status: those of this board.
         self.driven: Mask
@@ -91,7 +91,7 @@ class HandLoop(Executor):
 
     @abstractmethod
     def meet(self, read: Ports, hand: Message) -> None:
-        """Begin with the first `HAND_STATUS`, or continue from the level's own last messages."""
+        """Begin with the first `HandStatus`, or continue from the level's own last messages."""
 
     @abstractmethod
     def follow(self, hand: Message, write: Ports, tick: int) -> None:
@@ -122,7 +122,7 @@ class HandLoop(Executor):
         self.orders.report(write.status, self.command.operator)
 
     def age_s(self, hand: Message, tick: int) -> float:
-        """Return how old the sample of a `HAND_STATUS` is when what this cycle commands acts, s."""
+        """Return how old the sample of a `HandStatus` is when what this cycle commands acts, s."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )
@@ -199,13 +199,13 @@ class FingertipLoop(HandLoop):
     """
 
     inputs = {
-        "command": Input(GRASP_TARGET, "above.command"),
-        "hand": Input(HAND_STATUS, "hand.status"),
-        "below": Input(LOOP_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-        "last": Input(FINGER_TARGET, "own.command"),
+        "command": Input(GraspTarget, "above.command"),
+        "hand": Input(HandStatus, "hand.status"),
+        "below": Input(LoopStatus, "below.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
+        "last": Input(FingerTarget, "own.command"),
     }
-    outputs = {"command": FINGER_TARGET, "status": FINGER_STATUS}
+    outputs = {"command": FingerTarget, "status": FingerStatus}
     params = FingertipGains
 
     def __init__(self, context: LevelContext) -> None:
@@ -234,12 +234,12 @@ class JointLoop(HandLoop):
     """
 
     inputs = {
-        "command": Input(FINGER_TARGET, "above.command"),
-        "hand": Input(HAND_STATUS, "hand.status"),
-        "below": Input(LOOP_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(FingerTarget, "above.command"),
+        "hand": Input(HandStatus, "hand.status"),
+        "below": Input(LoopStatus, "below.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": TENDON_TORQUE, "status": LOOP_STATUS}
+    outputs = {"command": TendonTorque, "status": LoopStatus}
     params = JointGains
     preloads = (dynamics, laws)
 
@@ -270,11 +270,11 @@ class TendonLoop(HandLoop):
     """
 
     inputs = {
-        "command": Input(TENDON_TORQUE, "above.command"),
-        "hand": Input(HAND_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(TendonTorque, "above.command"),
+        "hand": Input(HandStatus, "below.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": TENSION_COMMAND, "status": LOOP_STATUS}
+    outputs = {"command": TensionCommand, "status": LoopStatus}
     params = TendonGains
     preloads = (laws,)
 
@@ -314,11 +314,11 @@ class FingerExecutor(HandLoop):
     """
 
     inputs = {
-        "command": Input(GRASP_TARGET, "above.command"),
-        "hand": Input(HAND_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(GraspTarget, "above.command"),
+        "hand": Input(HandStatus, "below.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": TENSION_COMMAND, "status": FINGER_STATUS}
+    outputs = {"command": TensionCommand, "status": FingerStatus}
     params = FingerParams
     preloads = (dynamics, laws)
 
@@ -334,7 +334,7 @@ class FingerExecutor(HandLoop):
         )
         self._servo = JointLaw(self.cell, self._joints, params)
         self._tendons = TendonLaw(hand, self._joints, params, context)
-        self._target = Message(FINGER_TARGET.dtype(context.sizes))
+        self._target = FingerTarget.zeros(context.sizes)
         self._torque = np.zeros(len(self._joints))
 
     @classmethod
@@ -368,8 +368,8 @@ class FingerExecutor(HandLoop):
 def follow_grasp(
     loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int
 ) -> None:
-    """Fill a `FINGER_TARGET` for the `GRASP_TARGET` that a loop follows, and the
-    `FINGER_STATUS`."""
+    """Fill a `FingerTarget` for the `GraspTarget` that a loop follows, and the
+    `FingerStatus`."""
     status.tip = law.sense(hand.position)
     target.active = loop.command.active
     if loop.command.active:

@@ -29,10 +29,10 @@ from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext
-from rack.levels.messages import WORLD_MODEL
+from rack.levels.messages import WorldState
 from rack.levels.robot.cell import Cell, cell_of
 from rack.levels.systems.hand.kinematics import FingerKinematics
-from rack.levels.systems.hand.messages import GRASP_PLAN, GRASP_STATUS, GraspKind
+from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
 from rack.levels.tables import NotNegative, Positive, Table, read_params
 
 LINES = 72
@@ -219,10 +219,10 @@ class Workstation(HostProgram):
     """Plans a grasp of one object, and plans again if the object moves before it is held."""
 
     inputs = {
-        "world": Input(WORLD_MODEL, "below.world"),
-        "grasp": Input(GRASP_STATUS, "below.grasp"),
+        "world": Input(WorldState, "below.world"),
+        "grasp": Input(GraspStatus, "below.grasp"),
     }
-    outputs = {"plan": GRASP_PLAN}
+    outputs = {"plan": GraspPlan}
     params = WorkstationParams
 
     def __init__(self, context: LevelContext) -> None:

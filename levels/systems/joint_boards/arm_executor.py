@@ -13,8 +13,8 @@ from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.arm.above import CommandsAbove
 from rack.levels.level import Input, LevelContext, Misfits, Ports, Reading
-from rack.levels.messages import ARM_STATE
-from rack.levels.operator import DRIVES, HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.messages import ArmState
+from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload, Terms
 from rack.levels.servo.control import ArmParams
@@ -22,19 +22,19 @@ from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver, Course, numbers
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
-from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_TORQUE
+from rack.levels.systems.joint_boards.messages import ArmStatus, JointTorque
 from rack.levels.tables import read_params
 
 HELD = "held by the operator; `resume` releases it"
 
 
 class JointTorques(CommandsAbove):
-    """Adds up the `JOINT_TORQUE`s of the boards above; each is 0 for the joints of other boards."""
+    """Adds up the `JointTorque`s of the boards above; each is 0 for the joints of other boards."""
 
     def __init__(self, context: LevelContext, cell: Cell) -> None:
         super().__init__(context, cell.patience, 1, "torque", "braked")
         joints = len(cell.home)
-        # The fields of a `JOINT_TORQUE` from `torque` to `payload_offset`.
+        # The fields of a `JointTorque` from `torque` to `payload_offset`.
         self._sum = np.zeros(3 * joints + 5)
         self.torque = self._sum[:joints]  # (joints,), N m
         # Where the boards want the joints; accelerations are not known.
@@ -75,11 +75,11 @@ class ArmExecutor(ArmDriver):
     """
 
     inputs = {
-        "torques": Input(JOINT_TORQUE, "above.command", many=True),
-        "before": Input(ARM_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "torques": Input(JointTorque, "above.command", many=True),
+        "before": Input(ArmState, "own.state"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
+    outputs = {"status": ArmStatus, "state": ArmState, "scene": SCENES}
     commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
 

@@ -11,10 +11,10 @@ from pydantic import Field
 
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
-from rack.levels.messages import TASK_STATUS
-from rack.levels.peer import PEER, Presence
+from rack.levels.messages import TaskStatus
+from rack.levels.peer import PeerPresence, Presence
 from rack.levels.servo.reference import MAX_AHEAD_S
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.tables import NotNegative, Positive, Table, read_params
 
 LEAD_CYCLES = 2
@@ -44,10 +44,10 @@ class JointGateway(Executor):
     """
 
     inputs = {
-        "command": Input(JOINT_REFERENCE, "above.command"),
-        "statuses": Input(JOINT_STATUS, "below.status", many=True),
+        "command": Input(JointReference, "above.command"),
+        "statuses": Input(JointStatus, "below.status", many=True),
     }
-    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_STATUS, rests_on="statuses")}
+    outputs = {"command": JointReference, "status": Output(JointStatus, rests_on="statuses")}
     params: ClassVar[type[GatewayParams]] = GatewayParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -63,8 +63,8 @@ class JointGateway(Executor):
         self._above = ", ".join(context.above)
         self._down: Link = deque()
         self._up: Link = deque()
-        self._newest = Message(JOINT_REFERENCE.dtype(context.sizes))  # reference that came
-        self._merged = Message(JOINT_STATUS.dtype(context.sizes))  # of the boards below, as one
+        self._newest = JointReference.zeros(context.sizes)  # reference that came
+        self._merged = JointStatus.zeros(context.sizes)  # of the boards below, as one
         self._due = 0  # tick at which the last reference given is due; 0: none is followed
         self._frozen = False  # too many are missing
 
@@ -162,19 +162,18 @@ class NetworkGatewayParams(GatewayParams):
 class NetworkGateway(JointGateway):
     """Follows references of another rack, due later by `delay`, within which they must have come.
 
-    They are due at ticks of that rack, whose time next to ours its `PEER` shows. The board is DONE,
-    or in ERROR, when the program of that rack is: then it may end the run.
-    """
+    They are due at ticks of that rack, whose time next to ours its `PeerPresence` shows. The board
+    is DONE, or in ERROR, when the program of that rack is: then it may end the run."""
 
     inputs = {
-        "command": Input(JOINT_REFERENCE, "lan.reference"),
-        "program": Input(TASK_STATUS, "lan.program"),
-        "peer": Input(PEER, "lan.peer"),
+        "command": Input(JointReference, "lan.reference"),
+        "program": Input(TaskStatus, "lan.program"),
+        "peer": Input(PeerPresence, "lan.peer"),
         "statuses": JointGateway.inputs["statuses"],
     }
     outputs = {
-        "command": JOINT_REFERENCE,
-        "status": Output(JOINT_STATUS, cycles=STATUS_CYCLES, rests_on="statuses"),
+        "command": JointReference,
+        "status": Output(JointStatus, cycles=STATUS_CYCLES, rests_on="statuses"),
     }
     params = NetworkGatewayParams
 
@@ -188,7 +187,7 @@ class NetworkGateway(JointGateway):
         # interpolate to it.
         self._ahead = self._period + LEAD_CYCLES * context.every
         self._above = "lan"
-        self._arrived = Message(JOINT_REFERENCE.dtype(context.sizes))
+        self._arrived = JointReference.zeros(context.sizes)
         self._refused = ""  # why the newest reference was not taken
         self._their_s = 0.0  # simulated time there less that here
         self._program: Message

@@ -13,7 +13,7 @@ from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports
 from rack.levels.messages import Error
-from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.operator import Goal, Operation, OperatorCommand
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.servo import curves, reference
@@ -27,10 +27,10 @@ from rack.levels.servo.reference import Reference
 from rack.levels.systems.joint_boards import joint_control
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads, servo_joints
 from rack.levels.systems.joint_boards.messages import (
-    ARM_STATUS,
-    JOINT_REFERENCE,
-    JOINT_STATUS,
-    JOINT_TORQUE,
+    ArmStatus,
+    JointReference,
+    JointStatus,
+    JointTorque,
 )
 from rack.levels.tables import read_params, set_live
 
@@ -56,11 +56,11 @@ class JointServo(Executor):
     """
 
     inputs = {
-        "command": Input(JOINT_REFERENCE, "above.command"),
-        "status": Input(ARM_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(JointReference, "above.command"),
+        "status": Input(ArmStatus, "below.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": JOINT_TORQUE, "status": JOINT_STATUS}
+    outputs = {"command": JointTorque, "status": JointStatus}
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),

@@ -11,10 +11,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints
 
-from rack.backplane import message
-from rack.backplane.message import Message, State, command, status
+from rack.backplane.message import Command, Message, State, Status, field
 from rack.levels.level import Executor, Input, LevelContext, Output, Ports
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, Goal, Operation, Orders
+from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand, Orders
 from rack.levels.systems.joint_boards.joint_servo import JointServo
 from rack.levels.tables import Table, read_params
 
@@ -23,19 +22,22 @@ MOST_NAMES = 8
 """Names that one message holds, and the length of each with a space."""
 ANSWER_CYCLES = 20
 """Cycles of a joint's board from answer to answer: at 1 kHz as often as a network permits."""
-MODIFICATIONS = command(
-    "modifications",
-    1,
-    message.Field(
-        "wanted",
-        f"S{MOST_NAMES * NAME_BYTES}",
-        "ASCII",
-        "those that are to be in, as in elbow.pd, by spaces",
-    ),
-)
-MODIFIED = status("modified", 1)
-"""A board's answer: which message it has obeyed, or why it could not."""
-MODIFIER_STATUS = status("modifier_status", 1, *ANSWER)
+
+
+class Modifications(Command, version=1):
+    """The control modifications that are to be in force."""
+
+    wanted: str = field(
+        f"S{MOST_NAMES * NAME_BYTES}", doc="those that are to be in, as in elbow.pd, by spaces"
+    )
+
+
+class ModifiedAnswer(Status, version=1, message="modified"):
+    """A board's answer: which message it has obeyed, or why it could not."""
+
+
+class ModifierStatus(AnsweringStatus, version=1):
+    """Status of the board that puts in modifications."""
 
 
 BoardAndName = Annotated[
@@ -58,10 +60,10 @@ class ModificationSender(Executor):
     """
 
     inputs = {
-        "modified": Input(MODIFIED, "lan.modified", many=True),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "modified": Input(ModifiedAnswer, "lan.modified", many=True),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": MODIFICATIONS, "status": MODIFIER_STATUS}
+    outputs = {"command": Modifications, "status": ModifierStatus}
     commands = {Operation.MODIFY: (Goal.ON, Goal.OFF)}
     params = SenderParams
 
@@ -112,8 +114,8 @@ class ModificationSender(Executor):
 class ModifiedFromAfar(JointServo):
     """Servoes joints by a law that another rack, and an operator here, may modify."""
 
-    inputs = {**JointServo.inputs, "asked": Input(MODIFICATIONS, "lan.modifications")}
-    outputs = {**JointServo.outputs, "modified": Output(MODIFIED, cycles=ANSWER_CYCLES)}
+    inputs = {**JointServo.inputs, "asked": Input(Modifications, "lan.modifications")}
+    outputs = {**JointServo.outputs, "modified": Output(ModifiedAnswer, cycles=ANSWER_CYCLES)}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

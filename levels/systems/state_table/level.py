@@ -15,18 +15,17 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Field, Message, State, command, status
-from rack.levels.fields import flag, number, short_count
+from rack.backplane.message import Command, Message, State, field
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
-    ANSWER,
     HELD_FROM_ABOVE,
-    OPERATOR_COMMAND,
     RESTS_ON,
+    AnsweringStatus,
     Commands,
     Operation,
+    OperatorCommand,
     Orders,
     answered,
 )
@@ -53,30 +52,35 @@ from rack.levels.systems.state_table.table import (
 )
 from rack.levels.tables import SceneConfig, Table, read_params
 
-COMMAND_HEAD = (
-    RESTS_ON,
-    flag("hold", "1: come to rest and stay, whatever is under way"),
-    Field(
-        "words", f"S{PHRASE_BYTES}", "ASCII", "the command with its parameters, as in 'pick block1'"
-    ),
-)
-"""First fields of every command to a level of this kind."""
-STATUS_HEAD = (
-    *ANSWER,
-    Field("table", f"S{NAME_BYTES}", "ASCII", "state table in force"),
-    number("checksum", "CRC-32 of its file"),
-    Field("in_state", f"S{NAME_BYTES}", "ASCII", "state after this cycle"),
-    short_count("row", "row that fired in this cycle, from 1; 0: none"),
-    Field("fired", f"S{ROW_NAME_BYTES}", "ASCII", "its name"),
-    Field("words", f"S{PHRASE_BYTES}", "ASCII", "command in force; empty: none"),
-    number(
-        "ordered", "serial of an operator's command, if it is in force; 0: it is the level above's"
-    ),
-    number("done", "newest command of the level above that is done; 0: none"),
-)
-"""First fields of the status of every level of this kind: with them a restarted board goes on."""
-WORD_COMMAND = command("word_command", 1, *COMMAND_HEAD)
-TABLE_STATUS = status("table_status", 1, *STATUS_HEAD)
+
+class TableCommand(Command, version=1, message="word_command"):
+    """First fields of every command to a level of this kind."""
+
+    operator: int = RESTS_ON
+    hold: bool = field(doc="1: come to rest and stay, whatever is under way")
+    words: str = field(
+        f"S{PHRASE_BYTES}", doc="the command with its parameters, as in 'pick block1'"
+    )
+
+
+class TableStatus(AnsweringStatus, version=1):
+    """First fields of the status of every level of this kind: with them a restarted board goes
+    on."""
+
+    table: str = field(f"S{NAME_BYTES}", doc="state table in force")
+    checksum: int = field("u4", unit="1", doc="CRC-32 of its file")
+    in_state: str = field(f"S{NAME_BYTES}", doc="state after this cycle")
+    row: int = field("u2", unit="1", doc="row that fired in this cycle, from 1; 0: none")
+    fired: str = field(f"S{ROW_NAME_BYTES}", doc="its name")
+    words: str = field(f"S{PHRASE_BYTES}", doc="command in force; empty: none")
+    ordered: int = field(
+        "u4",
+        unit="1",
+        doc="serial of an operator's command, if it is in force; 0: it is the level above's",
+    )
+    done: int = field("u4", unit="1", doc="newest command of the level above that is done; 0: none")
+
+
 YES_NO = ("no", "yes")
 UNKNOWN = "unknown"
 """A command whose words the level does not know."""
@@ -126,11 +130,11 @@ class StateTableExecutor(Executor):
 
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
     inputs = {
-        "command": Input(WORD_COMMAND, "above.command", many=True, optional=True),
-        "last_status": Input(TABLE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(TableCommand, "above.command", many=True, optional=True),
+        "last_status": Input(TableStatus, "own.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"status": TABLE_STATUS}
+    outputs = {"status": TableStatus}
     params = StateTableParams
     vocabulary: ClassVar[Vocabulary]
 
@@ -266,7 +270,7 @@ class StateTableExecutor(Executor):
         """Return the value of each of the level's own conditions in this cycle."""
 
     def give(self, write: Ports, tick: int) -> None:
-        """Fill what the level writes, other than the fields of `STATUS_HEAD`."""
+        """Fill what the level writes, other than the fields of `TableStatus`."""
 
     def do_take(self) -> None:
         """Let the newest command be the one in force."""
@@ -347,7 +351,7 @@ class StateTableExecutor(Executor):
                 self._newest = WordCommand(True, order.id, order.name)
 
     def _report(self, write: Ports, number: int, row: RowConfig) -> None:
-        """Fill the fields of `STATUS_HEAD`, and the operator's in the command."""
+        """Fill the fields of `TableStatus`, and the operator's in the command."""
         shown: Message = write.status
         orders = self.orders
         state = STATES[row.status]

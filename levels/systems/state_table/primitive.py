@@ -9,23 +9,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message, command, status
+from rack.backplane.message import Message, field
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
-from rack.levels.fields import by_joint, flag, real, row
 from rack.levels.level import Input, LevelContext, Output, Ports
-from rack.levels.operator import OPERATOR_COMMAND
+from rack.levels.operator import OperatorCommand
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo import curves
 from rack.levels.servo.curves import Curve, Passage, Ramp
-from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import ArmStatus, JointReference, JointStatus
 from rack.levels.systems.state_table.level import (
-    COMMAND_HEAD,
     OPERATIONS,
-    STATUS_HEAD,
     YES_NO,
     StateTableExecutor,
+    TableCommand,
+    TableStatus,
     vocabulary,
 )
 from rack.levels.tables import Positive, Table
@@ -44,27 +43,30 @@ GRIP_STILL_M_S = 0.002
 GRIP_MARGIN_M = 0.001
 """A gripper this near to open or closed is; closed in between it holds something."""
 
-JOINT_MOVE = command(
-    "joint_move",
-    1,
-    *COMMAND_HEAD,
-    by_joint("joints", "rad", "where a motion ends"),
-    real("speed", "1", "part of the joints' limits"),
-    row("object", "row of the object concerned in the world model; -1: none"),
-    real("aim", "m", "where the object, or the place, was for this command", 3),
-    real("yaw", "rad", "how it was turned about the vertical"),
-)
-JOINT_MOVE_STATUS = status(
-    "joint_move_status",
-    1,
-    *STATUS_HEAD,
-    by_joint("position", "rad", "joint positions commanded last"),
-    by_joint("end", "rad", "where the newest motion ends"),
-    flag("moving", "1: they still change"),
-    flag("closed", "1: the gripper is commanded to close"),
-    flag("held", "1: it holds something"),
-    row("object", "row of the object that it holds; -1: none"),
-)
+
+class JointMove(TableCommand, version=1):
+    """From the elemental move level of state tables to its primitive level."""
+
+    joints: np.ndarray = field(unit="rad", doc="where a motion ends", shape="joints")
+    speed: float = field(unit="1", doc="part of the joints' limits")
+    object: int = field(
+        "i2", unit="1", doc="row of the object concerned in the world model; -1: none"
+    )
+    aim: np.ndarray = field(
+        unit="m", doc="where the object, or the place, was for this command", shape=3
+    )
+    yaw: float = field(unit="rad", doc="how it was turned about the vertical")
+
+
+class JointMoveStatus(TableStatus, version=1):
+    """Status of the primitive level of state tables."""
+
+    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
+    end: np.ndarray = field(unit="rad", doc="where the newest motion ends", shape="joints")
+    moving: bool = field(doc="1: they still change")
+    closed: bool = field(doc="1: the gripper is commanded to close")
+    held: bool = field(doc="1: it holds something")
+    object: int = field("i2", unit="1", doc="row of the object that it holds; -1: none")
 
 
 class PrimitivePlanConfig(Table):
@@ -78,14 +80,14 @@ class PrimitiveTable(StateTableExecutor):
     """Moves the joints along straight lines and works the gripper, as its table says."""
 
     inputs = {
-        "command": Input(JOINT_MOVE, "above.command", many=True, optional=True),
-        "statuses": Input(JOINT_STATUS, "below.status", many=True),
-        "arm": Input(ARM_STATUS, "arm.status"),
-        "last_command": Input(JOINT_REFERENCE, "own.command"),
-        "last_status": Input(JOINT_MOVE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "command": Input(JointMove, "above.command", many=True, optional=True),
+        "statuses": Input(JointStatus, "below.status", many=True),
+        "arm": Input(ArmStatus, "arm.status"),
+        "last_command": Input(JointReference, "own.command"),
+        "last_status": Input(JointMoveStatus, "own.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_MOVE_STATUS, rests_on="statuses")}
+    outputs = {"command": JointReference, "status": Output(JointMoveStatus, rests_on="statuses")}
     commands = OPERATIONS
     preloads = (curves,)
     vocabulary = vocabulary(

@@ -8,18 +8,17 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Message, status
-from rack.levels.fields import number, short_count
+from rack.backplane.message import field
 from rack.levels.level import Input, LevelContext, Misfits, Ports
-from rack.levels.operator import OPERATOR_COMMAND, Operation
-from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS, MoveTable
+from rack.levels.operator import Operation, OperatorCommand
+from rack.levels.systems.state_table.elemental_move import MoveTable, MoveTableStatus
 from rack.levels.systems.state_table.level import (
     BELOW,
     OPERATIONS,
-    STATUS_HEAD,
-    WORD_COMMAND,
     StateTableExecutor,
     StateTableParams,
+    TableCommand,
+    TableStatus,
     answer_of,
     vocabulary,
 )
@@ -28,16 +27,16 @@ from rack.levels.tables import SceneConfig, Table, read_params
 
 COMMANDS_A_STEP = 2
 """Commands for the level below in one step: one to pick, one to place."""
-TASK_TABLE_STATUS = status(
-    "task_table_status",
-    1,
-    *STATUS_HEAD,
-    short_count("action", "steps done"),
-    short_count("actions", "steps of the plan"),
-    short_count("moves_done", "commands done by the level below"),
-    short_count("moves", "commands of the plan"),
-    number("sent", "serial of the newest command sent down; 0: none"),
-)
+
+
+class TaskTableStatus(TableStatus, version=1):
+    """Status of the task level of state tables."""
+
+    action: int = field("u2", unit="1", doc="steps done")
+    actions: int = field("u2", unit="1", doc="steps of the plan")
+    moves_done: int = field("u2", unit="1", doc="commands done by the level below")
+    moves: int = field("u2", unit="1", doc="commands of the plan")
+    sent: int = field("u4", unit="1", doc="serial of the newest command sent down; 0: none")
 
 
 class StepConfig(Table):
@@ -61,12 +60,12 @@ class TaskTable(StateTableExecutor):
     says."""
 
     inputs = {
-        "status": Input(MOVE_TABLE_STATUS, "below.status"),
-        "last_command": Input(WORD_COMMAND, "own.command"),
-        "last_status": Input(TASK_TABLE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "status": Input(MoveTableStatus, "below.status"),
+        "last_command": Input(TableCommand, "own.command"),
+        "last_status": Input(TaskTableStatus, "own.status"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
-    outputs = {"command": WORD_COMMAND, "status": TASK_TABLE_STATUS}
+    outputs = {"command": TableCommand, "status": TaskTableStatus}
     commands = OPERATIONS
     vocabulary = vocabulary(
         conditions={
@@ -85,7 +84,7 @@ class TaskTable(StateTableExecutor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._step = 0  # steps done
-        self._command = Message(WORD_COMMAND.dtype({}))  # the newest command sent down
+        self._command = TableCommand.zeros({})  # the newest command sent down
 
     @classmethod
     def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:

@@ -25,9 +25,9 @@ from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext
 from rack.levels.systems.trajectory.messages import (
-    MOTION_REQUEST,
-    MOTION_STATUS,
     MotionKind,
+    MotionRequest,
+    MotionStatus,
     RequestEnd,
 )
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, Table, read_params
@@ -146,7 +146,7 @@ class Motions:
 
     @property
     def _status(self) -> Message:
-        """The newest `MOTION_STATUS`, or that of the level in its place."""
+        """The newest `MotionStatus`, or that of the level in its place."""
         return self._bus.read("motion").value
 
     def _request(self, **fields: Any) -> int:
@@ -189,8 +189,8 @@ class ScriptParams(Table):
 class CommandEnvironment(HostProgram):
     """Runs a script that commands motions by name; a prompt offers the same names."""
 
-    inputs = {"motion": Input(MOTION_STATUS, "below.motion")}
-    outputs = {"requests": MOTION_REQUEST}
+    inputs = {"motion": Input(MotionStatus, "below.motion")}
+    outputs = {"requests": MotionRequest}
     params = ScriptParams
 
     def __init__(self, context: LevelContext) -> None:

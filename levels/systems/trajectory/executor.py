@@ -12,20 +12,20 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
-from rack.levels.messages import WORLD_MODEL
-from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.messages import WorldState
+from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
 from rack.levels.systems.trajectory.legs import WorldSight
 from rack.levels.systems.trajectory.messages import (
-    MOTION_REQUEST,
-    MOTION_STATE,
-    MOTION_STATUS,
     MotionKind,
+    MotionRequest,
+    MotionState,
+    MotionStatus,
 )
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import Agenda
@@ -50,18 +50,18 @@ class TrajectoryExecutor(Executor):
     """
 
     inputs = {
-        "requests": Input(MOTION_REQUEST, "above.requests"),
-        "boards": Input(JOINT_STATUS, "below.status", many=True),
-        "world": Input(WORLD_MODEL, "world.model"),
-        "last_command": Input(JOINT_REFERENCE, "own.command"),
-        "last_status": Input(MOTION_STATUS, "own.status"),
-        "last_state": Input(MOTION_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
+        "requests": Input(MotionRequest, "above.requests"),
+        "boards": Input(JointStatus, "below.status", many=True),
+        "world": Input(WorldState, "world.model"),
+        "last_command": Input(JointReference, "own.command"),
+        "last_status": Input(MotionStatus, "own.status"),
+        "last_state": Input(MotionState, "own.state"),
+        "operator": Input(OperatorCommand, "own.operator"),
     }
     outputs = {
-        "command": JOINT_REFERENCE,
-        "status": Output(MOTION_STATUS, rests_on="boards"),
-        "state": MOTION_STATE,
+        "command": JointReference,
+        "status": Output(MotionStatus, rests_on="boards"),
+        "state": MotionState,
     }
     commands = HOLDABLE
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams

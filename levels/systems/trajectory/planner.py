@@ -25,11 +25,11 @@ from rack.levels.level import (
     Ports,
     Program,
 )
-from rack.levels.messages import TASK_STATUS, WORLD_MODEL
+from rack.levels.messages import TaskStatus, WorldState
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.robot.cell import cell_of
-from rack.levels.systems.trajectory.messages import HELD, MOTION_REQUEST, MOTION_STATUS, MotionKind
+from rack.levels.systems.trajectory.messages import HELD, MotionKind, MotionRequest, MotionStatus
 from rack.levels.tables import (
     Finite,
     NotNegative,
@@ -186,8 +186,8 @@ class RequestExecutor(Executor):
     """Reports the program done, or the error that ended it. It obeys no operator: the trajectory
     level does."""
 
-    inputs = {"status": Input(MOTION_STATUS, "below.status")}
-    outputs = {"status": TASK_STATUS}
+    inputs = {"status": Input(MotionStatus, "below.status")}
+    outputs = {"status": TaskStatus}
     params = PlanningParams
     program = MotionProgram
 
@@ -225,10 +225,10 @@ class RequestPlanner(Planner):
     """
 
     inputs = {
-        "status": Input(MOTION_STATUS, "below.status"),
-        "world": Input(WORLD_MODEL, "world.model"),
+        "status": Input(MotionStatus, "below.status"),
+        "world": Input(WorldState, "world.model"),
     }
-    output = Output(MOTION_REQUEST, queued=True)
+    output = Output(MotionRequest, queued=True)
     params = PlanningParams
     program = MotionProgram
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from rack.backplane.message import Field, State, status
+from rack.backplane.message import State, Status, field
 from rack.levels.level import Executor, Input, Ports
 
-RELAYED = status(
-    "relayed", 1, Field("sent", "i8", "tick", "cycle in which the first board sent this message")
-)
+
+class Relayed(Status, version=1):
+    """A message that is passed on from board to board."""
+
+    sent: int = field(unit="tick", doc="cycle in which the first board sent this message")
 
 
 class Sender(Executor):
     """Sends a message in every cycle."""
 
-    outputs = {"status": RELAYED}
+    outputs = {"status": Relayed}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Send."""
@@ -24,8 +26,8 @@ class Sender(Executor):
 class Relay(Executor):
     """Passes on the message of another board, which the config wires to `message`."""
 
-    inputs = {"message": Input(RELAYED, "own.status")}
-    outputs = {"status": RELAYED}
+    inputs = {"message": Input(Relayed, "own.status")}
+    outputs = {"status": Relayed}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Pass it on; -1 while there is none."""
