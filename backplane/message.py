@@ -32,10 +32,6 @@ from rack.backplane.message_type import Field, MessageType
 REASON_BYTES = 120
 COMMAND_ID = "id"
 """First field of every command: its serial."""
-NOT_SENT = (
-    "its board writes this message in every cycle: declare the port as Output(..., queued=True) to"
-    " send it"
-)
 _SET = object.__setattr__
 B = TypeVar("B", bound="Message")
 _KINDS: Mapping[type, tuple[str, str]] = {
@@ -205,20 +201,6 @@ class Message(metaclass=_Slotted):
         """Copy the bytes of a message of the same type."""
         self.raw[:] = other.raw
 
-    def send(self, basis: int | None = None) -> bool:
-        """Put a copy into the queue to which an output port leads; return False if the queue is
-        full.
-
-        Of a port that is written on demand: have the board write it in this cycle, resting on
-        information of tick `basis`. Messages of other mailboxes are written in every cycle: there
-        it raises `MailboxError`.
-        """
-        raise MailboxError(NOT_SENT)
-
-    def room(self) -> int:
-        """Return how many messages the queue still takes in this cycle; raises as `send` does."""
-        raise MailboxError(NOT_SENT)
-
     def __setattr__(self, name: str, value: Any) -> None:
         try:
             _SET(self, name, value)
@@ -350,21 +332,6 @@ def _holds(kind: str, value: Any) -> bool:
         return False
     plain = value.encode() if isinstance(value, str) else value
     return stored.dtype.kind == "f" or bool(np.all(stored == plain))
-
-
-def sending(plain: Message, send: Callable[..., bool], room: Callable[[], int]) -> Message:
-    """Return a message on the bytes of `plain` that has these methods `send` and `room`."""
-    resolved = type(plain)
-    kind = resolved.message_type
-    body = {"__slots__": ("room", "send")}
-    options = {"version": kind.version, "message": kind.name}
-    made = type(resolved)(resolved.__name__, (resolved,), body, **options)
-    message: Message = object.__new__(made)
-    message.__init__(plain.record.dtype, plain.raw)  # type: ignore[misc]
-    # Their slots hide the methods of `Message`.
-    _SET(message, "send", send)
-    _SET(message, "room", room)
-    return message
 
 
 class Command(Message):

@@ -88,6 +88,9 @@ class Segment:
         self._life: ProcessLock | None = None
         self.bytes = memoryview(memory)
         self.words = self.bytes.cast("q")
+        self.message_classes: dict[str, type[Message]] = {}
+        """Classes of the messages that this process reads and writes, by mailbox: see
+        `AnyMessage` for others."""
         self.layout: Layout
         self.config: str
         self.published: str

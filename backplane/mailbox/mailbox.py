@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 from xxhash import xxh3_64_intdigest as xxh3
 
@@ -46,17 +46,20 @@ class Verdict(IntEnum):
     BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one
 
 
-class Reading(NamedTuple):
+M = TypeVar("M", bound=Message, covariant=True)
+
+
+class Reading(NamedTuple, Generic[M]):
     """A message, all zero before the first one, and the verdict of the read.
 
     `is_lost`: its writer is dead, hangs, or has been silent for too long for its period. `earlier`:
     in a mailbox where every message counts, the unread ones before this one, oldest first.
     """
 
-    value: Message
+    message: M
     verdict: Verdict
     is_lost: bool = False
-    earlier: tuple[Message, ...] = ()
+    earlier: tuple[M, ...] = ()
 
     @property
     def is_new(self) -> bool:

@@ -75,7 +75,7 @@ def queues_of(layout: Layout) -> list[MailboxSpec]:
 
 
 class QueueWriter(Writer):
-    """The one writer of a queue. A level fills `message` and calls its `send`; the board calls
+    """The one writer of a queue. A level fills `message` and calls `send`; the board calls
     `write`, once a cycle.
 
     `taken` is the reader's position as of the writer's release tick: the board keeps it up to date.
@@ -89,7 +89,6 @@ class QueueWriter(Writer):
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before this.
         self._shared[Box.SENT] = self.serial
-        self.message = sending(slots.message, self._send, self.room)
         self.taken = 0
         self._pending: list[bytes] = []
         self._shown_at = 0
@@ -99,7 +98,8 @@ class QueueWriter(Writer):
         unread = self.serial - self.taken + self.held + len(self._pending)
         return max(0, self.spec.capacity - unread)
 
-    def _send(self, basis: int | None = None) -> bool:
+    def send(self, basis: int | None = None) -> bool:
+        """Put a copy of the message into the queue; return False if it is full."""
         if not self.room():
             self.refused += 1
             self._shared[Box.REFUSED] += 1
@@ -168,7 +168,7 @@ class QueueReader(Reader):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
-        written = int(Reader(segment, taken_name(name)).peek().value.taken)
+        written = int(Reader(segment, taken_name(name)).peek().message.taken)
         taken, rest = divmod(self._box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
