@@ -8,7 +8,7 @@ running rack needs the rest:
     from rack.backplane import Segment, open_observer
 
     segment = Segment.attach("nasrem")
-    print(open_observer(segment, "servo.status").peek().value)
+    print(open_observer(segment, "servo.status").peek().message)
 
 - `Segment` is a rack's memory, `Layout` its mailboxes and tasks as plain data (`MailboxSpec`,
   `TaskSpec`).

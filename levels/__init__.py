@@ -1,8 +1,8 @@
 """Virtual control loops: the public API of a level's author. `rack.levels.level` describes what a
 level must do.
 
-- Write a level: `Executor`, `Planner`, with `Input`, `Ports`, `Program`, `Reading`, `Verdict`,
-  `LevelContext`, `Pace`.
+- Write a level: `Executor`, `Planner`, with the ports `Input`, `Inputs`, `Output`, `QueuedOutput` and
+  `TimedOutput`, with `Reading`, `Verdict`, `Program`, `LevelContext`, `Pace`.
 - Declare messages: `Message`, `Command`, `Status`, `field`, `State`; the default levels' messages
   are in `rack.levels.messages`, and their error codes in `Error`.
 - Declare parameters: `Table`, `Positive`, `Finite`, `read_params`, `LIVE`, `set_live`; arm and
@@ -78,18 +78,20 @@ __all__ = [
     "Finite",
     "Goal",
     "Input",
+    "Inputs",
     "LevelContext",
     "LevelError",
     "Message",
     "Operation",
     "OperatorCommand",
     "Orders",
+    "Output",
     "Pace",
     "Planner",
-    "Ports",
     "Positive",
     "Program",
     "ProgramError",
+    "QueuedOutput",
     "Reading",
     "Refused",
     "RobotConfig",
@@ -98,6 +100,7 @@ __all__ = [
     "State",
     "Status",
     "Table",
+    "TimedOutput",
     "Verdict",
     "field",
     "read_params",
@@ -113,12 +116,15 @@ _PLACES = {
         "Fault",
         "Finding",
         "Input",
+        "Inputs",
         "LevelContext",
+        "Output",
         "Pace",
         "Planner",
-        "Ports",
         "Program",
+        "QueuedOutput",
         "Reading",
+        "TimedOutput",
         "Verdict",
     ),
     "rack.levels.messages": ("Error",),

@@ -82,7 +82,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType, ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any, ClassVar, NamedTuple, Self
 
 from pydantic import ValidationError, model_validator

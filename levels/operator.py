@@ -202,7 +202,7 @@ class Orders:
         if not operator.is_new:
             return False
         taken = False
-        for message in (*operator.earlier, operator.value):
+        for message in (*operator.earlier, operator.message):
             replaced = self.in_force
             if self._take_up(message):
                 taken = taken or message.what not in (*SETTINGS, *DRIVES)

@@ -100,16 +100,21 @@ class Output(Port[M]):
         cycles: Written in every n-th cycle: the last one before a multiple of n cycles' ticks,
             counted from the board's phase, so that readers released then find it fresh. If that
             cycle is missed, the message is missing too.
-        rests_on: The input whose information it passes on; default: the input of the same name, if
-            there is one. Its messages carry the tick of that information, of an input that reads
-            many the oldest, of none their own release. By these ticks the response of the whole
-            hierarchy is measured.
+        rests_on: The input whose information it passes on. Its messages carry the tick of that
+            information, of an input that reads many the oldest, of none their own release. By
+            these ticks the response of the whole hierarchy is measured.
     """
 
     queued = False
     max_age_s = 0.0
 
-    def __init__(self, message: type[M], *, cycles: int = 1, rests_on: str = "") -> None:
+    def __init__(
+        self,
+        message: type[M],
+        *,
+        cycles: int = 1,
+        rests_on: Input[Any] | Inputs[Any] | None = None,
+    ) -> None:
         self.message = message
         self.cycles = cycles
         self.rests_on = rests_on

@@ -35,7 +35,7 @@ from struct import Struct
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.message import Message, copied, field, sending
+from rack.backplane.message import Message, copied, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 

@@ -113,7 +113,8 @@ class TaskPorts:
 
     def rests_on(self, output: str) -> tuple[str, ...]:
         """Return the mailboxes on whose information an output rests."""
-        return mailboxes_of(self.reads.get(self.outputs[output].rests_on or output, {}))
+        source = self.outputs[output].rests_on
+        return () if source is None else mailboxes_of(self.reads.get(source.name, {}))
 
 
 def rewired(config: RackConfig, place: TaskPlace) -> Mapping[str, Sources]:
@@ -139,6 +140,8 @@ def with_made_ports(
     if not issubclass(ports.kind, Executor):
         return ports
     made = ports.kind.made_ports(config.board[ports.place.board].params, types)
+    for port, entry in made.inputs.items():
+        entry.name = port
     return replace(
         ports,
         inputs={**ports.inputs, **made.inputs},
@@ -165,20 +168,14 @@ def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
             raise LookupError(
                 f"port '{many[0]}' reads many mailboxes; permitted on the host side: one"
             )
-        return program, _outputs(program.outputs)
+        return program, program.outputs
     if role == "executor":
         executor = find_class(wanted, Executor)
-        return executor, _outputs(executor.outputs)
+        return executor, executor.outputs
     planner = find_class(wanted, Planner)
-    if (output := getattr(planner, "output", None)) is None:
-        raise LookupError("the class has no 'output', the message class of its plan")
-    return planner, _outputs({"plan": output})
-
-
-def _outputs(given: Mapping[str, type[Message] | Output]) -> dict[str, Output]:
-    return {
-        port: kind if isinstance(kind, Output) else Output(kind) for port, kind in given.items()
-    }
+    if not planner.outputs:
+        raise LookupError("the class has no 'output', the port of its plan")
+    return planner, planner.outputs
 
 
 def _connections(

@@ -54,7 +54,7 @@ from rack.boards.host.entries import (
 )
 from rack.boards.wiring import Entries
 from rack.levels.errors import CannotGoOn
-from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
+from rack.levels.level import Input, LevelContext, MadePorts, Output, QueuedOutput, Sender
 from rack.levels.tables import read_params
 
 LONGEST_S = 30.0
@@ -92,7 +92,9 @@ class BusAdapter(Adapter):
         # A message that is passed once must not be sampled; to host boards a bridge writes by
         # itself.
         outputs = {
-            port: Output(types[entry.source], queued=entry.asynchronous)
+            port: (QueuedOutput if entry.asynchronous else Output)(
+                types[entry.source], rests_on=inputs[port]
+            )
             for port, entry in known.items()
         }
         is_whole = bool(entries) and known == entries
@@ -125,7 +127,7 @@ class BusAdapter(Adapter):
                 entry = Outward(segment, own.spec.name, port, table, self._counts[port])
             else:
                 if before.is_there:
-                    self._before[port] = bytes(before.value.raw)
+                    self._before[port] = bytes(before.message.raw)
                 if entries is None:
                     self._hosts[writer] = segment.block(writer)
                     entry = Inward(segment, port, table, self._counts[port])
@@ -146,24 +148,25 @@ class BusAdapter(Adapter):
         if not before.is_there:
             return
         for port, count in self._counts.items():
-            count.resume(getattr(before.value, port), status.newest)
+            count.resume(getattr(before.message, port), status.newest)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Exchange the entries that are due; then, in lockstep, let programs run."""
         if self._before:
             for port, message in self._before.items():
-                getattr(write, port).raw[:] = message
+                out = self.ports[port]
+                (out.message if isinstance(out, Sender) else out).raw[:] = message
             self._before.clear()
         cycle = (tick - self.context.phase) // self.context.every
         for table, entry in self._entries:
             if table.is_due(cycle):
-                entry.exchange(read, write, tick)
+                entry.exchange(self.readings, self.ports, tick)
         for turn in self._turns:
             turn.take(tick)
         if self._statuses is not None:
-            self._statuses.exchange(read, write, tick)
+            self._statuses.exchange(self.readings, self.ports, tick)
         else:
-            self._report(write.status, tick)
+            self._report(self.ports[STATUS], tick)
 
     def _report(self, status: Message, tick: int) -> None:
         for port, count in self._counts.items():

@@ -19,7 +19,6 @@ from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block
 from rack.boards.wiring import Rows
-from rack.levels.level import Ports
 from rack.levels.tables import LAST_TICK, Table
 
 NEVER = -1
@@ -140,7 +139,9 @@ class EntryCount:
 class Crossing(Protocol):
     """One entry, at work."""
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> object:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> object:
         """Exchange, in a cycle in which that is due."""
 
 
@@ -157,17 +158,19 @@ class Inward:
         self._ring.superseded = count.superseded
         self._writer = segment.block(self._ring.spec.writer)
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> None:
         """Take what waits, and check it. In lockstep what a program sends is there once its
         computing is over."""
         ring = self._ring
         count = self._count
-        out = getattr(write, self._port)
+        out = write[self._port]
         waiting = ring.waiting if self._writer[Block.DEADLINE] <= tick else 0
         if self._table.asynchronous:
             for _ in range(min(waiting, self._table.most, out.room())):
                 if (message := ring.take()) is not None:
-                    out.copy_from(message)
+                    out.message.copy_from(message)
                     out.send()
                     count.passes(tick, ring.written)
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
@@ -196,12 +199,14 @@ class Outward:
             (segment.block(name), wake_semaphore(segment.rack, name)) for name in readers
         ]
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> None:
         """Copy what is there."""
-        reading: Reading = getattr(read, self._port)
+        reading = read[self._port]
         if not reading.is_there or (self._table.asynchronous and not reading.is_new):
             return
-        for message in (*reading.earlier, reading.value):
+        for message in (*reading.earlier, reading.message):
             self._writer.message.copy_from(message)
             self._writer.write(tick)
         # A reading does not say when its message was written.
@@ -228,14 +233,17 @@ class Replayed:
         self._is_sent = is_sent
         self._at = sum(tick <= since for tick, _, _ in rows) if is_sent else 0
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> bool:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> bool:
         """Give out what the recorded run wrote up to this cycle; return whether there was some."""
-        out = getattr(write, self._port)
+        out = write[self._port]
+        message = out.message if self._is_sent else out
         rows = self._rows
         before = self._at
         while self._at < len(rows) and rows[self._at][0] <= tick:
             _, basis, content = rows[self._at]
-            out.raw[:] = content
+            message.raw[:] = content
             self._at += 1
             if self._is_sent:
                 out.send(basis)

@@ -36,7 +36,7 @@ from rack.boards.lan.peers import Peers
 from rack.boards.lan.replayed import ReplayedNetwork
 from rack.boards.wiring import Entries
 from rack.levels.errors import LevelError
-from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
+from rack.levels.level import Input, LevelContext, MadePorts, Output, TimedOutput
 from rack.levels.peer import PeerPresence, peer_port
 from rack.levels.tables import read_params
 
@@ -174,10 +174,11 @@ class LanAdapter(Adapter):
             return MadePorts(is_whole=False)
         known = {port: entry for port, entry in table.exports.items() if entry.source in types}
         inputs = {port: Input(types[entry.source], entry.source) for port, entry in known.items()}
-        outputs = {STATUS: Output(status_of(table.exports, table.imports))}
+        status = Output(status_of(table.exports, table.imports))
+        outputs: dict[str, Output[Any]] = {STATUS: status}
         for port, entry in table.imports.items():
             try:
-                outputs[port] = Output(entry.message_class(), max_age_s=entry.max_age_ms * 1e-3)
+                outputs[port] = TimedOutput(entry.message_class(), entry.max_age_ms * 1e-3)
             except LookupError:
                 continue
         is_whole = len(known) == len(table.exports) and len(outputs) == 1 + len(table.imports)
@@ -208,7 +209,7 @@ class LanAdapter(Adapter):
             if (
                 before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()
             ).is_there:
-                peer.resume(before.value, seen_by)
+                peer.resume(before.message, seen_by)
         self._imports = {
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack], self._grid)
             for port, entry in table.imports.items()
@@ -228,11 +229,11 @@ class LanAdapter(Adapter):
         observer = open_observer(segment, f"{board}.{STATUS}")
         if (before := observer.peek()).is_there:
             for port, export in self._exports.items():
-                export.resume(getattr(before.value, f"export_{port}"))
+                export.resume(getattr(before.message, f"export_{port}"))
             for port, entry in self._imports.items():
-                entry.resume(getattr(before.value, f"import_{port}"), observer.newest)
-            self._desk.resume(before.value.desk)
-            self._flaws = before.value.flaws.tolist()
+                entry.resume(getattr(before.message, f"import_{port}"), observer.newest)
+            self._desk.resume(before.message.desk)
+            self._flaws = before.message.flaws.tolist()
         if self._grid.is_lockstep and table.racks:
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
@@ -270,12 +271,12 @@ class LanAdapter(Adapter):
                 export.recall(barrier.done, self.context.every)
             barrier.prepare(barrier.done)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Exchange what is due."""
         if self._replayed is not None:
             self._replayed.begin(tick)
             self._look(tick)
-            self._replayed.give(read, write, tick)
+            self._replayed.give(self.ports, tick)
             return
         cycle = tick // self.context.every
         if self._barrier is None:
@@ -290,10 +291,10 @@ class LanAdapter(Adapter):
         for port, entry in self._imports.items():
             entry.look(tick)
             if cycle % entry.every == 0:
-                entry.exchange(getattr(write, port), tick)
+                entry.exchange(self.ports[port], tick)
         self._clocks.exchange()
         self._desk.answer(tick)
-        self._report(write, tick)
+        self._report(tick)
 
     def _look(self, tick: int) -> None:
         """Note who has come, and who has gone."""
@@ -313,8 +314,8 @@ class LanAdapter(Adapter):
             since = tick + self.context.every if self._grid.is_lockstep else tick
             self._words[System.PEER_STOP] = switch(since, must_stop)
 
-    def _report(self, write: Ports, tick: int) -> None:
-        own: Message = write.status
+    def _report(self, tick: int) -> None:
+        own = self.ports[STATUS]
         self._clocks.count(own.clocks)
         for port, export in self._exports.items():
             export.fill(getattr(own, f"export_{port}"))
@@ -322,7 +323,7 @@ class LanAdapter(Adapter):
             entry.fill(getattr(own, f"import_{port}"), tick)
         self._desk.fill(own.desk)
         for peer in self._peers:
-            out = getattr(write, peer_port(peer.rack))
+            out = self.ports[peer_port(peer.rack)]
             self._clocks.fill(out, peer.rack, tick)
             peer.fill(out, self._grid.is_lockstep)
         if self._link is not None and not self._grid.is_lockstep:

@@ -57,7 +57,7 @@ class PlanStore:
         """
         if not plan.is_new:
             return
-        message = copied(plan.value)
+        message = copied(plan.message)
         if message.replan:
             self._answer = message
             return

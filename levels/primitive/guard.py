@@ -162,7 +162,7 @@ class Sight:
 
     def update(self, world: Reading, q: Array, tick: int) -> None:
         """Process the newest world model; `q` (joints,), rad, is where the arm rests."""
-        model = world.value
+        model = world.message
         seen = world.is_there and model.revision > 0
         self._blind = self._has_bodies and (not seen or tick - model.sensed > self._blind_ticks)
         if self._waiting is not None and seen and model.sensed >= self._waiting[1]:

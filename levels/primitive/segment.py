@@ -99,14 +99,14 @@ def recall(read: Ports) -> Memory:
     """Return the state in the level's own last messages; not `is_known` before the first ones."""
     status = read.last_status
     command = read.last_command
-    if not (status.is_there and command.is_there and command.value.id):
+    if not (status.is_there and command.is_there and command.message.id):
         return Memory()
     return Memory(
         is_known=True,
-        done=status.value.done,
-        interrupted=status.value.current,
-        progress=status.value.progress,
-        held=status.value.held,
-        opening=command.value.opening,
-        force=command.value.force,
+        done=status.message.done,
+        interrupted=status.message.current,
+        progress=status.message.progress,
+        held=status.message.held,
+        opening=command.message.opening,
+        force=command.message.force,
     )

@@ -47,7 +47,7 @@ class Tracking:
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
-        servo = status.value
+        servo = status.message
         left_alone = bool(servo.holding) and self._cycles_in_step > HANDOVER_CYCLES
         if self.silent_cycles > MAX_MISSED_STATUSES or left_alone or servo.stopped:
             self.in_step = False

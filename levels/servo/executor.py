@@ -10,7 +10,7 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.level import Input, LevelContext, Misfits, Ports, Verdict
+from rack.levels.level import Input, LevelContext, Misfits, Output, Verdict
 from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
 from rack.levels.operator import DRIVES, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Terms
@@ -33,13 +33,13 @@ class ServoExecutor(ArmDriver):
     See `ArmDriver`.
     """
 
-    inputs = {
-        "command": Input(JointCommand, "above.command"),
-        "plan": Input(ServoPlan, "own.plan"),
-        "before": Input(ArmState, "own.state"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"status": ServoStatus, "state": ArmState, "scene": SCENES}
+    above = Input(JointCommand, "above.command")
+    plan = Input(ServoPlan, "own.plan")
+    before = Input(ArmState, "own.state")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(ServoStatus)
+    state = Output(ArmState)
+    scene = SCENES
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
@@ -88,14 +88,14 @@ class ServoExecutor(ArmDriver):
             why = f'they modify a law of torques; [robot] interface is "{interface}"'
             yield "params.modifications", ", ".join(names), why
 
-    def take_messages(self, read: Ports) -> None:
+    def take_messages(self) -> None:
         """Take over what is new."""
-        if read.operator.verdict is Verdict.NEW:
-            self.operator.take(read.operator, self.sensors.position)
-        if read.plan.verdict is Verdict.NEW:
-            self._loop.take(read.plan.value)
-        if read.command.verdict is Verdict.NEW:
-            command: Message = read.command.value
+        if self.operator.verdict is Verdict.NEW:
+            self.operator.take(self.operator, self.sensors.position)
+        if self.plan.verdict is Verdict.NEW:
+            self._loop.take(self.plan.message)
+        if self.above.verdict is Verdict.NEW:
+            command: Message = self.above.message
             self.command = command.id
             self.rests_on = command.operator
             self.reference.take(command)

@@ -10,7 +10,7 @@ from pydantic import Field as Parameter
 
 from rack.backplane.message import Message, State, Status, field
 from rack.backplane.process import compute_until
-from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output, Planner
 from rack.levels.tables import Table, read_params
 
 
@@ -49,7 +49,7 @@ class FigureParams(Table):
 class FigureLoop(Executor):
     """Computes for X of processor time in every cycle: a level without a planner."""
 
-    outputs = {"status": FigureStatus}
+    status = Output(FigureStatus)
     params = FigureParams
     plan = -1
     """Release that the plan in force answers; -1: there is none."""
@@ -62,10 +62,10 @@ class FigureLoop(Executor):
             times_ms = (times_ms,)
         self._times_ns = [round(ms * NS_PER_MS) for ms in times_ms]
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Report, then compute; time spent preempted does not count."""
         end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
-        status = write.status
+        status = self.status
         status.state = State.EXECUTING
         status.cycle = tick
         status.plan = self.plan
@@ -75,20 +75,20 @@ class FigureLoop(Executor):
 class FigureExecutor(FigureLoop):
     """Reports which plan is in force, too."""
 
-    inputs = {"plan": Input(FigurePlan, "own.plan")}
+    plan = Input(FigurePlan, "own.plan")
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Report, with the plan in force, then compute."""
-        if read.plan.is_there:
-            self.plan = read.plan.value.made_at
-        super().process(read, write, tick)
+        if self.plan.is_there:
+            self.plan = self.plan.message.made_at
+        super().process(tick)
 
 
 class FigurePlanner(Planner):
     """Computes for P of processor time, then begins the next plan: one is always wanted."""
 
-    inputs = {"status": Input(FigureStatus, "own.status")}
-    output = FigurePlan
+    status = Input(FigureStatus, "own.status")
+    output = Output(FigurePlan)
     params = FigureParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -96,13 +96,13 @@ class FigurePlanner(Planner):
         super().__init__(context)
         self._time_ns = round(read_params(FigureParams, context.params).plan_ms * NS_PER_MS)
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return True: a plan is always wanted."""
         return True
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Report, then compute; time spent preempted does not count."""
         end = process_time_ns() + self._time_ns
-        write.made_at = tick
-        write.cycle = read.status.value.cycle if read.status.is_there else -1
+        self.output.made_at = tick
+        self.output.cycle = self.status.message.cycle if self.status.is_there else -1
         compute_until(end)

@@ -87,7 +87,7 @@ class AttachedRack:
         reading = self.read(signal.mailbox)
         if not reading.is_there:
             raise Failure(f"mailbox '{signal.mailbox}' has no message yet")
-        return signal.in_message(reading.value.record)
+        return signal.in_message(reading.message.record)
 
     @as_failure()
     def command(self, level: str, what: str, wait_s: float | None = None, **goal: Any) -> Reply:

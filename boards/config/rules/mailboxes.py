@@ -29,8 +29,8 @@ def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Mistakes:
     table = place.table
     inputs = ", ".join(ports.kind.inputs) or "none"
     for output, told in ports.outputs.items():
-        if told.rests_on and told.rests_on not in ports.inputs:
-            why = f"its output '{output}' rests on '{told.rests_on}'; inputs: {inputs}"
+        if told.rests_on is not None and told.rests_on.name not in ports.inputs:
+            why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
             yield Mistake(f"{table}.{role}", place.target, why)
     for port, given in rewired(wiring.config, place).items():
         if port not in ports.kind.inputs:

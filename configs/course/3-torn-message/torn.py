@@ -6,7 +6,7 @@ from time import sleep
 import numpy as np
 
 from rack.backplane.message import Message, State, Status, field
-from rack.levels.level import Executor, Input
+from rack.levels.level import Executor, Input, Output
 
 
 class Numbers(Message, version=1):
@@ -36,28 +36,28 @@ def is_torn(numbers):
 class Writer(Executor):
     """Writes the number of its cycle 16 times."""
 
-    outputs = {"message": Numbers}
+    message = Output(Numbers)
 
-    def process(self, read, write, tick):
+    def process(self, tick):
         for place in range(16):
             MEMORY[place] = tick
-            write.message.numbers[place] = tick
+            self.message.numbers[place] = tick
             sleep(WORD_S)
 
 
 class Reader(Executor):
     """Counts the messages that are torn."""
 
-    inputs = {"message": Input(Numbers, "writer.message")}
-    outputs = {"status": TornCounts}
+    message = Input(Numbers, "writer.message")
+    status = Output(TornCounts)
 
-    def process(self, read, write, tick):
-        counts = write.status
+    def process(self, tick):
+        counts = self.status
         if counts.reads == READS:
             return
         counts.reads += 1
         counts.memory += is_torn(MEMORY.copy())
-        counts.mailbox += is_torn(read.message.value.numbers)
+        counts.mailbox += is_torn(self.message.message.numbers)
         counts.state = State.DONE if counts.reads == READS else State.EXECUTING
         counts.reason = (
             f"{counts.reads} reads: {counts.memory} torn in memory, {counts.mailbox} in the mailbox"

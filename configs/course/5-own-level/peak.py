@@ -1,7 +1,7 @@
 """A level of one's own: the greatest speed of any joint so far."""
 
 from rack.backplane.message import State, Status, field
-from rack.levels.level import Executor, Input
+from rack.levels.level import Executor, Input, Output
 from rack.levels.messages import ServoStatus
 
 
@@ -14,10 +14,10 @@ class PeakStatus(Status, version=1):
 class Peak(Executor):
     """Reads the servo level's status, and keeps the greatest speed in it."""
 
-    inputs = {"servo": Input(ServoStatus, "servo.status")}
-    outputs = {"status": PeakStatus}
+    servo = Input(ServoStatus, "servo.status")
+    status = Output(PeakStatus)
 
-    def process(self, read, write, tick):
-        speed = abs(read.servo.value.velocity).max()
-        write.status.state = State.EXECUTING
-        write.status.speed = max(write.status.speed, speed)
+    def process(self, tick):
+        speed = abs(self.servo.message.velocity).max()
+        self.status.state = State.EXECUTING
+        self.status.speed = max(self.status.speed, speed)

@@ -3,7 +3,7 @@
 from time import monotonic
 
 from rack.backplane.message import State, Status, field
-from rack.levels.level import Executor, Input
+from rack.levels.level import Executor, Input, Output
 from rack.levels.messages import ServoStatus
 
 
@@ -25,37 +25,37 @@ TIME_CONSTANT_S = 0.1
 class Smooth(Executor):
     """A low-pass filter of the fastest joint's speed."""
 
-    inputs = {"servo": Input(ServoStatus, "servo.status")}
-    outputs = {"status": SmoothStatus}
+    servo = Input(ServoStatus, "servo.status")
+    status = Output(SmoothStatus)
 
     def __init__(self, context):
         super().__init__(context)
         self.before_s = monotonic()
 
-    def process(self, read, write, tick):
+    def process(self, tick):
         now_s = monotonic()
         part = (now_s - self.before_s) / TIME_CONSTANT_S
         self.before_s = now_s
-        speed = abs(read.servo.value.velocity).max()
-        write.status.state = State.EXECUTING
-        write.status.speed += min(part, 1.0) * (speed - write.status.speed)
+        speed = abs(self.servo.message.velocity).max()
+        self.status.state = State.EXECUTING
+        self.status.speed += min(part, 1.0) * (speed - self.status.speed)
 
 
 class Rises(Executor):
     """Counts how often the smoothed speed begins to rise."""
 
-    inputs = {"smooth": Input(SmoothStatus, "smooth.status")}
-    outputs = {"status": RisesStatus}
+    smooth = Input(SmoothStatus, "smooth.status")
+    status = Output(RisesStatus)
 
     def __init__(self, context):
         super().__init__(context)
         self.speed = 0.0
         self.is_rising = False
 
-    def process(self, read, write, tick):
-        speed = read.smooth.value.speed
+    def process(self, tick):
+        speed = self.smooth.message.speed
         is_rising = speed > self.speed
-        write.status.state = State.EXECUTING
-        write.status.rises += is_rising and not self.is_rising
+        self.status.state = State.EXECUTING
+        self.status.rises += is_rising and not self.is_rising
         self.speed = speed
         self.is_rising = is_rising

@@ -1,5 +1,5 @@
 from rack.backplane.message import State, Status, field
-from rack.levels.level import Executor, Input
+from rack.levels.level import Executor, Input, Output
 from rack.levels.messages import ServoStatus
 
 
@@ -13,12 +13,12 @@ class PowerStatus(Status, version=1):
 class PowerMeter(Executor):
     """What the arm takes, from torque and velocity."""
 
-    inputs = {"servo": Input(ServoStatus, "servo.status")}
-    outputs = {"status": PowerStatus}
+    servo = Input(ServoStatus, "servo.status")
+    status = Output(PowerStatus)
 
-    def process(self, read, write, tick):
-        arm = read.servo.value
-        meter = write.status
+    def process(self, tick):
+        arm = self.servo.message
+        meter = self.status
         meter.state = State.EXECUTING
         meter.power = float((arm.torque * arm.velocity).sum())
         meter.energy += max(meter.power, 0.0) * self.context.period_s

@@ -124,7 +124,7 @@ class Agreement:
         """Return the answers of these arms to the present order."""
         said = dict.fromkeys(arms, Response.NONE)
         for arm in arms:
-            answer = self._answers[arm].value
+            answer = self._answers[arm].message
             if (answer.program, answer.echo) == (self.program, self.order):
                 said[arm] = Response(answer.response)
         return said
@@ -136,7 +136,7 @@ class Agreement:
 
     def _await(self) -> None:
         """Go on once every arm reports, with the step that the reports show, or with the end."""
-        answers = [reading.value for reading in self._answers.values()]
+        answers = [reading.message for reading in self._answers.values()]
         ours = [answer for answer in answers if answer.program == self.program]
         ended = [answer for answer in ours if answer.response == Response.ENDED]
         newest = max([answer.echo for answer in ended or ours], default=0)
@@ -168,7 +168,7 @@ class Agreement:
             self.phase = Phase.DOING  # told so by a launch before this one
         elif all(r is Response.POSSIBLE for r in said.values()) and self._are_there(said):
             arrives_s = self._now_s + self._margin_s
-            times = [self._answers[arm].value.until for arm in said]
+            times = [self._answers[arm].message.until for arm in said]
             in_time = all(arrives_s <= until_s for until_s in times if until_s)
             self.phase = Phase.DOING if in_time else Phase.CANCELLING
 
@@ -202,7 +202,7 @@ class Agreement:
         """End the program if an arm has given one of these answers; return whether it has."""
         for arm, response in said.items():
             if response in kinds:
-                answer = self._answers[arm].value
+                answer = self._answers[arm].message
                 what = f"step {self.step} {response.name.lower()}: {arm}"
                 reason = f"{what}: {answer.reason}".removesuffix(": ")
                 self.end(Error(answer.error) or Error.GIVEN_UP, reason)

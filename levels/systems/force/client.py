@@ -25,7 +25,7 @@ from pydantic import ValidationError
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
-from rack.levels.level import Input, LevelContext, Misfits, Program
+from rack.levels.level import Input, LevelContext, Misfits, Output, Program
 from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
 from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
@@ -213,8 +213,8 @@ class ForceMotions(Motions):
 class ForceClient(CommandEnvironment):
     """Runs a script that commands forces and motions by name; a prompt offers the same names."""
 
-    inputs = {"motion": Input(ServerStatus, "below.motion")}
-    outputs = {"requests": ServerRequest}
+    motion = Input(ServerStatus, "below.motion")
+    requests = Output(ServerRequest)
     program = ForceProgram
 
     def motions(self, bus: Bus) -> Motions:

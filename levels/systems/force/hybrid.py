@@ -8,7 +8,7 @@ import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array, Mask, norm
-from rack.levels.level import Input, LevelContext, Output, Ports, Reading
+from rack.levels.level import Input, Inputs, LevelContext, Output, Reading
 from rack.levels.operator import ABOVE_LOST
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
@@ -49,35 +49,35 @@ class ComplianceWatch:
     def recall(self, last: Reading) -> None:
         """Continue after a restart from the last `ForceStatus`: a guard strikes once."""
         if last.is_there:
-            self.struck = last.value.struck
-            self.axis = last.value.axis
+            self.struck = last.message.struck
+            self.axis = last.message.axis
 
-    def look(self, read: Ports, tick: int) -> None:
+    def look(self, tick: int) -> None:
         """Judge the commands and the wrench of this cycle."""
-        compliance = read.compliance.value
-        wrench = read.wrench
+        compliance = self.compliance.message
+        wrench = self.wrench
         self.task = None
         self.rests = False
         self.reason = ""
-        self.sensed = wrench.value.tick if wrench.is_there else -1
+        self.sensed = wrench.message.tick if wrench.is_there else -1
         reason = objection(compliance) if compliance.active else ""
         rotation = (
             rotation_of(compliance.frame) if compliance.frame.any() and not reason else np.eye(3)
         )
-        self.felt = turned(rotation.T, wrench.value.wrench)
+        self.felt = turned(rotation.T, wrench.message.wrench)
         if reason:
             self._rest(reason)
         elif compliance.active:
-            self._follow(read, rotation, tick)
+            self._follow(rotation, tick)
 
-    def _follow(self, read: Ports, rotation: Array, tick: int) -> None:
+    def _follow(self, rotation: Array, tick: int) -> None:
         """Do what the command says, as far as the contact is known and the level above is there."""
-        blind = self._blind(read.wrench, tick)
-        if blind or read.command.is_lost or read.compliance.is_lost:
+        blind = self._blind(self.wrench, tick)
+        if blind or self.above.is_lost or self.compliance.is_lost:
             self._rest(blind or ABOVE_LOST)
-        self._take(read.compliance.value, rotation)
+        self._take(self.compliance.message, rotation)
         if not blind:
-            self._guard(read.compliance.value)
+            self._guard(self.compliance.message)
 
     def _rest(self, reason: str) -> None:
         self.rests = True
@@ -89,7 +89,7 @@ class ComplianceWatch:
             return "no wrench from the board of the arm: waiting for it"
         if tick - self.sensed > self._oldest:
             return f"wrench is stale, {tick - self.sensed} ticks: waiting for the board of the arm"
-        return "the wrist sensor is at the end of its range" if wrench.value.saturated else ""
+        return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
 
     def _take(self, compliance: Message, rotation: Array) -> None:
         """Take over the axes of force; those forces are not sought while the motion must end."""
@@ -159,18 +159,14 @@ class HybridExecutor(WristLevel):
     the distance that force has left.
     """
 
-    inputs = {
-        "command": Input(JointReference, "above.command"),
-        "compliance": Input(Compliance, "above.compliance"),
-        "wrench": Input(Wrench, "arm.wrench"),
-        "statuses": Input(JointStatus, "below.status", many=True),
-        "last_force": Input(ForceStatus, "own.force"),
-    }
-    outputs = {
-        "command": JointReference,
-        "status": Output(JointStatus, rests_on="statuses"),
-        "force": Output(ForceStatus, rests_on="wrench"),
-    }
+    above = Input(JointReference, "above.command")
+    compliance = Input(Compliance, "above.compliance")
+    wrench = Input(Wrench, "arm.wrench")
+    statuses = Inputs(JointStatus, "below.status")
+    last_force = Input(ForceStatus, "own.force")
+    command = Output(JointReference, rests_on=above)
+    status = Output(JointStatus, rests_on=statuses)
+    force = Output(ForceStatus, rests_on=wrench)
     params = HybridGains
     preloads = (curves, dynamics, reference)
 
@@ -188,31 +184,31 @@ class HybridExecutor(WristLevel):
         self._still = np.zeros(len(cell.home))
         self._tick: int | None = None  # of the last cycle
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Follow references and forces; report."""
         if self._tick is None:
-            self._watch.recall(read.last_force)
+            self._watch.recall(self.last_force)
             self._tick = tick - self.context.every
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
-        if self._boards.update(read.statuses):
+        if self._boards.update(self.statuses):
             self._begin(self._boards.position, tick)
-        if read.command.is_new:
-            self._reference.take(read.command.value)
-        self._watch.look(read, tick)
-        write.command.id = tick // self.context.every + 1
+        if self.above.is_new:
+            self._reference.take(self.above.message)
+        self._watch.look(tick)
+        self.command.id = tick // self.context.every + 1
         for name in PASSED:
-            setattr(write.command, name, getattr(read.command.value, name))
+            setattr(self.command, name, getattr(self.above.message, name))
         if self._boards.in_step:
-            self._move(write.command, tick, passed_s)
+            self._move(self.command, tick, passed_s)
         else:
-            write.command.due = 0
+            self.command.due = 0
             self._moving[:] = 0.0
-        self._report(read, write.status)
-        force = write.force
+        self._report(self.status)
+        force = self.force
         watch = self._watch
-        force.echo = read.compliance.value.id
-        force.operator = read.compliance.value.operator
+        force.echo = self.compliance.message.id
+        force.operator = self.compliance.message.operator
         force.sensed = watch.sensed
         force.wrench = watch.felt
         force.offset = self._law.offset
@@ -245,19 +241,19 @@ class HybridExecutor(WristLevel):
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
             self._begin(self._target, tick)
 
-    def _report(self, read: Ports, status: Message) -> None:
+    def _report(self, status: Message) -> None:
         """Show the boards below as one, whose set points are those of this level."""
-        values = [reading.value for reading in read.statuses.values()]
+        values = [reading.message for reading in self.statuses.values()]
         status.position = values[0].position
         status.torque = sum(v.torque for v in values)
         status.driven = np.any([v.driven for v in values], axis=0)
         status.target = self._target
         status.target_velocity = self._moving
-        status.echo = read.command.value.id
+        status.echo = self.above.message.id
         status.operator = max(v.operator for v in values)
         status.holding = self._reference.holding
         status.stopped = not self._boards.in_step
-        status.due = read.command.value.due
+        status.due = self.above.message.due
         worst = max(values, key=lambda value: value.error)
         kept = self._watch.reason if self._boards.in_step else self._boards.awaited
         status.error = worst.error

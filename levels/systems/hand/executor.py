@@ -14,7 +14,17 @@ from rack.levels.algebra import Array
 from rack.levels.arm import substeps
 from rack.levels.arm.above import CommandsAbove
 from rack.levels.faults import TendonStep
-from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Misfits, Ports, Reading
+from rack.levels.level import (
+    Executor,
+    Fault,
+    Finding,
+    Input,
+    Inputs,
+    LevelContext,
+    Misfits,
+    Output,
+    Reading,
+)
 from rack.levels.messages import ArmState, Error
 from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import cell_of
@@ -40,12 +50,12 @@ class HandExecutor(Executor):
     when all boards above have seen it, with what these want then.
     """
 
-    inputs = {
-        "tensions": Input(TensionCommand, "above.command", many=True),
-        "before": Input(ArmState, "own.state"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"status": HandStatus, "state": ArmState, "scene": SCENES}
+    tensions = Inputs(TensionCommand, "above.command")
+    before = Input(ArmState, "own.state")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(HandStatus)
+    state = Output(ArmState)
+    scene = SCENES
     commands = HOLDABLE
     params = Table
     faults = (TendonStep,)
@@ -106,36 +116,36 @@ class HandExecutor(Executor):
                 self._torn[place] = True
         self.hand.tear(torn)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
         hand = self.hand
         # Advance the hand to tick. A restarted board first restores it.
         if not self._started:
             self._started = True
-            if read.before.is_there:
-                self.hand.restore(read.before.value)
+            if self.before.is_there:
+                self.hand.restore(self.before.message)
                 self._opened = True
             self._closed_at = tick
         self.hand.step(tick - self.hand.tick)
         if self.hand.braked and self._closed_at is None:  # no tensions came in time
             self._closed_at = tick
-        self.orders.take(read.operator)
+        self.orders.take(self.operator)
         sample = hand.sense()
         self.findings += self._slack.look(sample.tension, hand.wanted)
         self.acted |= self._torn
-        self._drive(read, tick)
-        self._report(write.status, sample, tick)
-        self.orders.report(write.status, self.tensions.rests_on)
-        hand.save(write.state)
+        self._drive(tick)
+        self._report(self.status, sample, tick)
+        self.orders.report(self.status, self.tensions.rests_on)
+        hand.save(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
-            hand.look(write.scene)
+            hand.look(self.scene)
 
-    def _drive(self, read: Ports, tick: int) -> None:
+    def _drive(self, tick: int) -> None:
         """Give the valves the tensions of the boards above, or close them and say why."""
         since = self._closed_at if self._opened else 0
-        self._waiting = self.tensions.missing(read.tensions, tick, since or 0)
+        self._waiting = self.tensions.missing(self.tensions, tick, since or 0)
         if not self._waiting:
-            self.tensions.join(read.tensions)
+            self.tensions.join(self.tensions)
             found, self._waiting = self.tensions.check()
             if found is not None:
                 self.hand.refuse(found)
@@ -242,7 +252,7 @@ class Tensions(CommandsAbove):
         """Set `tension` and `rests_on`, while nothing is `missing`."""
         self.rests_on = 0
         for board in self.oldest:
-            value = tensions[board].value
+            value = tensions[board].message
             self.rests_on = max(self.rests_on, value.operator)
             np.copyto(self.tension, value.tension, where=value.driven != 0)
 

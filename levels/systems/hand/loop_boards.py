@@ -14,7 +14,7 @@ import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Mask
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
+from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Reading
 from rack.levels.operator import BELOW_LOST, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
@@ -90,21 +90,21 @@ class HandLoop(Executor):
                 yield place, [], "it needs a board there"
 
     @abstractmethod
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Begin with the first `HandStatus`, or continue from the level's own last messages."""
 
     @abstractmethod
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the level's command for `self.command`, and what its status says of fingers or
         joints."""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Follow the newest command, and report."""
-        hand: Reading = read.hand
-        self.orders.take(read.operator)
+        hand: Reading = self.hand
+        self.orders.take(self.operator)
         if not self._met:
             if not hand.is_there:
-                status = write.status
+                status = self.status
                 status.driven = self.driven
                 status.sensed = -1
                 status.holding = True
@@ -112,14 +112,14 @@ class HandLoop(Executor):
                 status.reason = NO_HAND_YET
                 return
             self._met = True
-            self.meet(read, hand.value)
-        self._take(read.command, tick)
-        kept = self._kept(read, tick)
-        self.follow(hand.value, write, tick)
-        write.command.id += 1
-        write.command.operator = self.orders.rests_on(self.command.operator)
-        self._report(read, write.status, kept)
-        self.orders.report(write.status, self.command.operator)
+            self.meet(hand.message)
+        self._take(self.above, tick)
+        kept = self._kept(tick)
+        self.follow(hand.message, tick)
+        self.command.id += 1
+        self.command.operator = self.orders.rests_on(self.command.operator)
+        self._report(self.status, kept)
+        self.orders.report(self.status, self.command.operator)
 
     def age_s(self, hand: Message, tick: int) -> float:
         """Return how old the sample of a `HandStatus` is when what this cycle commands acts, s."""
@@ -145,35 +145,35 @@ class HandLoop(Executor):
             wrong = [
                 name
                 for name in self._numbers
-                if not np.isfinite(getattr(command.value, name)).all()
+                if not np.isfinite(getattr(command.message, name)).all()
             ]
             self._rejected = (
                 f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""
             )
             if not wrong:
-                self.command.copy_from(command.value)
+                self.command.copy_from(command.message)
                 self.commanded = True
                 self._taken = tick
 
-    def _kept(self, read: Ports, tick: int) -> str:
+    def _kept(self, tick: int) -> str:
         """Return why the hand does not follow the level above; empty: it does."""
-        hand = read.hand.value
-        if read.hand.is_lost or tick - hand.tick > self._oldest:
+        hand = self.hand.message
+        if self.hand.is_lost or tick - hand.tick > self._oldest:
             return HAND_LOST
         if hand.stopped:
             return f"hand: {hand.reason}"
         if "below" in self.inputs:
-            below = read.below
+            below = self.below
             if below.is_lost or not below.is_there:
                 return BELOW_LOST
-            if below.value.stopped:
-                return str(below.value.reason)
+            if below.message.stopped:
+                return str(below.message.reason)
         return self.orders.keeps(self.context.board)
 
-    def _report(self, read: Ports, status: Message, kept: str) -> None:
+    def _report(self, status: Message, kept: str) -> None:
         """Fill the status."""
-        hand = read.hand.value
-        lost = self.commanded and read.command.is_lost
+        hand = self.hand.message
+        lost = self.commanded and self.above.is_lost
         status.sensed = hand.tick
         status.echo = self.command.id
         note = kept or self._rejected
@@ -198,14 +198,13 @@ class FingertipLoop(HandLoop):
     A restarted board continues from the targets that it gave last.
     """
 
-    inputs = {
-        "command": Input(GraspTarget, "above.command"),
-        "hand": Input(HandStatus, "hand.status"),
-        "below": Input(LoopStatus, "below.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-        "last": Input(FingerTarget, "own.command"),
-    }
-    outputs = {"command": FingerTarget, "status": FingerStatus}
+    above = Input(GraspTarget, "above.command")
+    hand = Input(HandStatus, "hand.status")
+    below = Input(LoopStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    last = Input(FingerTarget, "own.command")
+    command = Output(FingerTarget, rests_on=above)
+    status = Output(FingerStatus)
     params = FingertipGains
 
     def __init__(self, context: LevelContext) -> None:
@@ -215,15 +214,15 @@ class FingertipLoop(HandLoop):
         gains = read_params(FingertipGains, context.params)
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Begin where the joints are, or with the last targets."""
-        last = read.last.value
-        begin = last if read.last.is_there and last.active else hand
+        last = self.last.message
+        begin = last if self.last.is_there and last.active else hand
         self._law.start(begin.position)
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the targets of the joints."""
-        follow_grasp(self, self._law, hand, write.command, write.status, tick)
+        follow_grasp(self, self._law, hand, self.command, self.status, tick)
 
 
 class JointLoop(HandLoop):
@@ -233,13 +232,12 @@ class JointLoop(HandLoop):
     See `JointLaw`.
     """
 
-    inputs = {
-        "command": Input(FingerTarget, "above.command"),
-        "hand": Input(HandStatus, "hand.status"),
-        "below": Input(LoopStatus, "below.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"command": TendonTorque, "status": LoopStatus}
+    above = Input(FingerTarget, "above.command")
+    hand = Input(HandStatus, "hand.status")
+    below = Input(LoopStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TendonTorque, rests_on=above)
+    status = Output(LoopStatus)
     params = JointGains
     preloads = (dynamics, laws)
 
@@ -248,18 +246,18 @@ class JointLoop(HandLoop):
         self.driven = np.full(len(context.robot.joints), True)
         self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Hold the joints where they are, until there are targets."""
         self.command.position = hand.position
         self.command.stiff = 1.0
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the torques for the newest targets."""
         self._law.torques(
-            hand, self.command, self.age_s(hand, tick), self.ahead_s(tick), write.command.torque
+            hand, self.command, self.age_s(hand, tick), self.ahead_s(tick), self.command.torque
         )
-        write.command.sampled = hand.tick
-        write.status.clipped = self._law.clipped
+        self.command.sampled = hand.tick
+        self.status.clipped = self._law.clipped
 
 
 class TendonLoop(HandLoop):
@@ -269,12 +267,11 @@ class TendonLoop(HandLoop):
     notices a joint loop that is gone, too.
     """
 
-    inputs = {
-        "command": Input(TendonTorque, "above.command"),
-        "hand": Input(HandStatus, "below.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"command": TensionCommand, "status": LoopStatus}
+    above = Input(TendonTorque, "above.command")
+    hand = Input(HandStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TensionCommand, rests_on=above)
+    status = Output(LoopStatus)
     params = TendonGains
     preloads = (laws,)
 
@@ -284,18 +281,18 @@ class TendonLoop(HandLoop):
         gains = read_params(TendonGains, context.params)
         self._law = TendonLaw(self.hand, self.driven, gains, context)
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Begin with the tensions that are there."""
         self._law.start(hand)
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the tensions for the newest torques."""
-        command = write.command
+        command = self.command
         command.driven = self.driven
         command.sampled = min(hand.tick, self.command.sampled) if self.commanded else -1
         if command.sampled >= 0:
             self._law.tensions(hand, self.command.torque, command.tension)
-        write.status.clipped = self._law.clipped
+        self.status.clipped = self._law.clipped
 
 
 class FingerParams(FingertipGains, JointGains, TendonGains):
@@ -313,12 +310,11 @@ class FingerExecutor(HandLoop):
     loop.
     """
 
-    inputs = {
-        "command": Input(GraspTarget, "above.command"),
-        "hand": Input(HandStatus, "below.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"command": TensionCommand, "status": FingerStatus}
+    above = Input(GraspTarget, "above.command")
+    hand = Input(HandStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TensionCommand, rests_on=above)
+    status = Output(FingerStatus)
     params = FingerParams
     preloads = (dynamics, laws)
 
@@ -349,20 +345,20 @@ class FingerExecutor(HandLoop):
         if hand is not None and name not in (names := [finger.name for finger in hand.finger]):
             yield "params.finger", name, f"the hand has no such finger; fingers: {', '.join(names)}"
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Hold the joints where they are."""
         self._tip.start(hand.position)
         self._tendons.start(hand)
         self._target.position = hand.position
         self._target.stiff = 1.0
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the tensions of the finger's tendons."""
-        follow_grasp(self, self._tip, hand, self._target, write.status, tick)
+        follow_grasp(self, self._tip, hand, self._target, self.status, tick)
         self._servo.torques(hand, self._target, self.age_s(hand, tick), 0.0, self._torque)
-        self._tendons.tensions(hand, self._torque, write.command.tension)
-        write.command.driven = self._joints
-        write.command.sampled = hand.tick
+        self._tendons.tensions(hand, self._torque, self.command.tension)
+        self.command.driven = self._joints
+        self.command.sampled = hand.tick
 
 
 def follow_grasp(

@@ -28,7 +28,7 @@ from rack.backplane.words import Block
 from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input, LevelContext
+from rack.levels.level import Input, LevelContext, Output
 from rack.levels.messages import WorldState
 from rack.levels.robot.cell import Cell, cell_of
 from rack.levels.systems.hand.kinematics import FingerKinematics
@@ -218,11 +218,9 @@ class WorkstationParams(Table):
 class Workstation(HostProgram):
     """Plans a grasp of one object, and plans again if the object moves before it is held."""
 
-    inputs = {
-        "world": Input(WorldState, "below.world"),
-        "grasp": Input(GraspStatus, "below.grasp"),
-    }
-    outputs = {"plan": GraspPlan}
+    world = Input(WorldState, "below.world")
+    grasp = Input(GraspStatus, "below.grasp")
+    plan = Output(GraspPlan)
     params = WorkstationParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -247,9 +245,9 @@ class Workstation(HostProgram):
         """Plan and send a grasp if one is wanted; return the newest, None without one."""
         world = bus.read("world")
         status = bus.read("grasp")
-        if not (world.is_there and status.is_there) or status.value.kind > GraspKind.PRESHAPE:
+        if not (world.is_there and status.is_there) or status.message.kind > GraspKind.PRESHAPE:
             return self._planned
-        model: Message = world.value
+        model: Message = world.message
         position = model.position[self._row]
         if norm(position - self._at) < MOVED_M:
             return self._planned

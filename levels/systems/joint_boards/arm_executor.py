@@ -12,7 +12,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.arm.above import CommandsAbove
-from rack.levels.level import Input, LevelContext, Misfits, Ports, Reading
+from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import ArmState
 from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import Cell
@@ -57,7 +57,7 @@ class JointTorques(CommandsAbove):
         self.rests_on = 0
         self._sum[:] = 0.0
         for board in self.oldest:
-            value = commands[board].value
+            value = commands[board].message
             self.rests_on = max(self.rests_on, value.operator)
             self._sum += numbers(value, "torque", "payload_offset")
         joints = len(self.torque)
@@ -74,12 +74,12 @@ class ArmExecutor(ArmDriver):
     where it is. See `ArmDriver`.
     """
 
-    inputs = {
-        "torques": Input(JointTorque, "above.command", many=True),
-        "before": Input(ArmState, "own.state"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"status": ArmStatus, "state": ArmState, "scene": SCENES}
+    torques = Inputs(JointTorque, "above.command")
+    before = Input(ArmState, "own.state")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(ArmStatus)
+    state = Output(ArmState)
+    scene = SCENES
     commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
 
@@ -122,15 +122,15 @@ class ArmExecutor(ArmDriver):
                 must = "the arm has no gripper"
             yield "above", list(wanted), f"{must}; {_by(grips)}"
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
-        write.status.tick = tick
-        super().process(read, write, tick)
+        self.status.tick = tick
+        super().process(tick)
 
-    def take_messages(self, read: Ports) -> None:
+    def take_messages(self) -> None:
         """Take over what is new."""
-        self._torques = read.torques
-        self.orders.take(read.operator, self._judge)
+        self._torques = self.torques
+        self.orders.take(self.operator, self._judge)
 
     def _judge(self, command: Message) -> None:
         """Obey what leaves the command in force as it is, or refuse it."""

@@ -14,7 +14,7 @@ from pydantic import Field as Key
 
 from rack.backplane.message import Message, field
 from rack.levels.algebra import Array, norm
-from rack.levels.level import Input, LevelContext, Ports
+from rack.levels.level import Input, Inputs, LevelContext, Output
 from rack.levels.messages import WorldState
 from rack.levels.operator import OperatorCommand
 from rack.levels.planning.ik import InverseKinematics
@@ -74,15 +74,14 @@ class MovePlanConfig(Table):
 class MoveTable(StateTableExecutor):
     """Picks an object, puts it down at a place, goes home, pose by pose as its table says."""
 
-    inputs = {
-        "command": Input(TableCommand, "above.command", many=True, optional=True),
-        "status": Input(JointMoveStatus, "below.status"),
-        "world": Input(WorldState, "world.model"),
-        "last_command": Input(JointMove, "own.command"),
-        "last_status": Input(MoveTableStatus, "own.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"command": JointMove, "status": MoveTableStatus}
+    above = Inputs(TableCommand, "above.command", optional=True)
+    below = Input(JointMoveStatus, "below.status")
+    world = Input(WorldState, "world.model")
+    last_command = Input(JointMove, "own.command")
+    last_status = Input(MoveTableStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(JointMove, rests_on=above)
+    status = Output(MoveTableStatus, rests_on=below)
     vocabulary = vocabulary(
         conditions={
             "below": BELOW,
@@ -133,30 +132,30 @@ class MoveTable(StateTableExecutor):
         """Return objects, places and poses."""
         return {"object": scene.objects, "place": tuple(plan.place), "pose": (*plan.pose, HOME)}
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue with the command sent down last."""
-        super().recall(read, write)
-        if read.last_status.is_there and read.last_command.is_there:
-            last = read.last_status.value
-            self._command.copy_from(read.last_command.value)
+        super().recall()
+        if self.last_status.is_there and self.last_command.is_there:
+            last = self.last_status.message
+            self._command.copy_from(self.last_command.message)
             self._command.id = last.sent
             self._reached = bool(last.reached)
             self._put = last.put
 
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return where the level below, the object and the gripper are."""
-        self._below = read.status.value
-        self._world = read.world.value
+        self._below = self.below.message
+        self._world = self.world.message
         self.detail = self._below.reason
         self.resting = not self._below.moving
-        is_seen = not read.world.is_lost and self._world.revision > 0
+        is_seen = not self.world.is_lost and self._world.revision > 0
         target = "moving"
         is_elsewhere = False
         if is_seen:
             target = self._target(self._command.object)
             is_elsewhere = self._put >= 0 and not self._is_at(self._put)
         return {
-            "below": answer_of(read.status, self._command.id),
+            "below": answer_of(self.below, self._command.id),
             "world": ("unseen", "seen")[is_seen],
             "target": target,
             "support": ("there", "elsewhere")[is_elsewhere],
@@ -235,11 +234,11 @@ class MoveTable(StateTableExecutor):
         self._command.speed = speed
         self._command.joints = joints
 
-    def give(self, write: Ports, tick: int) -> None:
+    def give(self, tick: int) -> None:
         """Write the command, and what a restarted board needs."""
-        shown = write.status
+        shown = self.status
         self._command.hold = self.holds
-        write.command.copy_from(self._command)
+        self.command.copy_from(self._command)
         shown.sent = self._command.id
         shown.reached = self._reached
         shown.resting = self.resting

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 from pydantic import Field as Key
 
 from rack.backplane.message import Command, Message, State, field
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
@@ -129,12 +129,10 @@ class StateTableExecutor(Executor):
     each action."""
 
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
-    inputs = {
-        "command": Input(TableCommand, "above.command", many=True, optional=True),
-        "last_status": Input(TableStatus, "own.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"status": TableStatus}
+    above = Inputs(TableCommand, "above.command", optional=True)
+    last_status = Input(TableStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(TableStatus)
     params = StateTableParams
     vocabulary: ClassVar[Vocabulary]
 
@@ -240,13 +238,13 @@ class StateTableExecutor(Executor):
             self.state = self.table.start
             self._since = None
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Do one cycle: read, let one row fire, write."""
         if not self._started:
             self._started = True
-            self.recall(read, write)
-        self._preprocess(read)
-        values = self.look(read, tick)
+            self.recall()
+        self._preprocess()
+        values = self.look(tick)
         self._since = tick if self._since is None else self._since
         values[LATE] = YES_NO[(tick - self._since) * self.context.tick_s > self.table.patience_s]
         if self.vocabulary.commands:
@@ -262,14 +260,14 @@ class StateTableExecutor(Executor):
         if row.next not in (SAME, self.state):
             self.state = row.next
             self._since = tick
-        self.give(write, tick)
-        self._report(write, number, row)
+        self.give(tick)
+        self._report(number, row)
 
     @abstractmethod
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return the value of each of the level's own conditions in this cycle."""
 
-    def give(self, write: Ports, tick: int) -> None:
+    def give(self, tick: int) -> None:
         """Fill what the level writes, other than the fields of `TableStatus`."""
 
     def do_take(self) -> None:
@@ -286,13 +284,13 @@ class StateTableExecutor(Executor):
         """Whether an operator, or the level above, holds this one; or its board is lost."""
         return bool(self._kept)
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue from the last messages in the level's own mailboxes, after a restart of its
         board."""
-        if not read.last_status.is_there:
+        if not self.last_status.is_there:
             return
-        last = read.last_status.value
-        write.status.copy_from(last)
+        last = self.last_status.message
+        self.status.copy_from(last)
         self.state = last.in_state
         table = last.table if last.table in self.tables else self.table_name
         self.use(table)
@@ -300,15 +298,15 @@ class StateTableExecutor(Executor):
         self._done = last.done
         self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)
 
-    def _preprocess(self, read: Ports) -> None:
+    def _preprocess(self) -> None:
         """Take up what the operator and the level above command."""
         orders = self.orders
-        orders.take(read.operator, self._judge)
+        orders.take(self.operator, self._judge)
         self._kept = ""
         self._rests_on = orders.rests_on(0)
         above: Reading | None = None
         if "command" in self.inputs:
-            above = next(iter(read.command.values()), None)
+            above = next(iter(self.above.values()), None)
         if above is not None:
             self._hear(above)
         elif orders.standing is not Operation.DO:
@@ -318,7 +316,7 @@ class StateTableExecutor(Executor):
 
     def _hear(self, above: Reading) -> None:
         """Take up what the level above commands, unless an operator commands instead."""
-        command: Message = above.value
+        command: Message = above.message
         self._rests_on = self.orders.rests_on(command.operator)
         if self.orders.standing is Operation.DO:
             return
@@ -350,9 +348,9 @@ class StateTableExecutor(Executor):
             else:
                 self._newest = WordCommand(True, order.id, order.name)
 
-    def _report(self, write: Ports, number: int, row: RowConfig) -> None:
+    def _report(self, number: int, row: RowConfig) -> None:
         """Fill the fields of `TableStatus`, and the operator's in the command."""
-        shown: Message = write.status
+        shown: Message = self.status
         orders = self.orders
         state = STATES[row.status]
         reason = row.reason
@@ -388,7 +386,7 @@ class StateTableExecutor(Executor):
         elif is_done:
             orders.done()
         if "command" in self.outputs:
-            write.command.operator = self._rests_on
+            self.command.operator = self._rests_on
         orders.report(shown, self._rests_on)
 
 
@@ -396,6 +394,6 @@ def answer_of(reading: Reading, serial: int) -> str:
     """Return the value of `BELOW` for a status and the serial of the newest command sent down."""
     if reading.is_lost:
         return "lost"
-    if not reading.is_there or reading.value.echo != serial or not serial:
+    if not reading.is_there or reading.message.echo != serial or not serial:
         return "waiting"
-    return {State.DONE: "done", State.ERROR: "error"}.get(reading.value.state, "executing")
+    return {State.DONE: "done", State.ERROR: "error"}.get(reading.message.state, "executing")

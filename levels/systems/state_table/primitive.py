@@ -12,7 +12,7 @@ import numpy as np
 from rack.backplane.message import Message, field
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
-from rack.levels.level import Input, LevelContext, Output, Ports
+from rack.levels.level import Input, Inputs, LevelContext, Output
 from rack.levels.operator import OperatorCommand
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
@@ -79,15 +79,14 @@ class PrimitivePlanConfig(Table):
 class PrimitiveTable(StateTableExecutor):
     """Moves the joints along straight lines and works the gripper, as its table says."""
 
-    inputs = {
-        "command": Input(JointMove, "above.command", many=True, optional=True),
-        "statuses": Input(JointStatus, "below.status", many=True),
-        "arm": Input(ArmStatus, "arm.status"),
-        "last_command": Input(JointReference, "own.command"),
-        "last_status": Input(JointMoveStatus, "own.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"command": JointReference, "status": Output(JointMoveStatus, rests_on="statuses")}
+    above = Inputs(JointMove, "above.command", optional=True)
+    statuses = Inputs(JointStatus, "below.status")
+    arm = Input(ArmStatus, "arm.status")
+    last_command = Input(JointReference, "own.command")
+    last_status = Input(JointMoveStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(JointReference, rests_on=above)
+    status = Output(JointMoveStatus, rests_on=statuses)
     commands = OPERATIONS
     preloads = (curves,)
     vocabulary = vocabulary(
@@ -130,26 +129,26 @@ class PrimitiveTable(StateTableExecutor):
         self._due = 0  # tick at which the set point of this cycle is due
         self._grips = 0  # cycles until the gripper's motion must show
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue with the gripper as it is; the arm's motion begins anew from where the boards
         below hold it."""
-        super().recall(read, write)
-        if read.last_status.is_there:
-            last = read.last_status.value
+        super().recall()
+        if self.last_status.is_there:
+            last = self.last_status.message
             self._closed = bool(last.closed)
             self._held = bool(last.held)
             self._object = last.object
             self._point[0] = last.position
             self._end[:] = last.end
-            write.command.copy_from(read.last_command.value)
+            self.command.copy_from(self.last_command.message)
 
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return whether the arm follows and has arrived, and what the gripper does."""
-        for reading in read.command.values():
-            self._goal = reading.value.joints
-            self._speed = reading.value.speed
-            self._target = reading.value.object
-        position = self._follow(read)
+        for reading in self.above.values():
+            self._goal = reading.message.joints
+            self._speed = reading.message.speed
+            self._target = reading.message.object
+        position = self._follow()
         self._due = tick + LEAD_CYCLES * self.context.every
         if self._curve is not None and self._passed_s >= self._curve.ends_s:
             self._point[0] = self._curve.table[curves.REST]
@@ -165,14 +164,14 @@ class PrimitiveTable(StateTableExecutor):
             arm = "arrived" if there else "resting"
         return {
             "arm": arm,
-            "gripper": self._grip(read.arm.value),
+            "gripper": self._grip(self.arm.message),
             "hold": YES_NO[self.holds],
         }
 
-    def _follow(self, read: Ports) -> Array:
+    def _follow(self) -> Array:
         """Find out whether the boards below follow; return the joint positions, rad."""
-        readings = list(read.statuses.values())
-        statuses: list[Message] = [reading.value for reading in readings]
+        readings = list(self.statuses.values())
+        statuses: list[Message] = [reading.message for reading in readings]
         position: Array = statuses[0].position
         gone = any(reading.is_lost or not reading.is_there for reading in readings)
         stopped = gone or any(below.stopped for below in statuses)
@@ -245,10 +244,10 @@ class PrimitiveTable(StateTableExecutor):
         self._grips = GRIP_CYCLES
         self._object = self._target
 
-    def give(self, write: Ports, tick: int) -> None:
+    def give(self, tick: int) -> None:
         """Write the set point, with inertia and load there, and what a restarted board needs."""
-        command = write.command
-        shown = write.status
+        command = self.command
+        shown = self.status
         if self._curve is not None:
             self._point[:] = self._curve.at(self._passed_s).table
         command.id = tick // self.context.every + 1

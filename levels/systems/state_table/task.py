@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field as Key
 
 from rack.backplane.message import field
-from rack.levels.level import Input, LevelContext, Misfits, Ports
+from rack.levels.level import Input, LevelContext, Misfits, Output
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.systems.state_table.elemental_move import MoveTable, MoveTableStatus
 from rack.levels.systems.state_table.level import (
@@ -59,13 +59,12 @@ class TaskTable(StateTableExecutor):
     """Sends the commands of its steps to the level below, one after the other, as its table
     says."""
 
-    inputs = {
-        "status": Input(MoveTableStatus, "below.status"),
-        "last_command": Input(TableCommand, "own.command"),
-        "last_status": Input(TaskTableStatus, "own.status"),
-        "operator": Input(OperatorCommand, "own.operator"),
-    }
-    outputs = {"command": TableCommand, "status": TaskTableStatus}
+    below = Input(MoveTableStatus, "below.status")
+    last_command = Input(TableCommand, "own.command")
+    last_status = Input(TaskTableStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TableCommand)
+    status = Output(TaskTableStatus, rests_on=below)
     commands = OPERATIONS
     vocabulary = vocabulary(
         conditions={
@@ -117,21 +116,21 @@ class TaskTable(StateTableExecutor):
                         )
                         yield f"params.tables.{name}", path.name, why
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue with the step under way."""
-        super().recall(read, write)
-        if read.last_status.is_there and read.last_command.is_there:
-            self._step = read.last_status.value.action
-            self._command.copy_from(read.last_command.value)
-            self._command.id = read.last_status.value.sent
+        super().recall()
+        if self.last_status.is_there and self.last_command.is_there:
+            self._step = self.last_status.message.action
+            self._command.copy_from(self.last_command.message)
+            self._command.id = self.last_status.message.sent
 
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return where the level below is, and whether a step is left."""
-        self.detail = read.status.value.reason
-        self.resting = bool(read.status.value.resting)
+        self.detail = self.below.message.reason
+        self.resting = bool(self.below.message.resting)
         is_left = self._step < len(self.table.plan.step)
         return {
-            "below": answer_of(read.status, self._command.id),
+            "below": answer_of(self.below, self._command.id),
             "step": ("none", "more")[is_left],
         }
 
@@ -147,11 +146,11 @@ class TaskTable(StateTableExecutor):
         """Go on to the next step."""
         self._step += 1
 
-    def give(self, write: Ports, tick: int) -> None:
+    def give(self, tick: int) -> None:
         """Write the command, and the progress."""
         self._command.hold = self.holds
-        write.command.copy_from(self._command)
-        shown = write.status
+        self.command.copy_from(self._command)
+        shown = self.status
         steps = len(self.table.plan.step)
         shown.action = min(self._step, steps)
         shown.actions = steps

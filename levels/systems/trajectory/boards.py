@@ -63,7 +63,7 @@ class JointBoards:
     def _kept(self, statuses: Mapping[str, Reading]) -> str:
         """Return the board that does not follow, and why; empty: all do, or could."""
         for board, reading in statuses.items():
-            status = reading.value
+            status = reading.message
             silent = self._silent[board]
             if silent > MAX_SILENT_CYCLES or not reading.is_there:
                 return f"{board}: no status for {silent} cycles"
@@ -77,7 +77,7 @@ class JointBoards:
         """Return whether all boards hold all joints at rest; take over where."""
         driven = np.zeros(len(self._joints), dtype=bool)
         for board, reading in statuses.items():
-            status = reading.value
+            status = reading.message
             mine = status.driven.astype(bool)
             # Written so that NaN does not count as rest, nor as a place.
             resting = (np.abs(status.target_velocity[mine]) <= MAX_REST_RAD_S).all()

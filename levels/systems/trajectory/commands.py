@@ -23,7 +23,7 @@ from typing import Any
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input, LevelContext
+from rack.levels.level import Input, LevelContext, Output
 from rack.levels.systems.trajectory.messages import (
     MotionKind,
     MotionRequest,
@@ -147,7 +147,7 @@ class Motions:
     @property
     def _status(self) -> Message:
         """The newest `MotionStatus`, or that of the level in its place."""
-        return self._bus.read("motion").value
+        return self._bus.read("motion").message
 
     def _request(self, **fields: Any) -> int:
         request = {"body": WORLD, **fields, "id": self._newest + 1}
@@ -189,8 +189,8 @@ class ScriptParams(Table):
 class CommandEnvironment(HostProgram):
     """Runs a script that commands motions by name; a prompt offers the same names."""
 
-    inputs = {"motion": Input(MotionStatus, "below.motion")}
-    outputs = {"requests": MotionRequest}
+    motion = Input(MotionStatus, "below.motion")
+    requests = Output(MotionRequest)
     params = ScriptParams
 
     def __init__(self, context: LevelContext) -> None:

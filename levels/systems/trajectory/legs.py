@@ -57,8 +57,8 @@ class WorldSight:
 
     def look(self, world: Reading) -> None:
         """Take over the newest model."""
-        if world.is_there and world.value.revision:
-            self._model = world.value
+        if world.is_there and world.message.revision:
+            self._model = world.message
 
     @property
     def knows(self) -> bool:

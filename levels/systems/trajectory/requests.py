@@ -99,7 +99,7 @@ class Agenda:
         """Take what is new; return whether the arm must stop: a CANCEL came."""
         cancelled = False
         if requests.is_new:
-            for message in (*requests.earlier, requests.value):
+            for message in (*requests.earlier, requests.message):
                 cancelled |= self._take(copied(message))
         return cancelled
 

@@ -188,7 +188,7 @@ def _reading(reader: Reader) -> Callable[[int], Message]:
     delay = reader.spec.delay
 
     def take(tick: int) -> Message:
-        return read(tick + delay).value
+        return read(tick + delay).message
 
     return take
 

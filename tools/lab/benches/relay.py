@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rack.backplane.message import State, Status, field
-from rack.levels.level import Executor, Input, Ports
+from rack.levels.level import Executor, Input, Output
 
 
 class Relayed(Status, version=1):
@@ -15,21 +15,21 @@ class Relayed(Status, version=1):
 class Sender(Executor):
     """Sends a message in every cycle."""
 
-    outputs = {"status": Relayed}
+    status = Output(Relayed)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Send."""
-        write.status.state = State.EXECUTING
-        write.status.sent = tick
+        self.status.state = State.EXECUTING
+        self.status.sent = tick
 
 
 class Relay(Executor):
     """Passes on the message of another board, which the config wires to `message`."""
 
-    inputs = {"message": Input(Relayed, "own.status")}
-    outputs = {"status": Relayed}
+    message = Input(Relayed, "own.status")
+    status = Output(Relayed)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Pass it on; -1 while there is none."""
-        write.status.state = State.EXECUTING
-        write.status.sent = read.message.value.sent if read.message.is_there else -1
+        self.status.state = State.EXECUTING
+        self.status.sent = self.message.message.sent if self.message.is_there else -1
