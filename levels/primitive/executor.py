@@ -105,7 +105,7 @@ class PrimitiveExecutor(Executor):
         status."""
         if self._tick is None:
             self._tick = tick - self.context.every
-            self._memory = recall()
+            self._memory = recall(self.last_status, self.last_command)
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
         servo = self.below.message

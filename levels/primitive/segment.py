@@ -95,10 +95,8 @@ class Memory:
     force: float = 0.0  # commanded to the gripper, N
 
 
-def recall(read: Ports) -> Memory:
+def recall(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
     """Return the state in the level's own last messages; not `is_known` before the first ones."""
-    status = read.last_status
-    command = read.last_command
     if not (status.is_there and command.is_there and command.message.id):
         return Memory()
     return Memory(

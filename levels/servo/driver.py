@@ -114,7 +114,7 @@ class ArmDriver(Executor):
         self._started = False  # the first cycle has begun
         self._adopted = False  # the arm is enabled, and its pose then was taken over
         self.abandoned = False  # set points were abandoned in the last cycle: the arm was braked
-        self.command = self.rests_on = (
+        self.followed = self.rests_on = (
             0  # serials of the newest command, and of the operator's that it rests on
         )
 
@@ -194,7 +194,7 @@ class ArmDriver(Executor):
     def has_work(self) -> bool:
         """Whether the level has work from which it can be kept. Default: once there was a
         command."""
-        return self.command > 0
+        return self.followed > 0
 
     @property
     def note(self) -> str:

@@ -65,10 +65,10 @@ class ServoExecutor(ArmDriver):
             self.ahead = SetPointLaw(cell, params, context.period_s)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         joints = context.robot.joints
-        self.operator = OperatorControl(
+        self.operator_control = OperatorControl(
             self.commands, joints, cell.limits.position, obey=self._obey
         )
-        self.orders = self.operator.orders
+        self.orders = self.operator_control.orders
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
 
     @classmethod
@@ -91,12 +91,12 @@ class ServoExecutor(ArmDriver):
     def take_messages(self) -> None:
         """Take over what is new."""
         if self.operator.verdict is Verdict.NEW:
-            self.operator.take(self.operator, self.sensors.position)
+            self.operator_control.take(self.operator, self.sensors.position)
         if self.plan.verdict is Verdict.NEW:
             self._loop.take(self.plan.message)
         if self.above.verdict is Verdict.NEW:
             command: Message = self.above.message
-            self.command = command.id
+            self.followed = command.id
             self.rests_on = command.operator
             self.reference.take(command)
             if self._grip is not None:
@@ -122,7 +122,7 @@ class ServoExecutor(ArmDriver):
 
     def adopted(self) -> None:
         """Forget the operator's way: the arm may have been moved away from it."""
-        self.operator.forget()
+        self.operator_control.forget()
 
     def started(self) -> None:
         """Keep the grip on a part."""
@@ -142,7 +142,11 @@ class ServoExecutor(ArmDriver):
             reference.meet(sensors.position, sensors.velocity, tick)
         if reaction:
             return reference.rest(tick)
-        return self.operator.wanted(reference, tick) if self.operator.stands else reference.at(tick)
+        return (
+            self.operator_control.wanted(reference, tick)
+            if self.operator_control.stands
+            else reference.at(tick)
+        )
 
     def terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with the held object."""
@@ -181,11 +185,11 @@ class ServoExecutor(ArmDriver):
 
     def course(self, reaction: Reaction) -> Course:
         """Return what the status says of set points."""
-        operator = self.operator
+        operator = self.operator_control
         cut = self.reference.refused + self._loop.cut
         kept = self.stopping.reason
         if operator.stands and not kept:
             kept = operator.reason
         holding = self.abandoned or self.reference.holding
         stopped = self.abandoned or reaction > 0 or operator.stands
-        return Course(self.command, holding, stopped, cut, kept)
+        return Course(self.followed, holding, stopped, cut, kept)

@@ -51,7 +51,7 @@ class FigureLoop(Executor):
 
     status = Output(FigureStatus)
     params = FigureParams
-    plan = -1
+    plan_in_use = -1
     """Release that the plan in force answers; -1: there is none."""
 
     def __init__(self, context: LevelContext) -> None:
@@ -68,7 +68,7 @@ class FigureLoop(Executor):
         status = self.status
         status.state = State.EXECUTING
         status.cycle = tick
-        status.plan = self.plan
+        status.plan = self.plan_in_use
         compute_until(end)
 
 
@@ -80,7 +80,7 @@ class FigureExecutor(FigureLoop):
     def process(self, tick: int) -> None:
         """Report, with the plan in force, then compute."""
         if self.plan.is_there:
-            self.plan = self.plan.message.made_at
+            self.plan_in_use = self.plan.message.made_at
         super().process(tick)
 
 

@@ -52,32 +52,32 @@ class ComplianceWatch:
             self.struck = last.message.struck
             self.axis = last.message.axis
 
-    def look(self, tick: int) -> None:
+    def look(
+        self,
+        compliance: Reading[Compliance],
+        wrench: Reading[Wrench],
+        above_is_lost: bool,
+        tick: int,
+    ) -> None:
         """Judge the commands and the wrench of this cycle."""
-        compliance = self.compliance.message
-        wrench = self.wrench
+        wanted = compliance.message
         self.task = None
         self.rests = False
         self.reason = ""
         self.sensed = wrench.message.tick if wrench.is_there else -1
-        reason = objection(compliance) if compliance.active else ""
-        rotation = (
-            rotation_of(compliance.frame) if compliance.frame.any() and not reason else np.eye(3)
-        )
+        reason = objection(wanted) if wanted.active else ""
+        rotation = rotation_of(wanted.frame) if wanted.frame.any() and not reason else np.eye(3)
         self.felt = turned(rotation.T, wrench.message.wrench)
         if reason:
             self._rest(reason)
-        elif compliance.active:
-            self._follow(rotation, tick)
-
-    def _follow(self, rotation: Array, tick: int) -> None:
-        """Do what the command says, as far as the contact is known and the level above is there."""
-        blind = self._blind(self.wrench, tick)
-        if blind or self.above.is_lost or self.compliance.is_lost:
-            self._rest(blind or ABOVE_LOST)
-        self._take(self.compliance.message, rotation)
-        if not blind:
-            self._guard(self.compliance.message)
+        elif wanted.active:
+            # Do what the command says, as far as the contact is known and the level above is there.
+            blind = self._blind(wrench, tick)
+            if blind or above_is_lost or compliance.is_lost:
+                self._rest(blind or ABOVE_LOST)
+            self._take(wanted, rotation)
+            if not blind:
+                self._guard(wanted)
 
     def _rest(self, reason: str) -> None:
         self.rests = True
@@ -195,7 +195,7 @@ class HybridExecutor(WristLevel):
             self._begin(self._boards.position, tick)
         if self.above.is_new:
             self._reference.take(self.above.message)
-        self._watch.look(tick)
+        self._watch.look(self.compliance, self.wrench, self.above.is_lost, tick)
         self.command.id = tick // self.context.every + 1
         for name in PASSED:
             setattr(self.command, name, getattr(self.above.message, name))

@@ -209,7 +209,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
     last_status = Input(ServerStatus, "own.status")
     last_state = Input(ServerState, "own.state")
     last_compliance = Input(Compliance, "own.compliance")
-    status = Output(ServerStatus, rests_on=boards)
+    status = Output(ServerStatus, rests_on=TrajectoryExecutor.boards)
     state = Output(ServerState)
     compliance = Output(Compliance)
     params = ServerParams

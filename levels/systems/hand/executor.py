@@ -68,7 +68,7 @@ class HandExecutor(Executor):
         self.hand = SimulatedHand(
             cell, context.scene, context.clock_ns, context.every, context.seed
         )
-        self.tensions = Tensions(context, cell.hand, cell.patience)
+        self.wanted_tensions = Tensions(context, cell.hand, cell.patience)
         self.orders = Orders(self.commands)
         self._started = False  # the first cycle has begun
         # Tick of the first status that said so; None: the valves are open.
@@ -135,7 +135,7 @@ class HandExecutor(Executor):
         self.acted |= self._torn
         self._drive(tick)
         self._report(self.status, sample, tick)
-        self.orders.report(self.status, self.tensions.rests_on)
+        self.orders.report(self.status, self.wanted_tensions.rests_on)
         hand.save(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             hand.look(self.scene)
@@ -143,10 +143,10 @@ class HandExecutor(Executor):
     def _drive(self, tick: int) -> None:
         """Give the valves the tensions of the boards above, or close them and say why."""
         since = self._closed_at if self._opened else 0
-        self._waiting = self.tensions.missing(self.tensions, tick, since or 0)
+        self._waiting = self.wanted_tensions.missing(self.tensions, tick, since or 0)
         if not self._waiting:
-            self.tensions.join(self.tensions)
-            found, self._waiting = self.tensions.check()
+            self.wanted_tensions.join(self.tensions)
+            found, self._waiting = self.wanted_tensions.check()
             if found is not None:
                 self.hand.refuse(found)
         held = self.orders.holds
@@ -163,7 +163,7 @@ class HandExecutor(Executor):
         else:
             self._closed_at = None
             self._opened = True
-            self.hand.pull(self.tensions.tension)
+            self.hand.pull(self.wanted_tensions.tension)
 
     def _report(self, status: Message, sample: HandSample, tick: int) -> None:
         """Fill the status."""

@@ -59,10 +59,10 @@ class HandLoop(Executor):
         super().__init__(context)
         self.cell = cell_of(context)
         assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
-        self.hand: Hand = self.cell.hand
+        self.hand_model: Hand = self.cell.hand
         self.orders = Orders(self.commands)
         command = self.inputs["command"].message
-        self.command = command.zeros(context.sizes)  # that is followed
+        self.followed = command.zeros(context.sizes)  # that is followed
         # Names of its fields that must be finite.
         self._numbers = [field.name for field in command.message_type.fields if field.kind == "f8"]
         self.commanded = False  # there was one
@@ -95,7 +95,7 @@ class HandLoop(Executor):
 
     @abstractmethod
     def follow(self, hand: Message, tick: int) -> None:
-        """Write the level's command for `self.command`, and what its status says of fingers or
+        """Write the level's command for `self.followed`, and what its status says of fingers or
         joints."""
 
     def process(self, tick: int) -> None:
@@ -117,9 +117,9 @@ class HandLoop(Executor):
         kept = self._kept(tick)
         self.follow(hand.message, tick)
         self.command.id += 1
-        self.command.operator = self.orders.rests_on(self.command.operator)
+        self.command.operator = self.orders.rests_on(self.followed.operator)
         self._report(self.status, kept)
-        self.orders.report(self.status, self.command.operator)
+        self.orders.report(self.status, self.followed.operator)
 
     def age_s(self, hand: Message, tick: int) -> float:
         """Return how old the sample of a `HandStatus` is when what this cycle commands acts, s."""
@@ -139,7 +139,7 @@ class HandLoop(Executor):
         if self._held:
             for name in self._numbers:
                 if name.endswith("velocity"):  # what is commanded is kept at rest
-                    setattr(self.command, name, 0.0)
+                    setattr(self.followed, name, 0.0)
             self.orders.done()
         elif command.is_new or (released and command.is_there):
             wrong = [
@@ -151,7 +151,7 @@ class HandLoop(Executor):
                 f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""
             )
             if not wrong:
-                self.command.copy_from(command.message)
+                self.followed.copy_from(command.message)
                 self.commanded = True
                 self._taken = tick
 
@@ -175,7 +175,7 @@ class HandLoop(Executor):
         hand = self.hand.message
         lost = self.commanded and self.above.is_lost
         status.sensed = hand.tick
-        status.echo = self.command.id
+        status.echo = self.followed.id
         note = kept or self._rejected
         if lost and not note:
             note = f"no command from '{self._above}': its last one is kept"
@@ -209,8 +209,8 @@ class FingertipLoop(HandLoop):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self.driven = np.full(len(self.hand.names), True)
-        kinematics = FingerKinematics(self.cell, self.hand)
+        self.driven = np.full(len(self.hand_model.names), True)
+        kinematics = FingerKinematics(self.cell, self.hand_model)
         gains = read_params(FingertipGains, context.params)
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
@@ -248,13 +248,13 @@ class JointLoop(HandLoop):
 
     def meet(self, hand: Message) -> None:
         """Hold the joints where they are, until there are targets."""
-        self.command.position = hand.position
-        self.command.stiff = 1.0
+        self.followed.position = hand.position
+        self.followed.stiff = 1.0
 
     def follow(self, hand: Message, tick: int) -> None:
         """Write the torques for the newest targets."""
         self._law.torques(
-            hand, self.command, self.age_s(hand, tick), self.ahead_s(tick), self.command.torque
+            hand, self.followed, self.age_s(hand, tick), self.ahead_s(tick), self.command.torque
         )
         self.command.sampled = hand.tick
         self.status.clipped = self._law.clipped
@@ -279,7 +279,7 @@ class TendonLoop(HandLoop):
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
         gains = read_params(TendonGains, context.params)
-        self._law = TendonLaw(self.hand, self.driven, gains, context)
+        self._law = TendonLaw(self.hand_model, self.driven, gains, context)
 
     def meet(self, hand: Message) -> None:
         """Begin with the tensions that are there."""
@@ -289,9 +289,9 @@ class TendonLoop(HandLoop):
         """Write the tensions for the newest torques."""
         command = self.command
         command.driven = self.driven
-        command.sampled = min(hand.tick, self.command.sampled) if self.commanded else -1
+        command.sampled = min(hand.tick, self.followed.sampled) if self.commanded else -1
         if command.sampled >= 0:
-            self._law.tensions(hand, self.command.torque, command.tension)
+            self._law.tensions(hand, self.followed.torque, command.tension)
         self.status.clipped = self._law.clipped
 
 
@@ -321,7 +321,7 @@ class FingerExecutor(HandLoop):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         params = read_params(FingerParams, context.params)
-        hand = self.hand
+        hand = self.hand_model
         finger = hand.names.index(params.finger)
         self.driven = np.arange(len(hand.names)) == finger
         self._joints = hand.fingers[finger]

@@ -239,9 +239,9 @@ class Workstation(HostProgram):
         """Plan until the run is over."""
         while not bus.is_over:
             bus.wait(self._params.every_s)
-            self.plan(bus)
+            self.plan_grasp(bus)
 
-    def plan(self, bus: Bus) -> PlannedGrasp | None:
+    def plan_grasp(self, bus: Bus) -> PlannedGrasp | None:
         """Plan and send a grasp if one is wanted; return the newest, None without one."""
         world = bus.read("world")
         status = bus.read("grasp")

@@ -74,7 +74,7 @@ class ArmExecutor(ArmDriver):
     where it is. See `ArmDriver`.
     """
 
-    torques = Inputs(JointTorque, "above.command")
+    joint_torques = Inputs(JointTorque, "above.command")
     before = Input(ArmState, "own.state")
     operator = Input(OperatorCommand, "own.operator")
     status = Output(ArmStatus)
@@ -129,7 +129,7 @@ class ArmExecutor(ArmDriver):
 
     def take_messages(self) -> None:
         """Take over what is new."""
-        self._torques = self.torques
+        self._torques = self.joint_torques
         self.orders.take(self.operator, self._judge)
 
     def _judge(self, command: Message) -> None:

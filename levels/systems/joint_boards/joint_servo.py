@@ -86,7 +86,7 @@ class JointServo(Executor):
         self.loads = JointLoads(cell)
         self._servo = partial(servo_joints.load(), constants, self.loads.table)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
-        self.operator = OperatorControl(
+        self.operator_control = OperatorControl(
             self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey
         )
         # What the law sets for its modifications.
@@ -139,7 +139,7 @@ class JointServo(Executor):
         sampled = arm.tick
         every = self.context.every
         reference = self.reference
-        operator = self.operator
+        operator = self.operator_control
         away = self.below.is_lost or tick - sampled > self._oldest
         stopped = away or bool(arm.stopped)
         if away or (stopped and arm.braked):
@@ -222,7 +222,7 @@ class JointServo(Executor):
     def _take_messages(self) -> None:
         """Take over what is new."""
         if self.operator.is_new:
-            self.operator.take(self.operator, self.below.message.position)
+            self.operator_control.take(self.operator, self.below.message.position)
         if self.above.is_new:
             command: Message = self.above.message
             self._command = command.id
@@ -242,7 +242,7 @@ class JointServo(Executor):
 
     def _report(self, status: Message, arm: Message, away: bool, stopped: bool) -> None:
         """Fill what the law has not set in the status."""
-        operator = self.operator
+        operator = self.operator_control
         holding = self.reference.holding
         kept = operator.reason
         error = Error.NONE
