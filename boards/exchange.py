@@ -66,7 +66,7 @@ def ages_of(exchange: Message) -> dict[str, PortAge]:
 class Taken(NamedTuple):
     """The last reading of one mailbox, `readings[key]`, and its reader."""
 
-    readings: Mapping[str, Reading]
+    readings: Mapping[str, Reading[Any]]
     key: str
     reader: Reader
 

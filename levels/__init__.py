@@ -1,14 +1,14 @@
 """Virtual control loops: the public API of a level's author. `rack.levels.level` describes what a
 level must do.
 
-- Write a level: `Executor`, `Planner`, with the ports `Input`, `Inputs`, `Output`, `QueuedOutput` and
-  `TimedOutput`, with `Reading`, `Verdict`, `Program`, `LevelContext`, `Pace`.
+- Write a level: `Executor`, `Planner`, with the ports `Input`, `Inputs`, `Output`, `QueuedOutput`
+  and `TimedOutput`, with `Reading`, `Verdict`, `Program`, `LevelContext`, `Pace`.
 - Declare messages: `Message`, `Command`, `Status`, `field`, `State`; the default levels' messages
   are in `rack.levels.messages`, and their error codes in `Error`.
 - Declare parameters: `Table`, `Positive`, `Finite`, `read_params`, `LIVE`, `set_live`; arm and
   cell: `RobotConfig`, `SceneConfig`.
 - Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OperatorCommand`, `AnsweringStatus`,
-  `RESTS_ON`.
+  `RelayedCommand`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
 - Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
 
@@ -34,23 +34,26 @@ if TYPE_CHECKING:
         Fault,
         Finding,
         Input,
+        Inputs,
         LevelContext,
+        Output,
         Pace,
         Planner,
-        Ports,
         Program,
+        QueuedOutput,
         Reading,
+        TimedOutput,
         Verdict,
     )
     from rack.levels.messages import Error
     from rack.levels.operator import (
-        RESTS_ON,
         AnsweringStatus,
         Commands,
         Goal,
         Operation,
         OperatorCommand,
         Orders,
+        RelayedCommand,
     )
     from rack.levels.tables import (
         LIVE,
@@ -65,7 +68,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LIVE",
-    "RESTS_ON",
     "Alarm",
     "AnsweringStatus",
     "Command",
@@ -94,6 +96,7 @@ __all__ = [
     "QueuedOutput",
     "Reading",
     "Refused",
+    "RelayedCommand",
     "RobotConfig",
     "RobotError",
     "SceneConfig",
@@ -129,13 +132,13 @@ _PLACES = {
     ),
     "rack.levels.messages": ("Error",),
     "rack.levels.operator": (
-        "RESTS_ON",
         "AnsweringStatus",
         "Commands",
         "Goal",
         "Operation",
         "OperatorCommand",
         "Orders",
+        "RelayedCommand",
     ),
     "rack.levels.tables": (
         "LIVE",

@@ -55,7 +55,7 @@ class Bus(Protocol):
         """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when
         the run ends."""
 
-    def read(self, port: str) -> Reading:
+    def read(self, port: str) -> Reading[Any]:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the
         mailbox keeps them."""
 

@@ -11,9 +11,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from rack.backplane.message import Command, Message, field
+from rack.backplane.message import Message, field
 from rack.backplane.words import Demand
-from rack.levels.operator import RESTS_ON, AnsweringStatus
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 WINDOW = 8
 """Elemental moves in one task command: the level below never waits for a cycle of the task
@@ -110,10 +110,9 @@ class TaskPlan(Message, version=1):
     moves: np.ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
 
 
-class TaskCommand(Command, version=2):
+class TaskCommand(RelayedCommand, version=2):
     """From the task level to the elemental move level: a window on the plan."""
 
-    operator: int = RESTS_ON
     hold: bool = field(doc="1: ramp to rest and stay, whatever is under way")
     count: int = field("u2", unit="1", doc="moves that follow; id is the newest one's")
     moves: np.ndarray = field(ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW)
@@ -207,10 +206,9 @@ class MoveSegment(Message, version=1, message="segment"):
     force: float = field(unit="N or N m", doc="largest gripper force on the way and afterwards")
 
 
-class MoveCommand(Command, version=2):
+class MoveCommand(RelayedCommand, version=2):
     """From the elemental move level to the primitive level: the next segments."""
 
-    operator: int = RESTS_ON
     hold: bool = field(doc="1: ramp to rest on the path and stay")
     count: int = field("u2", unit="1", doc="segments that follow; id is the newest one's")
     segments: np.ndarray = field(MoveSegment, doc="segments to do, oldest first", shape=SEGMENTS)
@@ -259,10 +257,9 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
     )
 
 
-class JointCommand(Command, version=2, message="joint_set_point"):
+class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
     """From the primitive level to the servo level: where the joints should be, and when."""
 
-    operator: int = RESTS_ON
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
     )
@@ -289,7 +286,7 @@ class ServoPlan(Message, version=1):
     )
 
 
-class DrivenArm(Message):
+class DrivenArm(AnsweringStatus):
     """Fields of the status of a level that drives an arm."""
 
     position: np.ndarray = field(
@@ -329,7 +326,7 @@ class DrivenArm(Message):
     slowed: bool = field(doc="1: speeds are scaled down by robot.bring_up, until the release of it")
 
 
-class ServoStatus(AnsweringStatus, DrivenArm, version=5):
+class ServoStatus(DrivenArm, version=5):
     """Status of the servo level."""
 
 
@@ -359,7 +356,7 @@ class ArmState(Message, version=3):
     error: Error = field("u2", doc="latched fault; 0: none")
     reason: str = field(doc="that fault, readable")
     state: np.ndarray = field(
-        unit="", doc="of the simulated cell, see rack.levels.robot.state", shape="state"
+        unit="mixed", doc="of the simulated cell, see rack.levels.robot.state", shape="state"
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -90,6 +90,12 @@ class OperatorCommand(Command, version=2):
 RESTS_ON = field(
     "u4", unit="1", doc="newest command of an operator, here or above, that this rests on; 0: none"
 )
+
+
+class RelayedCommand(Command):
+    """Base of commands that pass on which operator's command they rest on."""
+
+    operator: int = RESTS_ON
 
 
 class AnsweringStatus(Status):
@@ -193,7 +199,7 @@ class Orders:
         """Whether that is HOLD."""
         return self.standing is Operation.HOLD
 
-    def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
+    def take(self, operator: Reading[Any], judge: Callable[[Message], None] | None = None) -> bool:
         """Read the mailbox; return True in the cycle that accepts a command other than a setting.
 
         `judge` is called with each command accepted: there a level may refuse it for its own

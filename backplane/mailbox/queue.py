@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from struct import Struct
+from typing import Any
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
@@ -176,11 +177,11 @@ class QueueReader(Reader):
         if self.taken and self._obtain(self.taken):
             self.transfers = 0
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Take every message visible at `tick`."""
         return self.take(tick, ALL)
 
-    def take(self, tick: int, most: int, now: int | None = None) -> Reading:
+    def take(self, tick: int, most: int, now: int | None = None) -> Reading[Any]:
         """Take the messages visible at `tick`, oldest first, at most `most`, and publish the
         position.
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
@@ -32,7 +32,7 @@ from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
-from rack.levels.level import Executor, Input, Output, Planner, Program
+from rack.levels.level import Executor, Input, Inputs, Output, Planner, Program
 from rack.levels.operator import Commands, OperatorCommand
 
 OWN_OPERATOR = "own.operator"
@@ -44,7 +44,7 @@ class Connection(NamedTuple):
     that follow."""
 
     port: str
-    entry: Input
+    entry: Input[Any] | Inputs[Any]
     key: str
     given: Sources
     mailboxes: Sources

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.boards.wiring import Entries
-from rack.levels.level import Executor, LevelContext
-from rack.levels.ports import Reading
+from rack.levels.level import Executor, LevelContext, Reading
 
 STATUS = "status"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 from rack.backplane.fault_table import FaultEntry
 from rack.backplane.layout import ExchangeSpec
@@ -23,7 +24,7 @@ from rack.boards.wiring import Source
 from rack.levels.level import LevelSection
 from rack.levels.ports import Reading, Sender, Verdict
 
-Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
+Line = tuple[dict[str, Reading[Any]], str, Callable[[int], Reading[Any]]]
 """One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
 
 
@@ -88,7 +89,7 @@ class InputPorts:
         its ports."""
         found = watched(segment, taken_name(queue.spec.name), alarms, self.task)
 
-        def read_and_note(tick: int) -> Reading:
+        def read_and_note(tick: int) -> Reading[Any]:
             reading = found.read(tick)
             queue.taken = int(reading.message.taken)
             return reading

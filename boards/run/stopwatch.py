@@ -175,7 +175,8 @@ class Stopwatch:
 def _state_of(outputs: OutputPorts) -> tuple[int, memoryview]:
     """Return where, in which bytes, a level's status holds its state, one byte; always 0 without a
     status."""
-    status = getattr(outputs.messages, "status", None)
+    writer = outputs.writers.get("status")
+    status = None if writer is None else writer.message
     at = (status.record.dtype.fields or {}).get("state") if status is not None else None
     return (
         (at[1], status.raw) if status is not None and at is not None else (0, memoryview(bytes(1)))

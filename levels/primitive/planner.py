@@ -4,6 +4,7 @@ moves."""
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 
@@ -101,7 +102,7 @@ class Plans:
     def __init__(self) -> None:
         self._plans: dict[int, Trajectory | SegmentFault] = {}
 
-    def accept(self, plan: Reading, window: Collection[int]) -> None:
+    def accept(self, plan: Reading[Any], window: Collection[int]) -> None:
         """Copy a new plan; drop those of segments that have left the window."""
         for serial in [s for s in self._plans if s not in window]:
             del self._plans[serial]

@@ -10,9 +10,9 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.level import Ports
-from rack.levels.messages import Error, SegmentKind
+from rack.levels.messages import Error, JointCommand, PrimitiveStatus, SegmentKind
 from rack.levels.motion.path import BlendedPath
+from rack.levels.ports import Reading
 
 
 class SegmentFault(NamedTuple):

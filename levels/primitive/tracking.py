@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class Tracking:
         self._cycles_in_step = 0
         self._unexplained_cycles = 0
 
-    def update(self, status: Reading) -> bool:
+    def update(self, status: Reading[Any]) -> bool:
         """Process one status; True in the cycle in which servo and level get into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1

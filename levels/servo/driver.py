@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -260,7 +260,7 @@ class ArmDriver(Executor):
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             self.arm.look(self.scene)
 
-    def _catch_up(self, before: Reading, tick: int) -> bool:
+    def _catch_up(self, before: Reading[Any], tick: int) -> bool:
         """Advance the arm to `tick`; return whether cycles were missed. A restarted board first
         restores the arm."""
         if not self._started:

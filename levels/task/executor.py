@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, LevelContext, Output, Program, Reading
@@ -133,7 +133,7 @@ class TaskExecutor(Executor):
         """Interrupt the program for an operator; return how many moves of the plan are done."""
         return self._detour.step(plan, self._done, below)
 
-    def _reason_to_wait(self, below: Reading) -> str:
+    def _reason_to_wait(self, below: Reading[Any]) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
         orders = self._orders

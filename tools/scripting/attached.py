@@ -75,7 +75,7 @@ class AttachedRack:
         return self._monitor.look()
 
     @as_failure()
-    def read(self, mailbox: str) -> Reading:
+    def read(self, mailbox: str) -> Reading[Any]:
         """Return the newest message of a mailbox, a copy; it costs no board anything."""
         return open_observer(self._segment, mailbox_of(mailbox, self._boxes).name).peek()
 

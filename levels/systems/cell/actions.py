@@ -19,7 +19,7 @@ _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 def write_action(action: AnyAction, message: Message) -> None:
     """Fill the `CellAction` of a message; what the action lacks is zero."""
-    for field in CellAction:
+    for field in CellAction.message_type.fields:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
     message.by = action.by or 0.0
     if isinstance(action, Transfer):
@@ -49,7 +49,7 @@ def write_action(action: AnyAction, message: Message) -> None:
 
 def copy_action(source: Message, target: Message) -> None:
     """Copy the `CellAction` from one message to another."""
-    for field in CellAction:
+    for field in CellAction.message_type.fields:
         target.record[field.name] = source.record[field.name]
 
 

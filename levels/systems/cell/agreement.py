@@ -21,6 +21,7 @@ begin together, or not at all:
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 from rack.backplane.message import Message
 from rack.levels.level import Reading
@@ -52,7 +53,7 @@ class Agreement:
         self._margin_s = margin_s
         self._farewell_s = farewell_s
         self._arms = list(dict.fromkeys(arm for step in steps for arm in step))
-        self._answers: Mapping[str, Reading] = {}  # as of this cycle
+        self._answers: Mapping[str, Reading[Any]] = {}  # as of this cycle
         self._now_s = 0.0  # likewise, simulated time
         self.phase = Phase.AWAITING
         self.step = 0
@@ -101,7 +102,7 @@ class Agreement:
             return OrderVerb.END
         return VERBS[self.phase] if arm in self.partners else OrderVerb.NONE
 
-    def advance(self, answers: Mapping[str, Reading], now_s: float) -> None:
+    def advance(self, answers: Mapping[str, Reading[Any]], now_s: float) -> None:
         """Take one step forward, if the answers allow it; be over once every arm has confirmed the
         end, or had time to."""
         self._answers = answers

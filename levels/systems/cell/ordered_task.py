@@ -120,7 +120,7 @@ class OrderedTaskExecutor(TaskExecutor):
 
     def _plan_to_follow(self, tick: int) -> Message:
         """Follow the orders; return the plan of the one under way."""
-        self._listen(self.order)
+        self._listen(self.ports["order"])
         self._waits = ""
         taken = self._taken
         request = self.request
@@ -143,7 +143,7 @@ class OrderedTaskExecutor(TaskExecutor):
         self.report.operated = below.operated or self._orders.stands
         return plan if self._begun and self._begun == plan.id else self._nothing
 
-    def _listen(self, reading: Reading) -> None:
+    def _listen(self, reading: Reading[Any]) -> None:
         """Take up what the coordinator says, or note why it says nothing."""
         order: Message = reading.message
         self._held = self._absent = ""
@@ -174,9 +174,9 @@ class OrderedTaskExecutor(TaskExecutor):
         self._waits = self._not_ready()
         if self._waits:
             return
-        order = self.order.message
+        order = self.ports["order"].message
         # The coordinator's simulated time less that here.
-        ahead_s = float(self.peer.message.ahead) if self._table.coordinator else 0.0
+        ahead_s = float(self.ports["peer"].message.ahead) if self._table.coordinator else 0.0
         now_s = tick * self.context.tick_s
         try:
             action = read_action(order, self.context)
@@ -207,8 +207,8 @@ class OrderedTaskExecutor(TaskExecutor):
             return "the arm does not rest yet"
         if not self.world.message.revision:
             return "the world model knows nothing yet"
-        if self.order.message.by and self._table.coordinator:
-            peer = self.peer
+        if self.ports["order"].message.by and self._table.coordinator:
+            peer = self.ports["peer"]
             if not (peer.is_there and peer.message.uncertainty >= 0.0):
                 return f"the clock of {self._source} has not been compared yet"
         return ""
@@ -254,7 +254,7 @@ class OrderedTaskExecutor(TaskExecutor):
         until = super()._shown_until(plan)
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
-    def _reason_to_wait(self, below: Reading) -> str:
+    def _reason_to_wait(self, below: Reading[Any]) -> str:
         waits = super()._reason_to_wait(below)
         if self._orders.stands:
             return waits

@@ -3,6 +3,8 @@ that servo joints."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
@@ -46,7 +48,7 @@ class ComplianceWatch:
         self.rests = False  # the motion must end
         self.reason = ""  # why, or why the force wanted is another; empty: all is as commanded
 
-    def recall(self, last: Reading) -> None:
+    def recall(self, last: Reading[Any]) -> None:
         """Continue after a restart from the last `ForceStatus`: a guard strikes once."""
         if last.is_there:
             self.struck = last.message.struck
@@ -83,7 +85,7 @@ class ComplianceWatch:
         self.rests = True
         self.reason = reason
 
-    def _blind(self, wrench: Reading, tick: int) -> str:
+    def _blind(self, wrench: Reading[Any], tick: int) -> str:
         """Return why the contact is not known; empty: it is."""
         if not wrench.is_there or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"

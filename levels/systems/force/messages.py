@@ -13,8 +13,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from rack.backplane.message import Command, Message, field
-from rack.levels.operator import RESTS_ON, AnsweringStatus
+from rack.backplane.message import Message, field
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 from rack.levels.systems.trajectory.messages import HELD, MotionRequest, MotionState, MotionStatus
 
 AXES = 6
@@ -39,11 +39,10 @@ class Wrench(Message, version=1):
     )
 
 
-class Compliance(Command, version=1):
+class Compliance(RelayedCommand, version=1):
     """From the motion server to the level of hybrid control. `id` rises with every change; a guard
     strikes once an id."""
 
-    operator: int = RESTS_ON
     active: bool = field(doc="1: some axis is one of force, or guarded; 0: motion alone")
     frame: np.ndarray = field(
         unit="1", doc="orientation of the task frame in the world, w, x, y, z", shape=4

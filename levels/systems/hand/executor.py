@@ -4,6 +4,7 @@ them."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -248,7 +249,7 @@ class Tensions(CommandsAbove):
         self.tension = np.zeros((2, len(hand.most)))  # N
         self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
 
-    def join(self, tensions: Mapping[str, Reading]) -> None:
+    def join(self, tensions: Mapping[str, Reading[Any]]) -> None:
         """Set `tension` and `rests_on`, while nothing is `missing`."""
         self.rests_on = 0
         for board in self.oldest:

@@ -54,7 +54,7 @@ class FingersBelow:
         self.error = Error.NONE  # of the hand
         self.rests_on = 0  # newest command of an operator that all boards rest on
 
-    def look(self, statuses: Mapping[str, Reading]) -> None:
+    def look(self, statuses: Mapping[str, Reading[Any]]) -> None:
         """Read the statuses of all boards."""
         self.awaited = ""
         self.error = Error.NONE

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -100,7 +101,7 @@ class HandLoop(Executor):
 
     def process(self, tick: int) -> None:
         """Follow the newest command, and report."""
-        hand: Reading = self.hand
+        hand: Reading[Any] = self.hand
         self.orders.take(self.operator)
         if not self._met:
             if not hand.is_there:
@@ -132,7 +133,7 @@ class HandLoop(Executor):
         the level above."""
         return min(tick - self._taken, self._period) * self.context.tick_s
 
-    def _take(self, command: Reading, tick: int) -> None:
+    def _take(self, command: Reading[Any], tick: int) -> None:
         """Follow what is new, unless an operator holds the loop."""
         released = self._held
         self._held = self.orders.holds

@@ -14,9 +14,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from rack.backplane.message import Command, field
+from rack.backplane.message import field
 from rack.backplane.words import Demand
-from rack.levels.operator import RESTS_ON, AnsweringStatus
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 FLEXOR = 0
 EXTENSOR = 1
@@ -47,10 +47,9 @@ DRIVEN = field("u1", unit="1", doc="1: the joint is one of this board's", shape=
 SENSED = field(unit="tick", doc="tick of the hand's status that it rests on; -1: none yet")
 
 
-class TensionCommand(Command, version=1):
+class TensionCommand(RelayedCommand, version=1):
     """From the boards of tendon loops to the board of the hand."""
 
-    operator: int = RESTS_ON
     sampled: int = field(
         unit="tick", doc="tick of the hand's status that it rests on; -1: none yet, so no tension"
     )
@@ -89,20 +88,18 @@ class HandStatus(AnsweringStatus, version=1):
     )
 
 
-class TendonTorque(Command, version=1):
+class TendonTorque(RelayedCommand, version=1):
     """From the joint loop to the tendon loop."""
 
-    operator: int = RESTS_ON
     sampled: int = field(
         unit="tick", doc="tick of the hand's status that it rests on; -1: none yet"
     )
     torque: np.ndarray = field(unit="N m", doc="of the joints", shape="joints")
 
 
-class FingerTarget(Command, version=1):
+class FingerTarget(RelayedCommand, version=1):
     """From the fingertip loop to the joint loop."""
 
-    operator: int = RESTS_ON
     active: bool = field(doc="0: no target yet, hold")
     position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
     velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
@@ -119,10 +116,9 @@ class FingerTarget(Command, version=1):
     )
 
 
-class GraspTarget(Command, version=1):
+class GraspTarget(RelayedCommand, version=1):
     """From the grasp loop to the fingertip loop, or to the boards of fingers."""
 
-    operator: int = RESTS_ON
     active: bool = field(doc="0: no target yet, hold")
     mode: np.ndarray = field(
         "u1", unit=FingerMode, doc="how each finger is controlled", shape="fingers"
@@ -200,12 +196,11 @@ class GraspStatus(AnsweringStatus, version=1):
     plan: int = field("u4", unit="1", doc="id of the grasp plan in use; 0: none")
 
 
-class GraspPlan(Command, version=1):
+class GraspPlan(RelayedCommand, version=1):
     """From a planner, on a board or on the host side, to the grasp loop: where the fingers take
     hold of
     an object, and from which posture they close. The newest with an `id` above 0 counts."""
 
-    operator: int = RESTS_ON
     object: int = field("i2", unit="1", doc="row of the object in the world model")
     sensed: int = field(unit="tick", doc="tick of the world model that it rests on")
     posture: np.ndarray = field(

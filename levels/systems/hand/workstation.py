@@ -269,7 +269,7 @@ class Workstation(HostProgram):
     def names(self, bus: Bus) -> Mapping[str, Any]:
         """Return the functions that a prompt offers."""
         return {
-            "plan": lambda: self.plan(bus),
+            "plan": lambda: self.plan_grasp(bus),
             "boards": lambda: self.boards(bus),
         }
 

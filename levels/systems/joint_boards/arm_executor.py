@@ -4,7 +4,7 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -52,7 +52,7 @@ class JointTorques(CommandsAbove):
         """The mass in the gripper, as the boards know it."""
         return Payload(float(self._sum[-4]), self._sum[-3:])
 
-    def add_up(self, commands: Mapping[str, Reading]) -> None:
+    def add_up(self, commands: Mapping[str, Reading[Any]]) -> None:
         """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""
         self.rests_on = 0
         self._sum[:] = 0.0
@@ -95,7 +95,7 @@ class ArmExecutor(ArmDriver):
         self._rest_by: int | None = None
         # Tick of the first status that said so; None: not braked, or not yet said.
         self._braked_at: int | None = None
-        self._torques: Mapping[str, Reading] = {}
+        self._torques: Mapping[str, Reading[Any]] = {}
         self._waiting = ""  # why the boards above do not drive the arm
 
     @classmethod

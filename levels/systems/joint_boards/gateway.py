@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -83,7 +83,7 @@ class JointGateway(Executor):
         self._up.append((tick + self._delay, bytes(self._merged.raw)))
         take_arrived(self._up, self.status, tick)
 
-    def _take(self, command: Reading, tick: int) -> None:
+    def _take(self, command: Reading[Any], tick: int) -> None:
         """Put what is new on the link; take what has passed it."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.message.raw)))
@@ -105,7 +105,7 @@ class JointGateway(Executor):
         command.velocity[:] = newest.velocity
         command.acceleration[:] = 0.0
 
-    def _merge(self, statuses: Mapping[str, Reading]) -> None:
+    def _merge(self, statuses: Mapping[str, Reading[Any]]) -> None:
         merged = self._merged
         values = [reading.message for reading in statuses.values()]
         merged.position[:] = values[0].position
@@ -165,11 +165,10 @@ class NetworkGateway(JointGateway):
     is DONE, or in ERROR, when the program of that rack is: then it may end the run."""
 
     above = Input(JointReference, "lan.reference")
-    program = Input(TaskStatus, "lan.program")
+    task = Input(TaskStatus, "lan.program")
     peer = Input(PeerPresence, "lan.peer")
-    statuses = JointGateway.inputs["statuses"]
     command = Output(JointReference, rests_on=above)
-    status = Output(JointStatus, cycles=STATUS_CYCLES, rests_on=statuses)
+    status = Output(JointStatus, cycles=STATUS_CYCLES, rests_on=JointGateway.statuses)
     params = NetworkGatewayParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -200,7 +199,7 @@ class NetworkGateway(JointGateway):
         elif self._refused:
             self.status.state = State.HOLDING
             self.status.reason = self._refused
-        program: Message = self.program.message
+        program: Message = self.task.message
         if program.state in (State.DONE, State.ERROR):
             self.status.state = program.state
             self.status.error = program.error
@@ -216,7 +215,7 @@ class NetworkGateway(JointGateway):
             step_s = self.context.tick_s / STATUS_CYCLES
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
-    def _take(self, command: Reading, tick: int) -> None:
+    def _take(self, command: Reading[Any], tick: int) -> None:
         """Hand on what is new when the boards below need it, at ticks of this rack."""
         if command.is_new:
             arrived = self._arrived

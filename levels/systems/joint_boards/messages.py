@@ -20,16 +20,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Command, field
+from rack.backplane.message import field
 from rack.levels.messages import DrivenArm, JointCommand, ServoStatus
-from rack.levels.operator import RESTS_ON, AnsweringStatus
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 
-class JointReference(Command, version=1):
+class JointReference(RelayedCommand, version=1):
     """From the trajectory level to all boards that servo joints; these interpolate between its set
     points."""
 
-    operator: int = RESTS_ON
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
     )
@@ -52,12 +51,11 @@ class JointReference(Command, version=1):
     )
 
 
-class JointTorque(Command, version=1):
+class JointTorque(RelayedCommand, version=1):
     """From a board that servoes joints to the board of the arm, which adds them up; id rises with
     every
     cycle."""
 
-    operator: int = RESTS_ON
     sampled: int = field(
         unit="tick", doc="tick of the arm's status that it rests on; -1: none yet, so no torque"
     )

@@ -15,18 +15,18 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Command, Message, State, field
+from rack.backplane.message import Message, State, field
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
     HELD_FROM_ABOVE,
-    RESTS_ON,
     AnsweringStatus,
     Commands,
     Operation,
     OperatorCommand,
     Orders,
+    RelayedCommand,
     answered,
 )
 from rack.levels.systems.state_table.checks import flaws
@@ -53,10 +53,9 @@ from rack.levels.systems.state_table.table import (
 from rack.levels.tables import SceneConfig, Table, read_params
 
 
-class TableCommand(Command, version=1, message="word_command"):
+class TableCommand(RelayedCommand, version=1, message="word_command"):
     """First fields of every command to a level of this kind."""
 
-    operator: int = RESTS_ON
     hold: bool = field(doc="1: come to rest and stay, whatever is under way")
     words: str = field(
         f"S{PHRASE_BYTES}", doc="the command with its parameters, as in 'pick block1'"
@@ -304,7 +303,7 @@ class StateTableExecutor(Executor):
         orders.take(self.operator, self._judge)
         self._kept = ""
         self._rests_on = orders.rests_on(0)
-        above: Reading | None = None
+        above: Reading[Any] | None = None
         if "command" in self.inputs:
             above = next(iter(self.above.values()), None)
         if above is not None:
@@ -314,7 +313,7 @@ class StateTableExecutor(Executor):
         if orders.holds:
             self._kept = orders.keeps(self.context.board)
 
-    def _hear(self, above: Reading) -> None:
+    def _hear(self, above: Reading[Any]) -> None:
         """Take up what the level above commands, unless an operator commands instead."""
         command: Message = above.message
         self._rests_on = self.orders.rests_on(command.operator)
@@ -390,7 +389,7 @@ class StateTableExecutor(Executor):
         orders.report(shown, self._rests_on)
 
 
-def answer_of(reading: Reading, serial: int) -> str:
+def answer_of(reading: Reading[Any], serial: int) -> str:
     """Return the value of `BELOW` for a status and the serial of the newest command sent down."""
     if reading.is_lost:
         return "lost"

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -235,7 +235,7 @@ class TouchGuard:
         """Forget the torques so far."""
         self._past.clear()
 
-    def is_struck(self, boards: Mapping[str, Reading], most: float) -> bool:
+    def is_struck(self, boards: Mapping[str, Reading[Any]], most: float) -> bool:
         """Return whether the torque of a joint has changed by more than `most`, N m."""
         if all(board.is_new and not board.message.holding for board in boards.values()):
             self._past.append(sum(board.message.torque for board in boards.values()))

@@ -7,8 +7,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from rack.backplane.message import Command, Message, field
-from rack.levels.operator import RESTS_ON, AnsweringStatus
+from rack.backplane.message import Message, field
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 HELD = 16
 """Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than
@@ -44,12 +44,11 @@ class RequestEnd(IntEnum):
     GUARDED = 5  # a guard was struck on the way
 
 
-class MotionRequest(Command, version=1):
+class MotionRequest(RelayedCommand, version=1):
     """`id` numbers requests, rising by one from 1 in the order of the queue; one not above those
     taken
     is a repetition."""
 
-    operator: int = RESTS_ON
     kind: MotionKind = field(doc="what to do")
     joints: np.ndarray = field(unit="rad", doc="goal of JOINTS", shape="joints")
     position: np.ndarray = field(

@@ -271,8 +271,8 @@ class RequestPlanner(Planner):
         for _ in range(BATCH):
             if not self._may_send(self.below.message.done, tick):
                 return
-            self._fill(self._sent, self.world.message)
-            if not self.send():
+            self._fill(self.output.message, self._sent, self.world.message)
+            if not self.output.send():
                 return
             self._sent += 1
             self._taken_at = tick
