@@ -123,8 +123,8 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
         fields: What `field` returns, by name.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
-    made: type[B] = type(base)(name, (base,), body, version=version, message=name)
-    return made
+    made: Any = _Slotted(name, (base,), body, version=version, message=name)
+    return made  # type: ignore[no-any-return]
 
 
 class _Slotted(type):
@@ -178,7 +178,8 @@ class Message(metaclass=_Slotted):
         cls.message_type = MessageType(known_as, version, tuple(fields.values()))
 
     def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Self:  # noqa: D102  # as the class
-        return object.__new__(_resolved(cls, dtype))
+        made: Self = object.__new__(_resolved(cls, dtype))
+        return made
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
         raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
@@ -280,7 +281,7 @@ def _greatest(kind: np.dtype) -> float:
 
 
 @cache
-def _resolved(cls: type[Message], dtype: np.dtype) -> type[Message]:
+def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
     """Return the subclass of a message class with one property per field of this dtype."""
     names = dtype.names or ()
     declared = {field.name: field for field in cls.message_type.fields}
@@ -288,8 +289,8 @@ def _resolved(cls: type[Message], dtype: np.dtype) -> type[Message]:
     kind = cls.message_type
     options = {"version": kind.version, "message": kind.name}
     slots = tuple(f"_{name}" for name in names)
-    made: type[Message] = type(cls)(cls.__name__, (cls,), {"__slots__": slots, **body}, **options)
-    return made
+    made: Any = _Slotted(cls.__name__, (cls,), {"__slots__": slots, **body}, **options)
+    return made  # type: ignore[no-any-return]
 
 
 def _property(slot: str, dtype: np.dtype, declared: Field | None) -> property:

@@ -31,7 +31,7 @@ from typing import Any, ClassVar, Protocol
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.levels.level import LevelContext, Program
-from rack.levels.ports import Input, Inputs, Output, collect_ports
+from rack.levels.ports import InputPort, Output, collect_ports
 from rack.levels.tables import Table
 
 
@@ -92,7 +92,7 @@ class Bus(Protocol):
 class HostProgram:
     """A program of a host board. `context.every` is 1: it has no rate."""
 
-    inputs: ClassVar[Mapping[str, Input[Any] | Inputs[Any]]] = {}
+    inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
     """Ports that it reads: mailboxes of a bus adapter, one per port, as in "below.motion"."""
     outputs: ClassVar[Mapping[str, Output[Any]]] = {}
     """Ports that it writes, each the mailbox `<board>.<port>`, for a bus adapter to read."""
@@ -104,8 +104,8 @@ class HostProgram:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.inputs = collect_ports(cls, cls.inputs, (Input, Inputs))
-        cls.outputs = collect_ports(cls, cls.outputs, (Output,))
+        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
+        cls.outputs = collect_ports(cls, "outputs", (Output,))
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

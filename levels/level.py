@@ -98,6 +98,7 @@ from rack.levels.faults import Fault
 from rack.levels.operator import Commands, Operation
 from rack.levels.ports import (
     Input,
+    InputPort,
     Inputs,
     MadePorts,
     Output,
@@ -221,7 +222,7 @@ class LevelContext:
 class LevelSection:
     """What executor and planner of a level have in common."""
 
-    inputs: ClassVar[Mapping[str, Input[Any] | Inputs[Any]]] = {}
+    inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
     """The ports that it reads, by name: collected from the class and its bases."""
     outputs: ClassVar[Mapping[str, Output[Any]]] = {}
     """The ports that it writes, likewise; the port of a planner is called "plan"."""
@@ -237,8 +238,8 @@ class LevelSection:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.inputs = collect_ports(cls, cls.inputs, (Input, Inputs))
-        cls.outputs = collect_ports(cls, cls.outputs, (Output,))
+        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
+        cls.outputs = collect_ports(cls, "outputs", (Output,))
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

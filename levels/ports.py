@@ -37,13 +37,13 @@ class Port(Generic[M]):
         self.name = name
 
 
-class Input(Port[M]):
-    """A port that a level reads: an attribute that is a `Reading` of a message class.
+class InputPort(Port[M]):
+    """A port that a level reads.
 
-    Args:
-        message: The class of its messages.
-        source: A mailbox ("world.model"), or relative to the level: "above.command",
-            "below.status", "own.plan". A config may wire the port elsewhere.
+    Attributes:
+        source: The mailbox, or mailboxes, as of `Input`.
+        many: Whether it reads the mailbox of every neighbour.
+        optional: Whether the level also works without any.
     """
 
     many = False
@@ -52,6 +52,16 @@ class Input(Port[M]):
     def __init__(self, message: type[M], source: str) -> None:
         self.message = message
         self.source = source
+
+
+class Input(InputPort[M]):
+    """A port that a level reads: an attribute that is a `Reading` of a message class.
+
+    Args:
+        message: The class of its messages.
+        source: A mailbox ("world.model"), or relative to the level: "above.command",
+            "below.status", "own.plan". A config may wire the port elsewhere.
+    """
 
     @overload
     def __get__(self, level: None, owner: type) -> Self: ...
@@ -65,7 +75,7 @@ class Input(Port[M]):
         return vars(level).setdefault(self.name, empty)  # type: ignore[no-any-return]
 
 
-class Inputs(Port[M]):
+class Inputs(InputPort[M]):
     """A port that reads the mailbox of every neighbour: an attribute that maps boards to readings.
 
     In the config's order. By mailbox where the config names several of one board.
@@ -79,8 +89,7 @@ class Inputs(Port[M]):
     many = True
 
     def __init__(self, message: type[M], source: str, *, optional: bool = False) -> None:
-        self.message = message
-        self.source = source
+        super().__init__(message, source)
         self.optional = optional
 
     @overload
@@ -113,7 +122,7 @@ class Output(Port[M]):
         message: type[M],
         *,
         cycles: int = 1,
-        rests_on: Input[Any] | Inputs[Any] | None = None,
+        rests_on: InputPort[Any] | None = None,
     ) -> None:
         self.message = message
         self.cycles = cycles
@@ -190,24 +199,27 @@ class MadePorts(NamedTuple):
     """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some
     are unknown."""
 
-    inputs: Mapping[str, Input[Any]] = MappingProxyType({})
+    inputs: Mapping[str, InputPort[Any]] = MappingProxyType({})
     outputs: Mapping[str, Output[Any]] = MappingProxyType({})
     is_whole: bool = True
 
 
-def collect_ports(level: type, known: Mapping[str, Any], kinds: tuple[type, ...]) -> dict[str, Any]:
-    """Return the ports of a class: those `known` of its bases, then its own.
+def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[str, Any]:
+    """Return the ports of a class: those of its bases, then its own.
 
     A class drops the port of a base by setting it to None.
 
     Args:
         level: The class.
-        known: The ports of its bases by name.
+        attribute: The attribute in which the bases have their ports, by name.
         kinds: Classes of ports to collect.
 
     Raises:
         LevelError: The class has a port and another attribute of the same name.
     """
+    known: dict[str, Any] = {}
+    for base in reversed(level.__mro__[1:]):
+        known |= {port.name: port for port in vars(base).get(attribute, {}).values()}
     found = dict(known)
     for name, value in vars(level).items():
         if isinstance(value, kinds):

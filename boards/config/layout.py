@@ -169,7 +169,7 @@ class LayoutMaker:
             "depth": depth,
             "phase": visible,
         }
-        position = self._mailbox(taken_name(box.name), QueueTaken, **place)
+        position = self._mailbox(taken_name(box.name), QueueTaken.message_type, **place)
         yield replace(position, readers=(writer.name,), protocol="time-slice")
 
     def _capacity(self, queue: str) -> int:

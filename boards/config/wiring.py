@@ -32,8 +32,9 @@ from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
-from rack.levels.level import Executor, Input, Inputs, Output, Planner, Program
+from rack.levels.level import Executor, Output, Planner, Program
 from rack.levels.operator import Commands, OperatorCommand
+from rack.levels.ports import InputPort
 
 OWN_OPERATOR = "own.operator"
 LevelClass = type[Executor] | type[Planner] | type[HostProgram]
@@ -44,7 +45,7 @@ class Connection(NamedTuple):
     that follow."""
 
     port: str
-    entry: Input[Any] | Inputs[Any]
+    entry: InputPort[Any]
     key: str
     given: Sources
     mailboxes: Sources
@@ -80,8 +81,8 @@ class TaskPorts:
 
     place: TaskPlace
     kind: LevelClass
-    inputs: Mapping[str, Input]
-    outputs: Mapping[str, Output]
+    inputs: Mapping[str, InputPort[Any]]
+    outputs: Mapping[str, Output[Any]]
     reads: Mapping[str, Source]
     exchange: Mapping[str, ExchangeConfig]
     connections: tuple[Connection, ...]
@@ -161,7 +162,7 @@ def with_exchange(ports: TaskPorts) -> TaskPorts:
     return replace(ports, outputs=outputs)
 
 
-def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
+def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output[Any]]]:
     if role == "host":
         program = find_class(wanted, HostProgram)
         if many := [port for port, entry in program.inputs.items() if entry.many]:
@@ -179,7 +180,7 @@ def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
 
 
 def _connections(
-    config: RackConfig, place: TaskPlace, inputs: Mapping[str, Input]
+    config: RackConfig, place: TaskPlace, inputs: Mapping[str, InputPort[Any]]
 ) -> Iterator[Connection]:
     own = {place.board}
     wired = rewired(config, place)
@@ -216,7 +217,7 @@ class Wiring:
         """The ports of all others, in order."""
         self.tasks = [ports for ports in self.ports.values() if ports.place.role != "host"]
         self.hosts = [ports for ports in self.ports.values() if ports.place.role == "host"]
-        self.writers: dict[str, tuple[TaskPorts, Output]] = {}
+        self.writers: dict[str, tuple[TaskPorts, Output[Any]]] = {}
         """The first task that writes each mailbox, and its declaration."""
         self.reading: dict[str, list[tuple[TaskPorts, str]]] = {}
         """Tasks and their ports that read each mailbox."""

@@ -17,6 +17,7 @@ FASTEST_HZ = 50.0
 """Fastest exchange over a network."""
 MOST_CHAIN = 8192
 """Bytes of a rack's certificates in DER form, as they travel with its seals."""
+MessageKind = type[Message]
 OnPeerLoss = Literal["hold", "stop", "go on"]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
@@ -71,7 +72,7 @@ class ImportConfig(Table):
         """Name of the mailbox there."""
         return self.source.partition("/")[2]
 
-    def message_class(self) -> type[Message]:
+    def message_class(self) -> MessageKind:
         """Return the message class. Raises `LookupError` with the reason if there is none."""
         module, name = module_and_name(self.type)
         found = getattr(module, name, None)

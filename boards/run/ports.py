@@ -21,8 +21,8 @@ from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
 from rack.boards.faults.messages import FaultyWriter
 from rack.boards.wiring import Source
-from rack.levels.level import LevelSection
-from rack.levels.ports import Reading, Sender, Verdict
+from rack.levels.level import LevelSection, Reading, Verdict
+from rack.levels.ports import Sender
 
 Line = tuple[dict[str, Reading[Any]], str, Callable[[int], Reading[Any]]]
 """One mailbox to read: where its reading goes, and the function that reads it as of a tick."""

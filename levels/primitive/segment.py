@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import Error, JointCommand, PrimitiveStatus, SegmentKind
 from rack.levels.motion.path import BlendedPath
-from rack.levels.ports import Reading
 
 
 class SegmentFault(NamedTuple):

@@ -28,7 +28,7 @@ from rack.levels.level import (
     Output,
     Reading,
 )
-from rack.levels.messages import Error, Scene
+from rack.levels.messages import ArmState, DrivenArm, Error, Scene
 from rack.levels.operator import Operation, Orders
 from rack.levels.robot.cell import cell_of, sensed_by
 from rack.levels.robot.dynamics import Terms
@@ -74,6 +74,10 @@ class ArmDriver(Executor):
     """The set points of a cycle, for drives that take them; None: they take torques."""
     orders: Orders
     """The operator's."""
+    before: Reading[ArmState]
+    status: DrivenArm
+    state: ArmState
+    scene: Scene
 
     def __init__(self, context: LevelContext, params: ArmParams) -> None:
         super().__init__(context)

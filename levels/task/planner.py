@@ -94,7 +94,7 @@ class TaskPlanner(Planner):
             self.output.error = refused.code
             self.output.reason = self._reason(refused)
             self.output.count = 0
-        self._plan = copied()
+        self._plan = copied(self.output)
 
     def _reason(self, refused: Refused) -> str:
         """Return why the program is refused, with the number of the action."""

@@ -202,7 +202,7 @@ class Coordinator(Executor):
                 self._agreement.recall(self.last_progress.message)
                 self._moves = self.last_progress.message.moves
         self._operated.take(self.operator)
-        self._readings = {arm: getattr(f"report_{arm}") for arm in self._table.arms}
+        self._readings = {arm: self.ports[f"report_{arm}"] for arm in self._table.arms}
         held = self._reason_to_hold()
         if self._steps:
             agreement = self._agreement
@@ -215,7 +215,7 @@ class Coordinator(Executor):
         if self._steps:
             self._check_progress(waits, tick)
         for arm in self._table.arms:
-            self._order(arm, held, getattr(f"order_{arm}"))
+            self._order(arm, held, self.ports[f"order_{arm}"])
         self._agreement.write_to(self.progress)
         fill_counts(self.progress.record[["moves"]], (self._moves,))
         self._report(waits, self.status)

@@ -92,7 +92,7 @@ class OrderedTaskExecutor(TaskExecutor):
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
             return MadePorts(is_whole=False)
-        ports = {"order": Input(CellOrder, table.orders)}
+        ports: dict[str, Input[Any]] = {"order": Input(CellOrder, table.orders)}
         if table.coordinator:
             ports["peer"] = Input(PeerPresence, f"lan.{peer_port(table.coordinator)}")
         return MadePorts(ports)
@@ -320,7 +320,7 @@ class OrderedTaskExecutor(TaskExecutor):
         super()._answer(below)
         is_held = self._taken.is_under_way and (self._absent or self._held)
         if not self._detour.move and (self._halted or self._rests or is_held):
-            self.command.hold = 1
+            self.command.hold = True
 
     def _state(self, plan: Message) -> State:
         if self._error:

@@ -216,8 +216,8 @@ class HybridExecutor(WristLevel):
         force.offset = self._law.offset
         force.struck = watch.struck
         force.axis = watch.axis
-        force.wanted = 0.0 if watch.task is None else watch.task.wanted
-        force.selected = 0 if watch.task is None else watch.task.selected
+        force.wanted = np.zeros(AXES) if watch.task is None else watch.task.wanted
+        force.selected = np.zeros(AXES) if watch.task is None else watch.task.selected
         resting = State.IDLE if watch.task is None else State.EXECUTING
         force.state = State.HOLDING if watch.reason else resting
         force.reason = watch.reason

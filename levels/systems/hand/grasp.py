@@ -4,7 +4,6 @@ again."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -186,7 +185,7 @@ class GraspExecutor(Executor):
         return ""
 
     @staticmethod
-    def _newest(plans: Mapping[str, Reading[Any]]) -> Message:
+    def _newest(plans: Mapping[str, Reading[GraspPlan]]) -> GraspPlan:
         return max((reading.message for reading in plans.values()), key=lambda plan: plan.id)
 
     def _awaits_plan(self) -> bool:

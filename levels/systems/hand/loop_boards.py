@@ -16,7 +16,13 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Mask
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Reading
-from rack.levels.operator import BELOW_LOST, HOLDABLE, OperatorCommand, Orders
+from rack.levels.operator import (
+    BELOW_LOST,
+    HOLDABLE,
+    OperatorCommand,
+    Orders,
+    RelayedCommand,
+)
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
@@ -51,10 +57,17 @@ class HandLoop(Executor):
 
     Without a fresh command it keeps what was commanded last, at rest: what the hand holds, it goes
     on holding. So it does on an operator's hold. A command that is not finite is not taken. A
-    subclass has the ports "command", "hand", "operator" and, unless the hand is below it, "below".
+    subclass has the ports "above", "command", "status", "hand", "operator" and, unless the hand is
+    below it, "below".
     """
 
     commands = HOLDABLE
+    above: Reading[RelayedCommand]
+    below: Reading[LoopStatus]
+    hand: Reading[HandStatus]
+    operator: Reading[OperatorCommand]
+    command: RelayedCommand
+    status: LoopStatus | FingerStatus
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -62,7 +75,7 @@ class HandLoop(Executor):
         assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand_model: Hand = self.cell.hand
         self.orders = Orders(self.commands)
-        command = self.inputs["command"].message
+        command = self.inputs["above"].message
         self.followed = command.zeros(context.sizes)  # that is followed
         # Names of its fields that must be finite.
         self._numbers = [field.name for field in command.message_type.fields if field.kind == "f8"]

@@ -132,6 +132,8 @@ class StateTableExecutor(Executor):
     last_status = Input(TableStatus, "own.status")
     operator = Input(OperatorCommand, "own.operator")
     status = Output(TableStatus)
+    command: RelayedCommand
+    """What it tells the level below, if there is one."""
     params = StateTableParams
     vocabulary: ClassVar[Vocabulary]
 

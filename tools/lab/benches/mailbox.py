@@ -188,7 +188,8 @@ def _reading(reader: Reader) -> Callable[[int], Message]:
     delay = reader.spec.delay
 
     def take(tick: int) -> Message:
-        return read(tick + delay).message
+        message: Message = read(tick + delay).message
+        return message
 
     return take
 
