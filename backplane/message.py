@@ -60,7 +60,7 @@ class Declaration:
     """What `field` says of a field of a message class; its name and type stand beside it."""
 
     kind: str | type[Message]
-    unit: str | type[IntEnum]
+    unit: str | type[IntEnum] | None
     doc: str
     shape: tuple[int | str, ...]
     length: tuple[float, float] | None
@@ -78,7 +78,9 @@ class Declaration:
             raise ValueError(f"numpy type '{kind}' does not hold {_name(hint)}")
         if (python is np.ndarray) != bool(self.shape):
             raise ValueError(f"shape {self.shape} does not suit {_name(hint)}")
-        unit = hint if python is IntEnum else self.unit or {bool: "1", str: "ASCII"}.get(python)
+        unit = hint if python is IntEnum else self.unit
+        if unit is None:
+            unit = {bool: "1", str: "ASCII"}.get(python)
         if unit is None:
             raise ValueError('has no unit; of a pure number it is "1"')
         if self.default is not None and not _holds(kind, self.default):
@@ -90,7 +92,7 @@ def field(
     kind: str | type[Message] = "",
     *,
     doc: str,
-    unit: str | type[IntEnum] = "",
+    unit: str | type[IntEnum] | None = None,
     shape: int | str | tuple[int | str, ...] = (),
     length: tuple[float, float] | None = None,
     default: Any = None,

@@ -356,7 +356,7 @@ class ArmState(Message, version=3):
     error: Error = field("u2", doc="latched fault; 0: none")
     reason: str = field(doc="that fault, readable")
     state: np.ndarray = field(
-        unit="mixed", doc="of the simulated cell, see rack.levels.robot.state", shape="state"
+        unit="", doc="of the simulated cell, see rack.levels.robot.state", shape="state"
     )
 
 

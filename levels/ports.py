@@ -226,6 +226,8 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
             if name not in known and any(hasattr(base, name) for base in level.__bases__):
                 why = f"port '{name}' has the name of another attribute"
                 raise LevelError(f"class {level.__name__}: {why}; rename the port")
+            # A port declared again takes its place among the class's own.
+            found.pop(name, None)
             found[name] = value
         elif name in known and value is None:
             del found[name]

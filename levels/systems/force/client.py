@@ -168,6 +168,12 @@ class ForceMotions(Motions):
         """End compliance and guards; done when the arm rests where it is."""
         return self._request(kind=MotionKind.COMPLY)
 
+    @property
+    def _status(self) -> ServerStatus:
+        """The newest status of the server."""
+        status: ServerStatus = self._bus.read("motion").message
+        return status
+
     def wrench(self) -> Mapping[str, float]:
         """Return the wrench of the tool on the surroundings, N, N m, by axis of the task frame."""
         values = self._status.wrench

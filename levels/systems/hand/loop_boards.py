@@ -381,9 +381,9 @@ def follow_grasp(
     """Fill a `FingerTarget` for the `GraspTarget` that a loop follows, and the
     `FingerStatus`."""
     status.tip = law.sense(hand.position)
-    target.active = loop.command.active
-    if loop.command.active:
-        law.targets(loop.command, loop.ahead_s(tick), target)
+    target.active = loop.followed.active
+    if loop.followed.active:
+        law.targets(loop.followed, loop.ahead_s(tick), target)
     status.position = hand.position
     status.target = law.wanted
     status.force[loop.driven] = hand.force[loop.driven]

@@ -306,7 +306,7 @@ class StateTableExecutor(Executor):
         self._kept = ""
         self._rests_on = orders.rests_on(0)
         above: Reading[Any] | None = None
-        if "command" in self.inputs:
+        if "above" in self.inputs:
             above = next(iter(self.above.values()), None)
         if above is not None:
             self._hear(above)
