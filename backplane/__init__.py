@@ -1,14 +1,14 @@
 """The backplane: one shared-memory segment per rack, with its mailboxes, its clock, and the watches
 on them.
 
-A level's author needs `Field`, `command` and `status` to declare messages, `State` for their
-statuses, and `Reading` with its `Verdict` for input ports. A program that looks into a running rack
-needs the rest:
+A level's author needs `Message`, `Command`, `Status` and `field` to declare messages, `State` for
+their statuses, and `Reading` with its `Verdict` for input ports. A program that looks into a
+running rack needs the rest:
 
     from rack.backplane import Segment, open_observer
 
     segment = Segment.attach("nasrem")
-    print(open_observer(segment, "servo.status").peek().value)
+    print(open_observer(segment, "servo.status").peek().message)
 
 - `Segment` is a rack's memory, `Layout` its mailboxes and tasks as plain data (`MailboxSpec`,
   `TaskSpec`).
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
     from rack.backplane.mailbox.mailbox import Reading, Verdict
     from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
-    from rack.backplane.message import Field, Message, MessageType, State, command, status
+    from rack.backplane.message import Command, Message, State, Status, field
     from rack.backplane.segment import Segment
     from rack.backplane.watch.alarms import Alarm
     from rack.backplane.words import Demand
@@ -42,23 +42,22 @@ if TYPE_CHECKING:
 __all__ = [
     "Alarm",
     "BackplaneError",
+    "Command",
     "Demand",
-    "Field",
     "Layout",
     "MailboxSpec",
     "Message",
-    "MessageType",
     "Reading",
     "Segment",
     "State",
+    "Status",
     "SystemClock",
     "TaskSpec",
     "Verdict",
-    "command",
+    "field",
     "open_observer",
     "open_reader",
     "open_writer",
-    "status",
 ]
 _PLACES = {
     "rack.backplane.clock.system_clock": ("SystemClock",),
@@ -66,7 +65,7 @@ _PLACES = {
     "rack.backplane.layout": ("Layout", "MailboxSpec", "TaskSpec"),
     "rack.backplane.mailbox.mailbox": ("Reading", "Verdict"),
     "rack.backplane.mailbox.protocols": ("open_observer", "open_reader", "open_writer"),
-    "rack.backplane.message": ("Field", "Message", "MessageType", "State", "command", "status"),
+    "rack.backplane.message": ("Command", "Message", "State", "Status", "field"),
     "rack.backplane.segment": ("Segment",),
     "rack.backplane.watch.alarms": ("Alarm",),
     "rack.backplane.words": ("Demand",),

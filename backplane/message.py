@@ -1,29 +1,48 @@
-"""Message types: fixed numpy structured layouts, documented field by field.
+"""Messages are classes: a local copy of one message has every field as an attribute.
 
-A message type is declared once, with symbolic sizes ("joints"), which a rack resolves from its
-config. The bytes of a resolved type travel through a mailbox.
+```python
+class PowerStatus(Status, version=1):
+    \"\"\"Power drawn by the arm.\"\"\"
+
+    power: float = field(unit="W", doc="mechanical power")
+    torque: Vector = field(unit="N m", shape="joints", doc="applied torque")
+```
+
+A scalar is a `float`, an `int`, a `bool`, a `str` or a member of an `IntEnum`; every other
+annotation stands for an array. A class without a version is a group of fields that others derive
+from.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from enum import IntEnum
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_type_hints
 
 import numpy as np
 
 from rack.backplane.errors import MailboxError
+from rack.backplane.message_type import Field, MessageType
 
 REASON_BYTES = 120
 COMMAND_ID = "id"
 """First field of every command: its serial."""
-NOT_SENT = (
-    "its board writes this message in every cycle: declare the port as Output(..., queued=True) to"
-    " send it"
-)
+_SET = object.__setattr__
+B = TypeVar("B", bound="Message")
+_KINDS: Mapping[type, tuple[str, str]] = {
+    bool: ("u1", "u"),
+    int: ("i8", "iu"),
+    float: ("f8", "f"),
+    str: (f"S{REASON_BYTES}", "S"),
+    IntEnum: ("u1", "iu"),
+    np.ndarray: ("f8", "iufS"),
+}
+"""By type of a field: its numpy type unless the field states another, and the kinds permitted."""
 
 
 class State(IntEnum):
@@ -37,111 +56,145 @@ class State(IntEnum):
 
 
 @dataclass(frozen=True)
-class Field:
-    """One field of a message: numpy scalar type, shape, unit and meaning.
+class Declaration:
+    """What `field` says of a field of a message class; its name and type stand beside it."""
 
-    `shape` mixes integers and symbolic sizes; `kind` is a numpy type string or, for a group of
-    fields, a nested `MessageType`. The unit of a number that stands for a name is its enum.
-    `length`: the least and the greatest one that a vector, along its last axis, or the magnitude of
-    a number may have.
+    kind: str | type[Message]
+    unit: str | type[IntEnum] | None
+    doc: str
+    shape: tuple[int | str, ...]
+    length: tuple[float, float] | None
+    default: Any
+
+    def named(self, name: str, hint: Any) -> Field:
+        """Return the field of this name and annotated type. Raises `ValueError` with a reason."""
+        if isinstance(self.kind, type):
+            group = self.kind.message_type
+            return Field(name, group, "", self.doc, self.shape)
+        python = next((kind for kind in _KINDS if hint is kind or _is_enum(hint, kind)), np.ndarray)
+        usual, permitted = _KINDS[python]
+        kind = self.kind or usual
+        if np.dtype(kind).kind not in permitted:
+            raise ValueError(f"numpy type '{kind}' does not hold {_name(hint)}")
+        if (python is np.ndarray) != bool(self.shape):
+            raise ValueError(f"shape {self.shape} does not suit {_name(hint)}")
+        unit = hint if python is IntEnum else self.unit
+        if unit is None:
+            unit = {bool: "1", str: "ASCII"}.get(python)
+        if unit is None:
+            raise ValueError('has no unit; of a pure number it is "1"')
+        if self.default is not None and not _holds(kind, self.default):
+            raise ValueError(f"default {self.default!r} does not fit numpy type '{kind}'")
+        return Field(name, kind, unit, self.doc, self.shape, self.length, python, self.default)
+
+
+def field(
+    kind: str | type[Message] = "",
+    *,
+    doc: str,
+    unit: str | type[IntEnum] | None = None,
+    shape: int | str | tuple[int | str, ...] = (),
+    length: tuple[float, float] | None = None,
+    default: Any = None,
+) -> Any:
+    """Declare a field of a message class.
+
+    Args:
+        kind: Its numpy type if that is not the annotation's default (`f8` of a float or an array,
+            `i8` of an int, `u1` of a bool or an `IntEnum`, `S120` of a str); or a message class:
+            the field is one such group or, with a shape, an array of them.
+        doc: What it says.
+        unit: Its unit, "1" for a pure number, an `IntEnum` for an array of names; not given for a
+            bool, a str, an enumeration and a group.
+        shape: Shape of an array, of integers and symbolic sizes ("joints").
+        length: The least and the greatest length of a vector, or magnitude of a number, that is
+            taken from another rack.
+        default: Value in the first message that a level writes; otherwise all bytes are 0.
     """
-
-    name: str
-    kind: str | MessageType
-    unit: str | type[IntEnum]
-    meaning: str
-    shape: tuple[int | str, ...] = ()
-    length: tuple[float, float] | None = None
+    sizes = shape if isinstance(shape, tuple) else (shape,)
+    return Declaration(kind, unit, doc, sizes, length, default)
 
 
-@dataclass(frozen=True)
-class MessageType:
-    """A named, versioned layout. `fields` are ordered by offset.
+def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
+    """Return a message class whose fields a config decides: integers, and groups.
 
-    Raises `MailboxError` for a field name that a `Message` cannot have.
+    Args:
+        name: Of the message.
+        version: Of the message.
+        base: Class whose fields come first.
+        fields: What `field` returns, by name.
     """
-
-    name: str
-    version: int
-    fields: tuple[Field, ...]
-
-    def __post_init__(self) -> None:
-        names = [f.name for f in self.fields]
-        wrong = [n for n in names if names.count(n) > 1 or n.startswith("_") or hasattr(Message, n)]
-        if wrong:
-            why = "permitted: once each, no leading '_', no attribute of Message"
-            raise MailboxError(f"message '{self.name}': field '{wrong[0]}': {why}")
-
-    def dtype(self, sizes: Mapping[str, int]) -> np.dtype:
-        """Return the numpy dtype with every symbolic size filled in.
-
-        Raises `MailboxError` when `sizes` lacks one. Padding is explicit in numpy's aligned layout,
-        zeroed once at creation and never written, so that equal messages have equal bytes.
-        """
-        return np.dtype([self._column(f, sizes) for f in self.fields], align=True)
-
-    def _column(self, field: Field, sizes: Mapping[str, int]) -> tuple[str, Any, tuple[int, ...]]:
-        kind = (
-            field.kind.dtype(sizes) if isinstance(field.kind, MessageType) else np.dtype(field.kind)
-        )
-        missing = [s for s in field.shape if isinstance(s, str) and s not in sizes]
-        if missing:
-            known = ", ".join(sorted(sizes)) or "none"
-            raise MailboxError(
-                f"message '{self.name}' field '{field.name}': size '{missing[0]}' is unknown; known"
-                f" sizes: {known}"
-            )
-        shape = tuple(sizes[s] if isinstance(s, str) else s for s in field.shape)
-        return field.name, kind, shape
+    body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
+    made: Any = _Slotted(name, (base,), body, version=version, message=name)
+    return made  # type: ignore[no-any-return]
 
 
-def command(name: str, version: int, *fields: Field) -> MessageType:
-    """Return a command type: `fields` after the command's serial."""
-    serial = Field(COMMAND_ID, "u4", "1", "serial of the command; 0: no command")
-    return MessageType(name, version, (serial, *fields))
+class _Slotted(type):
+    """Gives classes no attributes besides their slots: a misspelt field is an error."""
+
+    def __new__(
+        cls, name: str, bases: tuple[type, ...], body: dict[str, Any], **options: Any
+    ) -> _Slotted:
+        return super().__new__(cls, name, bases, {"__slots__": (), **body}, **options)
 
 
-def status(
-    name: str, version: int, *fields: Field, errors: str | type[IntEnum] = "1"
-) -> MessageType:
-    """Return a status type: `fields` after echo, state, error code, of the enum `errors` if it is
-    one, and reason."""
-    head = (
-        Field("echo", "u4", "1", "serial of the command that this status answers"),
-        Field("state", "u1", State, "idle, executing, done, error or holding"),
-        Field("error", "u2", errors, "error code of the level; 0: none"),
-        Field(
-            "reason",
-            f"S{REASON_BYTES}",
-            "ASCII",
-            "reason for the error or the hold, readable; empty: neither",
-        ),
-    )
-    return MessageType(name, version, (*head, *fields))
-
-
-class Message:
+class Message(metaclass=_Slotted):
     """A local copy of one message: a mailbox reads into it or writes from it.
 
-    Every field is an attribute. Array fields are numpy views of `record`: fill them in place
-    (`m.position[:] = q`) or assign (`m.position = q`). Scalars read and assign as plain numbers,
-    byte strings as `str`, see `text_of`. `record` is the structured array, shape (), `raw` its
-    bytes.
+    Array fields are numpy views of `record`: fill them in place (`m.position[:] = q`) or assign
+    (`m.position = q`). Scalars read and assign as plain values, texts as `str`, see `text_of`.
+    `record` is the structured array, shape (), `raw` its bytes.
     """
 
-    # Slots: a misspelt field is an error, not a new attribute that is never sent.
     __slots__ = ("raw", "record")
     raw: memoryview
     record: np.ndarray
+    message_type: ClassVar[MessageType] = MessageType("", 0, ())
 
-    def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Message:  # noqa: D102  # as the class
-        return object.__new__(_class_for(dtype))
+    def __init_subclass__(cls, version: int = 0, message: str = "") -> None:
+        """Collect the fields of a message class: those of its bases, then its own.
+
+        Args:
+            version: Of the message; it rises with every change of the fields. 0: the class is only
+                a base of others.
+            message: Name of the message; by default that of the class, as in "power_status".
+
+        Raises:
+            MailboxError: No message may have such a field.
+        """
+        fields = {f.name: f for base in cls.__bases__ for f in base.message_type.fields}  # type: ignore[attr-defined]
+        own = {name: d for name, d in vars(cls).items() if isinstance(d, Declaration)}
+        hints = get_type_hints(cls) if own else {}
+        for name, declaration in own.items():
+            try:
+                if name.startswith("_") or hasattr(Message, name) or name not in hints:
+                    raise ValueError(
+                        "permitted: annotated, no leading '_', no attribute of Message"
+                    )
+                fields[name] = declaration.named(name, hints[name])
+            except (TypeError, ValueError) as error:
+                raise MailboxError(
+                    f"message class {cls.__name__}: field '{name}': {error}"
+                ) from None
+        known_as = message or re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+        cls.message_type = MessageType(known_as, version, tuple(fields.values()))
+
+    def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Self:  # noqa: D102  # as the class
+        made: Self = object.__new__(_resolved(cls, dtype))
+        return made
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
-        self.raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
-        self.record = np.frombuffer(self.raw, dtype=dtype, count=1).reshape(())
+        raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
+        _SET(self, "raw", raw)
+        _SET(self, "record", np.frombuffer(raw, dtype=dtype, count=1).reshape(()))
         for name in dtype.names or ():
-            setattr(self, f"_{name}", self.record[name])
+            _SET(self, f"_{name}", self.record[name])
+
+    @classmethod
+    def zeros(cls, sizes: Mapping[str, int]) -> Self:
+        """Return a message of this class, all bytes 0; `sizes` by name. Raises `MailboxError` when
+        one is missing."""
+        return cls(cls.message_type.dtype(sizes))
 
     def clear(self) -> None:
         """Set every byte to zero."""
@@ -151,35 +204,34 @@ class Message:
         """Copy the bytes of a message of the same type."""
         self.raw[:] = other.raw
 
-    def send(self, basis: int | None = None) -> bool:
-        """Put a copy into the queue to which an output port leads; return False if the queue is
-        full.
+    def __setattr__(self, name: str, value: Any) -> None:
+        try:
+            _SET(self, name, value)
+        except AttributeError:
+            raise AttributeError(self._unknown(name)) from None
 
-        Of a port that is written on demand: have the board write it in this cycle, resting on
-        information of tick `basis`. Messages of other mailboxes are written in every cycle: there
-        it raises `MailboxError`.
-        """
-        raise MailboxError(NOT_SENT)
+    if not TYPE_CHECKING:
+        # A type checker knows the fields of a message class.
+        def __getattr__(self, name: str) -> Any:
+            raise AttributeError(self._unknown(name))
 
-    def room(self) -> int:
-        """Return how many messages the queue still takes in this cycle; raises as `send` does."""
-        raise MailboxError(NOT_SENT)
-
-    def __reduce__(self) -> tuple[Callable[..., Message], tuple[np.dtype, bytes]]:
-        """Make it again from type and bytes: its class has no name."""
-        return _again, (self.record.dtype, bytes(self.raw))
-
-    if TYPE_CHECKING:
-        # Field names come from the layout: a type checker cannot know them.
-        def __setattr__(self, name: str, value: Any) -> None: ...
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(
-            f"message has no field '{name}'; fields: {', '.join(self.record.dtype.names or ())}"
-        )
+    def _unknown(self, name: str) -> str:
+        names = self.record.dtype.names or ()
+        near = get_close_matches(name, names, 1)
+        what = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
+        return f"message '{self.message_type.name}' has no field '{name}'; {what}"
 
     def __repr__(self) -> str:
         return f"Message({ {n: self.record[n].tolist() for n in self.record.dtype.names or ()} })"
+
+
+class AnyMessage(Message):
+    """A message whose fields are known at run time alone."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+        def __setattr__(self, name: str, value: Any) -> None: ...
 
 
 def text_of(content: bytes | bytearray) -> str:
@@ -211,13 +263,9 @@ def state_name(state: int | None, otherwise: str = "") -> str:
 
 def copied(message: Message) -> Message:
     """Return a copy of a message, in memory of its own."""
-    copy = Message(message.record.dtype)
-    copy.copy_from(message)
+    copy: Message = object.__new__(type(message))
+    copy.__init__(message.record.dtype, memoryview(bytearray(message.raw)))  # type: ignore[misc]
     return copy
-
-
-def _again(dtype: np.dtype, content: bytes) -> Message:
-    return Message(dtype, memoryview(bytearray(content)))
 
 
 def fill_counts(record: Any, counts: Iterable[float]) -> None:
@@ -235,15 +283,19 @@ def _greatest(kind: np.dtype) -> float:
 
 
 @cache
-def _class_for(dtype: np.dtype) -> type[Message]:
-    """Return the subclass of `Message` with one property per field, made once per dtype."""
+def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
+    """Return the subclass of a message class with one property per field of this dtype."""
     names = dtype.names or ()
-    properties = {name: _property(f"_{name}", dtype[name]) for name in names}
+    declared = {field.name: field for field in cls.message_type.fields}
+    body = {name: _property(f"_{name}", dtype[name], declared.get(name)) for name in names}
+    kind = cls.message_type
+    options = {"version": kind.version, "message": kind.name}
     slots = tuple(f"_{name}" for name in names)
-    return type("Message", (Message,), {"__slots__": slots, **properties})
+    made: Any = _Slotted(cls.__name__, (cls,), {"__slots__": slots, **body}, **options)
+    return made  # type: ignore[no-any-return]
 
 
-def _property(slot: str, dtype: np.dtype) -> property:
+def _property(slot: str, dtype: np.dtype, declared: Field | None) -> property:
     view = attrgetter(slot)
 
     def store(self: Message, value: Any) -> None:
@@ -259,15 +311,42 @@ def _property(slot: str, dtype: np.dtype) -> property:
             view(self)[...] = data[:size]
 
         return property(lambda self: text_of(view(self).item()), store_text)
+    if declared is not None and declared.python is bool:
+        return property(lambda self: view(self).item() != 0, store)
+    if declared is not None and not isinstance(declared.unit, str):
+        member = {int(each): each for each in declared.unit}.get
+        return property(lambda self: member(value := view(self).item(), value), store)
     return property(lambda self: view(self).item(), store)
 
 
-def sending(plain: Message, send: Callable[..., bool], room: Callable[[], int]) -> Message:
-    """Return a message on the bytes of `plain` that has these methods `send` and `room`."""
-    kind = type("Message", (type(plain),), {"__slots__": ("room", "send")})
-    message: Message = object.__new__(kind)
-    message.__init__(plain.record.dtype, plain.raw)  # type: ignore[misc]
-    # Their slots hide the methods of `Message`.
-    setattr(message, "send", send)  # noqa: B010
-    setattr(message, "room", room)  # noqa: B010
-    return message
+def _is_enum(hint: Any, kind: type) -> bool:
+    return kind is IntEnum and isinstance(hint, type) and issubclass(hint, IntEnum)
+
+
+def _name(hint: Any) -> str:
+    return str(getattr(hint, "__name__", hint))
+
+
+def _holds(kind: str, value: Any) -> bool:
+    """Say whether a numpy type holds a value as it is."""
+    try:
+        stored = np.array(value, kind)
+    except (OverflowError, TypeError, ValueError):
+        return False
+    plain = value.encode() if isinstance(value, str) else value
+    return stored.dtype.kind == "f" or bool(np.all(stored == plain))
+
+
+class Command(Message):
+    """Base of the commands to a level."""
+
+    id: int = field("u4", unit="1", doc="serial of the command; 0: no command")
+
+
+class Status(Message):
+    """Base of the statuses of levels."""
+
+    echo: int = field("u4", unit="1", doc="serial of the command that this status answers")
+    state: State = field(doc="idle, executing, done, error or holding")
+    error: int = field("u2", unit="1", doc="error code of the level; 0: none")
+    reason: str = field(doc="reason for the error or the hold, readable; empty: neither")

@@ -15,7 +15,7 @@ import time
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, Self, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args, get_type_hints
 from zlib import crc32
 
 import posix_ipc
@@ -26,6 +26,9 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.words import Block, Head, Run, System
+
+if TYPE_CHECKING:
+    from rack.backplane.message import Message
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 16
@@ -88,6 +91,9 @@ class Segment:
         self._life: ProcessLock | None = None
         self.bytes = memoryview(memory)
         self.words = self.bytes.cast("q")
+        self.message_classes: dict[str, type[Message]] = {}
+        """Classes of the messages that this process reads and writes, by mailbox: see
+        `AnyMessage` for others."""
         self.layout: Layout
         self.config: str
         self.published: str

@@ -214,14 +214,14 @@ def statuses(segment: Segment, field: str) -> Iterator[tuple[str, Message]]:
         if box.name.endswith(".status") and field in (own.name for own in box.fields):
             status = open_observer(segment, box.name).peek()
             if status.is_there:
-                yield box.writer, status.value
+                yield box.writer, status.message
 
 
 def arm_states(segment: Segment) -> Iterator[tuple[str, Message]]:
     """Yield the last state of every arm or hand, which it counts by itself, with its board."""
     for box in segment.layout.mailboxes:
         if box.message == "arm_state":
-            yield box.writer, open_observer(segment, box.name).peek().value
+            yield box.writer, open_observer(segment, box.name).peek().message
 
 
 class Ending:
@@ -237,7 +237,7 @@ class Ending:
         """Return the last state of the level that ends the run, and the reason."""
         if self._observer is None:
             return "", ""
-        status = self._observer.peek().value
+        status = self._observer.peek().message
         silent_s = self._silence() * self._segment.layout.clock_ns * 1e-9
         reason = (
             f"'{self._ends_run}' has not been written for {silent_s:g} s"
@@ -311,14 +311,14 @@ class Ending:
                 box.message == "scene"
                 and (scene := open_observer(self._segment, box.name).peek()).is_there
             ):
-                return tuple(ends(goals, scene.value.position))
+                return tuple(ends(goals, scene.message.position))
         return ()
 
     def cause(self) -> Cause:
         """Return the cause of the end of a run that was not stopped."""
         if self._observer is None or self._ends_run is None:
             return "time over"
-        status = self._observer.peek().value
+        status = self._observer.peek().message
         fields = self._segment.layout.mailbox(self._ends_run).fields
         if status.state != State.ERROR and not self._silence():
             return "task done" if status.state == State.DONE else "time over"
@@ -332,7 +332,7 @@ class Ending:
         if it has ended."""
         assert self._observer is not None, "some level ends the run"
         reading = self._observer.peek()
-        if reading.value.state in (State.DONE, State.ERROR):
+        if reading.message.state in (State.DONE, State.ERROR):
             return 0
         newest = self._observer.newest if reading.is_there else 0
         ticks = self._segment.words[System.TICK] - newest

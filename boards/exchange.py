@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
-from rack.backplane.message import Field, Message, MessageType
-from rack.levels.fields import tick
+from rack.backplane.message import Message, field, make_message
 
 if TYPE_CHECKING:
     # A look at a running rack must not import the levels.
@@ -29,19 +28,20 @@ NEVER = -1
 """Tick at which a message was taken before there is one."""
 
 
-def exchange_message(reads: Mapping[str, Source]) -> MessageType:
-    """Return the message type for a board that reads these ports: two fields for each mailbox."""
+def exchange_message(reads: Mapping[str, Source]) -> type[Message]:
+    """Return the message class for a board that reads these ports: two fields for each mailbox."""
     age = (
         "from the release of the message in use to that of this cycle; negative: released later; 0"
         " before the first"
     )
     taken = f"release of the cycle that took it; {NEVER} before the first"
-    fields: list[Field] = []
+    fields: dict[str, Any] = {}
     for port, source in reads.items():
         labels = [port] if isinstance(source, str) else [f"{port}_{board}" for board in source]
         for label in labels:
-            fields += [tick(f"{label}_{AGE}", age), tick(f"{label}_{TAKEN}", taken)]
-    return MessageType(EXCHANGE, 1, tuple(fields))
+            fields[f"{label}_{AGE}"] = field(unit="tick", doc=age)
+            fields[f"{label}_{TAKEN}"] = field(unit="tick", doc=taken)
+    return make_message(EXCHANGE, 1, Message, fields)
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def ages_of(exchange: Message) -> dict[str, PortAge]:
 class Taken(NamedTuple):
     """The last reading of one mailbox, `readings[key]`, and its reader."""
 
-    readings: Mapping[str, Reading]
+    readings: Mapping[str, Reading[Any]]
     key: str
     reader: Reader
 

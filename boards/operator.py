@@ -10,7 +10,7 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry
-from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.operator import Goal, Operation, OperatorCommand
 
 
 def level_of(entry: RequestEntry, layout: Layout) -> str:
@@ -19,7 +19,7 @@ def level_of(entry: RequestEntry, layout: Layout) -> str:
 
 
 def message_of(entry: RequestEntry, layout: Layout) -> Message:
-    """Return a copy of a request's message, an `OPERATOR_COMMAND`."""
+    """Return a copy of a request's message, an `OperatorCommand`."""
     spec = _mailbox(entry, layout)
     message = Message(message_dtype(spec.fields, spec.size))
     message.raw[:] = entry.message[: spec.size]
@@ -29,7 +29,7 @@ def message_of(entry: RequestEntry, layout: Layout) -> Message:
 def _mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
     """Return the mailbox of a request. Raises `DamageError` if it is no operator's."""
     found = pick(layout.mailboxes, entry.mailbox, "mailbox")
-    if found.message != OPERATOR_COMMAND.name:
+    if found.message != OperatorCommand.message_type.name:
         raise DamageError(f"a command for '{found.name}'")
     return found
 

@@ -1,14 +1,14 @@
 """Virtual control loops: the public API of a level's author. `rack.levels.level` describes what a
 level must do.
 
-- Write a level: `Executor`, `Planner`, with `Input`, `Ports`, `Program`, `Reading`, `Verdict`,
-  `LevelContext`, `Pace`.
-- Declare messages: `MessageType`, `Field`, `command`, `status`, `Message`, `State`; the default
-  levels' messages are in `rack.levels.messages`, and their error codes in `Error`.
+- Write a level: `Executor`, `Planner`, with the ports `Input`, `Inputs`, `Output`, `QueuedOutput`
+  and `TimedOutput`, with `Reading`, `Verdict`, `Program`, `LevelContext`, `Pace`.
+- Declare messages: `Message`, `Command`, `Status`, `field`, `State`; the default levels' messages
+  are in `rack.levels.messages`, and their error codes in `Error`.
 - Declare parameters: `Table`, `Positive`, `Finite`, `read_params`, `LIVE`, `set_live`; arm and
   cell: `RobotConfig`, `SceneConfig`.
-- Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OPERATOR_COMMAND`, `ANSWER`,
-  `RESTS_ON`.
+- Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OperatorCommand`, `AnsweringStatus`,
+  `RelayedCommand`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
 - Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
 
@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 from rack.backplane.exports import on_first_use
 
 if TYPE_CHECKING:
-    from rack.backplane.message import Field, Message, MessageType, State, command, status
+    from rack.backplane.message import Command, Message, State, Status, field
     from rack.backplane.watch.alarms import Alarm
     from rack.levels.errors import LevelError, ProgramError, Refused, RobotError
     from rack.levels.level import (
@@ -34,23 +34,26 @@ if TYPE_CHECKING:
         Fault,
         Finding,
         Input,
+        Inputs,
         LevelContext,
+        Output,
         Pace,
         Planner,
-        Ports,
         Program,
+        QueuedOutput,
         Reading,
+        TimedOutput,
         Verdict,
     )
     from rack.levels.messages import Error
     from rack.levels.operator import (
-        ANSWER,
-        OPERATOR_COMMAND,
-        RESTS_ON,
+        AnsweringStatus,
         Commands,
         Goal,
         Operation,
+        OperatorCommand,
         Orders,
+        RelayedCommand,
     )
     from rack.levels.tables import (
         LIVE,
@@ -64,48 +67,50 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "ANSWER",
     "LIVE",
-    "OPERATOR_COMMAND",
-    "RESTS_ON",
     "Alarm",
+    "AnsweringStatus",
+    "Command",
     "Commands",
     "Demand",
     "Error",
     "Executor",
     "Fault",
-    "Field",
     "Finding",
     "Finite",
     "Goal",
     "Input",
+    "Inputs",
     "LevelContext",
     "LevelError",
     "Message",
-    "MessageType",
     "Operation",
+    "OperatorCommand",
     "Orders",
+    "Output",
     "Pace",
     "Planner",
-    "Ports",
     "Positive",
     "Program",
     "ProgramError",
+    "QueuedOutput",
     "Reading",
     "Refused",
+    "RelayedCommand",
     "RobotConfig",
     "RobotError",
     "SceneConfig",
     "State",
+    "Status",
     "Table",
+    "TimedOutput",
     "Verdict",
-    "command",
+    "field",
     "read_params",
     "set_live",
-    "status",
 ]
 _PLACES = {
-    "rack.backplane.message": ("Field", "Message", "MessageType", "State", "command", "status"),
+    "rack.backplane.message": ("Command", "Message", "State", "Status", "field"),
     "rack.backplane.watch.alarms": ("Alarm",),
     "rack.levels.errors": ("LevelError", "ProgramError", "Refused", "RobotError"),
     "rack.levels.level": (
@@ -114,23 +119,26 @@ _PLACES = {
         "Fault",
         "Finding",
         "Input",
+        "Inputs",
         "LevelContext",
+        "Output",
         "Pace",
         "Planner",
-        "Ports",
         "Program",
+        "QueuedOutput",
         "Reading",
+        "TimedOutput",
         "Verdict",
     ),
     "rack.levels.messages": ("Error",),
     "rack.levels.operator": (
-        "ANSWER",
-        "OPERATOR_COMMAND",
-        "RESTS_ON",
+        "AnsweringStatus",
         "Commands",
         "Goal",
         "Operation",
+        "OperatorCommand",
         "Orders",
+        "RelayedCommand",
     ),
     "rack.levels.tables": (
         "LIVE",

@@ -11,7 +11,7 @@ time never waits for it. It reaches the levels only through a bus adapter
 
         def run(self, bus: Bus) -> None:
             bus.send("requests", kind=MotionKind.JOINTS, joints=(0.0, -0.5, ...))
-            while bus.read("motion").value.done < bus.sent("requests"):
+            while bus.read("motion").message.done < bus.sent("requests"):
                 bus.wait(1.0)
 
 The program is over when `run` returns. An exception ends the process, which is restarted by the
@@ -30,8 +30,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import MessageType
-from rack.levels.level import Input, LevelContext, Program
+from rack.levels.level import LevelContext, Program
+from rack.levels.ports import InputPort, Output, collect_ports
 from rack.levels.tables import Table
 
 
@@ -55,7 +55,7 @@ class Bus(Protocol):
         """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when
         the run ends."""
 
-    def read(self, port: str) -> Reading:
+    def read(self, port: str) -> Reading[Any]:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the
         mailbox keeps them."""
 
@@ -92,15 +92,20 @@ class Bus(Protocol):
 class HostProgram:
     """A program of a host board. `context.every` is 1: it has no rate."""
 
-    inputs: ClassVar[Mapping[str, Input]] = {}
+    inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
     """Ports that it reads: mailboxes of a bus adapter, one per port, as in "below.motion"."""
-    outputs: ClassVar[Mapping[str, MessageType]] = {}
+    outputs: ClassVar[Mapping[str, Output[Any]]] = {}
     """Ports that it writes, each the mailbox `<board>.<port>`, for a bus adapter to read."""
     params: ClassVar[type[Table] | None] = None
     """Keys of `[host.<name>.params]`, checked before the launch; None: unchecked, the program reads
     them by itself."""
     program: ClassVar[type[Program] | None] = None
     """Keys of `[task]`, checked before the launch; None: it reads no such program."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
+        cls.outputs = collect_ports(cls, "outputs", (Output,))
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

@@ -82,20 +82,31 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType, ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any, ClassVar, NamedTuple, Self
 
 from pydantic import ValidationError, model_validator
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.queue import ALL
-from rack.backplane.message import Message, MessageType
+from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.compiled import preload
-from rack.levels.errors import ProgramError
+from rack.levels.errors import LevelError, ProgramError
 from rack.levels.faults import Fault
 from rack.levels.operator import Commands, Operation
+from rack.levels.ports import (
+    Input,
+    InputPort,
+    Inputs,
+    MadePorts,
+    Output,
+    QueuedOutput,
+    Sender,
+    TimedOutput,
+    collect_ports,
+)
 from rack.levels.tables import GoalConfig, RobotConfig, SceneConfig, Table, frozen
 
 __all__ = [
@@ -104,78 +115,23 @@ __all__ = [
     "Fault",
     "Finding",
     "Input",
+    "Inputs",
     "LevelContext",
     "MadePorts",
     "Output",
     "Pace",
     "Planner",
-    "Ports",
     "Program",
+    "QueuedOutput",
     "Reading",
+    "Sender",
+    "TimedOutput",
     "Verdict",
 ]
 
 
-class Input(NamedTuple):
-    """A port that a level reads."""
-
-    type: MessageType
-    source: str
-    """A mailbox ("world.model"), or relative to the level: "above.command", "below.status",
-    "own.plan". A config may wire the port elsewhere."""
-    many: bool = False
-    """Reads the mailbox of every neighbour: a dict of `Reading`s by board, in the config's order,
-    in place of one. By mailbox where the config names several of one board."""
-    optional: bool = False
-    """With `many`: the level also works without any such neighbour."""
-
-
-class Output(NamedTuple):
-    """A port that a level writes; its type alone for one of every cycle that rests on the input of
-    the same name."""
-
-    type: MessageType
-    cycles: int = 1
-    """Written in every n-th cycle: the last one before a multiple of n cycles' ticks, counted from
-    the board's phase, so that readers released then find it fresh. If that cycle is missed, the
-    message is missing too."""
-    queued: bool = False
-    """The level sends its messages itself, any number in a cycle: it fills `write.port` and calls
-    `write.port.send()`. False: the queue is full, and the message was not taken;
-    `write.port.room()` says how many more it takes."""
-    rests_on: str = ""
-    """The input whose information it passes on; default: the input of the same name, if there is
-    one. Its messages carry the tick of that information, of an input that reads many the oldest, of
-    none their own release. By these ticks the response of the whole hierarchy is measured."""
-    max_age_s: float = 0.0
-    """Above 0: written only in cycles in which the level calls `write.port.send(basis)`, `basis`
-    being the tick of the information. Readers find the message old in between, and its writer lost
-    when the information is older than this, s of simulated time."""
-
-    def is_due(self, tick: int, every: int, phase: int) -> bool:
-        """Return whether the cycle released at `tick`, every `every` ticks from tick `phase`,
-        writes it."""
-        return (tick - phase + every) % (self.cycles * every) == 0
-
-
-class MadePorts(NamedTuple):
-    """Ports that a config makes, in addition to those that a class declares; not `is_whole` if some
-    are unknown."""
-
-    inputs: Mapping[str, Input] = MappingProxyType({})
-    outputs: Mapping[str, Output] = MappingProxyType({})
-    is_whole: bool = True
-
-
 Misfits = Iterable[tuple[str, Any, str]]
 """Key, value and reason of each entry of a table that does not suit something else."""
-
-
-class Ports(SimpleNamespace):
-    """The ports of one cycle by name: `Reading`s for inputs, `Message`s for outputs."""
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"no port '{name}'; ports: {', '.join(sorted(self.__dict__))}")
 
 
 class Program(Table):
@@ -266,7 +222,10 @@ class LevelContext:
 class LevelSection:
     """What executor and planner of a level have in common."""
 
-    inputs: ClassVar[Mapping[str, Input]] = {}
+    inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
+    """The ports that it reads, by name: collected from the class and its bases."""
+    outputs: ClassVar[Mapping[str, Output[Any]]] = {}
+    """The ports that it writes, likewise; the port of a planner is called "plan"."""
     params: ClassVar[type[Table] | None] = None
     """Keys of `[board.<name>.params]`, checked before the launch; executor and planner share one
     table. None: unchecked, the level reads them by itself."""
@@ -277,8 +236,44 @@ class LevelSection:
     """Modules of which every process of the level needs the functions marked `compiled_for`: see
     `rack.levels.compiled`."""
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.inputs = collect_ports(cls, "inputs", (InputPort,))
+        cls.outputs = collect_ports(cls, "outputs", (Output,))
+
     def __init__(self, context: LevelContext) -> None:
         self.context = context
+        self.ports: dict[str, Any] = {}
+        """What the board puts into the ports that a config makes, by name."""
+
+    def input_table(self, port: str) -> dict[str, Any]:
+        """Return the dict into which the board puts what it has read from a port, by name.
+
+        Raises:
+            LevelError: The constructor uses the name of the port for something else.
+        """
+        if port not in self.inputs:
+            return self.ports
+        self._check_is_free(port)
+        return vars(self)
+
+    def place_output(self, port: str, value: object) -> None:
+        """Put a message, or a `Sender`, where the level finds it under the name of a port.
+
+        Raises:
+            LevelError: The constructor uses that name for something else.
+        """
+        if port not in self.outputs:
+            self.ports[port] = value
+            return
+        name = self.outputs[port].name
+        self._check_is_free(name)
+        vars(self)[name] = value
+
+    def _check_is_free(self, name: str) -> None:
+        if not isinstance(vars(self).get(name, {}), Reading | Message | dict):
+            why = f"attribute '{name}' has the name of a port; rename the attribute"
+            raise LevelError(f"class {type(self).__name__}: {why}")
 
     @classmethod
     def preload(cls) -> None:
@@ -306,7 +301,6 @@ class Executor(LevelSection, ABC):
     to cycle; each is written to its mailbox `<board>.<port>` at the end of every cycle.
     """
 
-    outputs: ClassVar[Mapping[str, MessageType | Output]] = {}
     faults: ClassVar[tuple[type, ...]] = ()
     """Classes of steps by which faults can strike what the level drives: see
     `rack.levels.faults`."""
@@ -358,7 +352,7 @@ class Executor(LevelSection, ABC):
         return cls.names(params)
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the ports that `params`, which may have mistakes, makes; `types`: mailboxes that
         classes declare."""
         return MadePorts()
@@ -367,8 +361,8 @@ class Executor(LevelSection, ABC):
         """Replace the injected faults by `faults`, all those active from now on."""
 
     @abstractmethod
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Compute one cycle, released at `tick`: sample `read`, fill `write`."""
+    def process(self, tick: int) -> None:
+        """Compute one cycle, released at `tick`: sample the inputs, fill the outputs."""
 
 
 class Planner(LevelSection, ABC):
@@ -378,13 +372,19 @@ class Planner(LevelSection, ABC):
     is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
     """
 
-    output: ClassVar[MessageType | Output]
+    output: Output[Any]
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        # Its mailbox is called after the plan.
+        cls.outputs = {"plan": cls.output} if "output" in cls.outputs else {}
+
+    def wanted(self, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is
         new."""
-        return bool(read.command.is_new)
+        command: Reading[Message] = getattr(self, "command")  # noqa: B009  # a port of most
+        return command.is_new
 
     @abstractmethod
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Make one plan into `write`. It takes effect `within_cycles` cycles after `tick`."""
+    def plan(self, tick: int) -> None:
+        """Make one plan into the output. It takes effect `within_cycles` cycles after `tick`."""

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Field, MessageType, command, status
+import numpy as np
+
+from rack.backplane.message import Message, field
 from rack.backplane.words import Demand
-from rack.levels.fields import by_joint, flag, number, real, row, short_count, tick
-from rack.levels.operator import ANSWER, RESTS_ON
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 WINDOW = 8
 """Elemental moves in one task command: the level below never waits for a cycle of the task
@@ -78,272 +79,305 @@ class SegmentKind(IntEnum):
     GRIPPER = 2
 
 
-ELEMENTAL_MOVE = MessageType(
-    "elemental_move",
-    1,
-    (
-        number("id", "serial of the move, rising by one from 1; 0: empty"),
-        short_count("action", "index of the program's action that it serves"),
-        Field("verb", "u1", Verb, "what to do"),
-        row("object", "row of the object concerned in the world model; -1: none"),
-        real("position", "m", "tool position at the end", 3),
-        real("quaternion", "1", "tool orientation at the end", 4),
-        by_joint("joints", "rad", "where MOVE_JOINTS ends; with `posture`, near the end"),
-        flag(
-            "posture", "1: of the configurations at the pose, the one nearest to `joints` is wanted"
-        ),
-        real("by", "s", "simulated time by which it must be done; 0: any time"),
-    ),
-)
+class ElementalMove(Message, version=1):
+    """One elemental move of a program."""
 
-TASK_PLAN = MessageType(
-    "task_plan",
-    1,
-    (
-        number("id", "serial of the plan"),
-        Field("error", "u2", Error, "why the program is refused; 0: it is not refused"),
-        Field("reason", "S120", "ASCII", "the refusal, readable"),
-        real("earliest", "s", "with TOO_LATE: the earliest time that could be met"),
-        short_count("count", "moves that follow"),
-        Field("moves", ELEMENTAL_MOVE, "", "the program, decomposed", (MOVES,)),
-    ),
-)
+    id: int = field("u4", unit="1", doc="serial of the move, rising by one from 1; 0: empty")
+    action: int = field("u2", unit="1", doc="index of the program's action that it serves")
+    verb: Verb = field(doc="what to do")
+    object: int = field(
+        "i2", unit="1", doc="row of the object concerned in the world model; -1: none"
+    )
+    position: np.ndarray = field(unit="m", doc="tool position at the end", shape=3)
+    quaternion: np.ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
+    joints: np.ndarray = field(
+        unit="rad", doc="where MOVE_JOINTS ends; with `posture`, near the end", shape="joints"
+    )
+    posture: bool = field(
+        doc="1: of the configurations at the pose, the one nearest to `joints` is wanted"
+    )
+    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
 
-TASK_COMMAND = command(
-    "task_command",
-    2,
-    RESTS_ON,
-    flag("hold", "1: ramp to rest and stay, whatever is under way"),
-    short_count("count", "moves that follow; id is the newest one's"),
-    Field("moves", ELEMENTAL_MOVE, "", "a window on the plan, oldest first", (WINDOW,)),
-)
 
-TASK_STATUS = status(
-    "task_status",
-    2,
-    *ANSWER,
-    short_count("action", "actions done"),
-    short_count("actions", "actions of the program"),
-    short_count("moves_done", "elemental moves done"),
-    short_count("moves", "elemental moves of the plan; 0 before there is one"),
-    number("first", "id under which the plan's first move is handed down"),
-    number("detour", "id of the move that an operator wants instead; 0: none"),
-)
+class TaskPlan(Message, version=1):
+    """From the planner of the task level to its executor: the program, decomposed."""
 
-OPERATED = flag("operated", "1: an operator keeps this level, or one below it, from its own work")
+    id: int = field("u4", unit="1", doc="serial of the plan")
+    error: Error = field("u2", doc="why the program is refused; 0: it is not refused")
+    reason: str = field(doc="the refusal, readable")
+    earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
+    count: int = field("u2", unit="1", doc="moves that follow")
+    moves: np.ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
 
-MOVE_STATUS = status(
-    "move_status",
-    3,
-    *ANSWER,
-    number("done", "newest elemental move done; 0: none yet"),
-    number("current", "elemental move under way; 0: none"),
-    real("progress", "1", "part of its path done, 0 to 1"),
-    Field("verb", "u1", Verb, "of the move under way"),
-    row("held", "row of the object in the gripper; -1: none"),
-    number("planned", "newest elemental move whose path is ready; 0: none yet"),
-    by_joint("end", "rad", "joint positions at the end of that path"),
-    number("replan", "open request to plan the current move anew from `start`; 0: none is open"),
-    by_joint("start", "rad", "joint positions where that motion holds"),
-    number("replans", "plans made anew because something was in the way"),
-    OPERATED,
-    flag(
-        "resting", "1: the arm rests, and the level that moves it has the operator's newest command"
-    ),
-)
 
-MOVE_PLAN = MessageType(
-    "move_plan",
-    1,
-    (
-        number("move", "elemental move that the plan serves"),
-        number("replan", "request that it answers; 0: the first plan of the move"),
-        Field("error", "u2", Error, "why there is no plan; 0: there is"),
-        Field("reason", "S120", "ASCII", "the error, readable"),
-        Field("kind", "u1", SegmentKind, "path or gripper"),
-        short_count("count", "waypoints that follow"),
-        real("waypoints", "rad", "collision-free path in joint space", WAYPOINTS, "joints"),
-        real(
-            "blend", "rad", "length over which corner k is rounded, before and after it", WAYPOINTS
-        ),
-    ),
-)
+class TaskCommand(RelayedCommand, version=2):
+    """From the task level to the elemental move level: a window on the plan."""
 
-SEGMENT = MessageType(
-    "segment",
-    1,
-    (
-        number("id", "serial of the segment, rising by one from 1; 0: empty"),
-        number("move", "elemental move that it serves"),
-        Field("kind", "u1", SegmentKind, "path or gripper"),
-        row("object", "object held, or to be grasped; -1: none"),
-        flag("touch", "1: the object may touch supports and fingers (approach, depart)"),
-        short_count("count", "waypoints that follow"),
-        real(
-            "waypoints",
-            "rad",
-            "path in joint space, from where the motion starts",
-            WAYPOINTS,
-            "joints",
-        ),
-        real("blend", "rad", "length over which corner k is rounded", WAYPOINTS),
-        real("by", "s", "simulated time by which it must be done; 0: any time"),
-        real("opening", "m or rad", "gripper joint position to go to, for GRIPPER"),
-        real("force", "N or N m", "largest gripper force on the way and afterwards"),
-    ),
-)
+    hold: bool = field(doc="1: ramp to rest and stay, whatever is under way")
+    count: int = field("u2", unit="1", doc="moves that follow; id is the newest one's")
+    moves: np.ndarray = field(ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW)
 
-MOVE_COMMAND = command(
-    "move_command",
-    2,
-    RESTS_ON,
-    flag("hold", "1: ramp to rest on the path and stay"),
-    short_count("count", "segments that follow; id is the newest one's"),
-    Field("segments", SEGMENT, "", "segments to do, oldest first", (SEGMENTS,)),
-)
 
-PRIMITIVE_STATUS = status(
-    "primitive_status",
-    3,
-    *ANSWER,
-    number("done", "newest segment done; 0: none yet"),
-    number("current", "segment under way; 0: none"),
-    real("progress", "1", "part of the segment's path done, 0 to 1"),
-    flag("blocked", "1: motion holds because something is in the way"),
-    flag("resting", "1: commanded velocity is zero"),
-    OPERATED,
-    row("held", "row of the object in the gripper; -1: none"),
-    real("opening", "m or rad", "gripper joint position, measured"),
-    by_joint("position", "rad", "joint positions commanded last"),
-    real("earliest", "s", "with TOO_LATE: the earliest time that could be met"),
-    real("ends", "s", "simulated time at which the segment under way should be done; 0: not known"),
-    number("wants", "segment for which the level wants a trajectory of its planner; 0: none"),
-    real("begin", "rad", "path parameter at which that trajectory is to begin, from rest"),
-)
+class TaskStatus(AnsweringStatus, version=2):
+    """Status of the task level."""
 
-TRAJECTORY = MessageType(
-    "trajectory",
-    1,
-    (
-        number("segment", "segment that it serves"),
-        Field("error", "u2", Error, "why there is none; 0: there is"),
-        Field("reason", "S120", "ASCII", "the error, readable"),
-        real("begin", "rad", "path parameter at which it begins"),
-        real("duration", "s", "from rest to rest"),
-        real("earliest", "s", "simulated time at which the segment could be done at the earliest"),
-        short_count("count", "sections that follow"),
-        real(
-            "sections",
-            "s, 1, 1/s, 1/s2, 1/s3",
-            "start, s, ds, dds, jerk of the path parameter",
-            SECTIONS,
-            5,
-        ),
-    ),
-)
+    action: int = field("u2", unit="1", doc="actions done")
+    actions: int = field("u2", unit="1", doc="actions of the program")
+    moves_done: int = field("u2", unit="1", doc="elemental moves done")
+    moves: int = field("u2", unit="1", doc="elemental moves of the plan; 0 before there is one")
+    first: int = field("u4", unit="1", doc="id under which the plan's first move is handed down")
+    detour: int = field(
+        "u4", unit="1", doc="id of the move that an operator wants instead; 0: none"
+    )
 
-JOINT_SET_POINT = command(
-    "joint_set_point",
-    2,
-    RESTS_ON,
-    tick("due", "tick at which the arm should be there; 0: no set point yet, hold"),
-    by_joint("position", "rad", "joint positions"),
-    by_joint("velocity", "rad/s", "joint velocities"),
-    # For a servo level that feeds acceleration forward; the default one derives it from positions
-    # and velocities.
-    by_joint("acceleration", "rad/s2", "joint accelerations"),
-    real("opening", "m or rad", "gripper joint position to go to"),
-    real("force", "N or N m", "largest gripper force"),
-    row("held", "row of the object in the gripper; -1: none"),
-)
 
-SERVO_PLAN = MessageType(
-    "servo_plan",
-    1,
-    (
-        real(
-            "inertia", "kg m2", "joint-space inertia, the object held included", "joints", "joints"
-        ),
-        row("held", "object included; -1: none"),
-        real("payload_mass", "kg", "mass in the gripper"),
-        real("payload_offset", "m", "its centre, in the frame of the tool", 3),
-    ),
-)
+OPERATED = field(doc="1: an operator keeps this level, or one below it, from its own work")
 
-DRIVEN_ARM = (
-    by_joint("position", "rad", "joint positions, measured; estimated for suspect sensors"),
-    by_joint("velocity", "rad/s", "joint velocities, likewise"),
-    by_joint("torque", "N m", "torque given to the arm in this cycle, after the limit gate"),
-    by_joint("target", "rad", "where the joints are wanted in this cycle"),
-    by_joint("target_velocity", "rad/s", "likewise"),
-    real("opening", "m or rad", "gripper joint position, measured"),
-    real("opening_velocity", "m/s or rad/s", "gripper joint velocity, measured"),
-    real("grip_force", "N or N m", "force given to the gripper"),
-    flag("holding", "1: no fresh set point, the arm ramps to rest and stays"),
-    flag("stopped", "1: set points are not followed: a demand, an operator, a fault, or brakes"),
-    flag("braked", "1: the brakes are engaged"),
-    Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
-    number("clipped", "cycles in which the limit gate cut a torque or a set point"),
-    number("touches", "unintended contacts, counted at every substep"),
-    number(
-        "violations",
-        "substeps in which the arm drove a position, velocity or torque beyond its limit",
-    ),
-    number("pushed", "substeps in which a blow pushed a joint beyond a limit"),
-    flag("slowed", "1: speeds are scaled down by robot.bring_up, until the release of it"),
-)
-"""Fields of the status of a level that drives an arm."""
 
-SERVO_STATUS = status("servo_status", 5, *ANSWER, *DRIVEN_ARM)
+class MoveStatus(AnsweringStatus, version=3):
+    """Status of the elemental move level."""
 
-ARM_STATE = MessageType(
-    "arm_state",
-    3,
-    (
-        tick("tick", "tick that the state belongs to"),
-        number("clipped", "cycles in which the limit gate cut a command"),
-        number("touches", "unintended contacts"),
-        number("violations", "substeps in which the arm broke a limit"),
-        number("pushed", "substeps in which a blow pushed a joint beyond a limit"),
-        Field("struck", "i4", "tick", "ticks for which the motion is still that of a blow"),
-        Field("waited", "i4", "tick", "ticks since the last command"),
-        flag("braked", "1: the brakes are engaged"),
-        by_joint("rest", "rad", "where engaged brakes hold the joints"),
-        by_joint("position", "rad", "joint positions as the servo level estimates them"),
-        by_joint("velocity", "rad/s", "joint velocities, likewise"),
-        by_joint("doubt", "rad", "largest error of those positions"),
-        tick(
-            "kept",
-            "ticks for which faults have kept the arm from its set points: see ArmParams.patience",
-        ),
-        Field("error", "u2", Error, "latched fault; 0: none"),
-        Field("reason", "S120", "ASCII", "that fault, readable"),
-        real("state", "", "of the simulated cell, see rack.levels.robot.state", "state"),
-    ),
-)
+    done: int = field("u4", unit="1", doc="newest elemental move done; 0: none yet")
+    current: int = field("u4", unit="1", doc="elemental move under way; 0: none")
+    progress: float = field(unit="1", doc="part of its path done, 0 to 1")
+    verb: Verb = field(doc="of the move under way")
+    held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")
+    planned: int = field(
+        "u4", unit="1", doc="newest elemental move whose path is ready; 0: none yet"
+    )
+    end: np.ndarray = field(
+        unit="rad", doc="joint positions at the end of that path", shape="joints"
+    )
+    replan: int = field(
+        "u4",
+        unit="1",
+        doc="open request to plan the current move anew from `start`; 0: none is open",
+    )
+    start: np.ndarray = field(
+        unit="rad", doc="joint positions where that motion holds", shape="joints"
+    )
+    replans: int = field("u4", unit="1", doc="plans made anew because something was in the way")
+    operated: bool = OPERATED
+    resting: bool = field(
+        doc="1: the arm rests, and the level that moves it has the operator's newest command"
+    )
 
-SCENE = MessageType(
-    "scene",
-    1,
-    (
-        real("position", "m", "body origins as sensed", "bodies", 3),
-        real("quaternion", "1", "body orientations as sensed", "bodies", 4),
-        real("tool_position", "m", "tool as sensed", 3),
-        real("tool_quaternion", "1", "tool as sensed", 4),
-    ),
-)
 
-WORLD_MODEL = MessageType(
-    "world_model",
-    1,
-    (
-        number(
-            "revision",
-            "rises when a body starts to move and when it rests again; 0: nothing sensed",
-        ),
-        real("position", "m", "body origins", "bodies", 3),
-        real("quaternion", "1", "body orientations", "bodies", 4),
-        real("velocity", "m/s", "body velocities, estimated", "bodies", 3),
-        tick("sensed", "cycle in which the newest scene was taken over"),
-    ),
-)
+class MovePlan(Message, version=1):
+    """From the planner of the elemental move level to its executor: a path for one move."""
+
+    move: int = field("u4", unit="1", doc="elemental move that the plan serves")
+    replan: int = field(
+        "u4", unit="1", doc="request that it answers; 0: the first plan of the move"
+    )
+    error: Error = field("u2", doc="why there is no plan; 0: there is")
+    reason: str = field(doc="the error, readable")
+    kind: SegmentKind = field(doc="path or gripper")
+    count: int = field("u2", unit="1", doc="waypoints that follow")
+    waypoints: np.ndarray = field(
+        unit="rad", doc="collision-free path in joint space", shape=(WAYPOINTS, "joints")
+    )
+    blend: np.ndarray = field(
+        unit="rad",
+        doc="length over which corner k is rounded, before and after it",
+        shape=WAYPOINTS,
+    )
+
+
+class MoveSegment(Message, version=1, message="segment"):
+    """One segment of a move: a path, or a motion of the gripper."""
+
+    id: int = field("u4", unit="1", doc="serial of the segment, rising by one from 1; 0: empty")
+    move: int = field("u4", unit="1", doc="elemental move that it serves")
+    kind: SegmentKind = field(doc="path or gripper")
+    object: int = field("i2", unit="1", doc="object held, or to be grasped; -1: none")
+    touch: bool = field(doc="1: the object may touch supports and fingers (approach, depart)")
+    count: int = field("u2", unit="1", doc="waypoints that follow")
+    waypoints: np.ndarray = field(
+        unit="rad",
+        doc="path in joint space, from where the motion starts",
+        shape=(WAYPOINTS, "joints"),
+    )
+    blend: np.ndarray = field(
+        unit="rad", doc="length over which corner k is rounded", shape=WAYPOINTS
+    )
+    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
+    opening: float = field(unit="m or rad", doc="gripper joint position to go to, for GRIPPER")
+    force: float = field(unit="N or N m", doc="largest gripper force on the way and afterwards")
+
+
+class MoveCommand(RelayedCommand, version=2):
+    """From the elemental move level to the primitive level: the next segments."""
+
+    hold: bool = field(doc="1: ramp to rest on the path and stay")
+    count: int = field("u2", unit="1", doc="segments that follow; id is the newest one's")
+    segments: np.ndarray = field(MoveSegment, doc="segments to do, oldest first", shape=SEGMENTS)
+
+
+class PrimitiveStatus(AnsweringStatus, version=3):
+    """Status of the primitive level."""
+
+    done: int = field("u4", unit="1", doc="newest segment done; 0: none yet")
+    current: int = field("u4", unit="1", doc="segment under way; 0: none")
+    progress: float = field(unit="1", doc="part of the segment's path done, 0 to 1")
+    blocked: bool = field(doc="1: motion holds because something is in the way")
+    resting: bool = field(doc="1: commanded velocity is zero")
+    operated: bool = OPERATED
+    held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")
+    opening: float = field(unit="m or rad", doc="gripper joint position, measured")
+    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
+    earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
+    ends: float = field(
+        unit="s", doc="simulated time at which the segment under way should be done; 0: not known"
+    )
+    wants: int = field(
+        "u4", unit="1", doc="segment for which the level wants a trajectory of its planner; 0: none"
+    )
+    begin: float = field(
+        unit="rad", doc="path parameter at which that trajectory is to begin, from rest"
+    )
+
+
+class TrajectoryPlan(Message, version=1, message="trajectory"):
+    """From the planner of the primitive level to its executor: when the arm is where on a path."""
+
+    segment: int = field("u4", unit="1", doc="segment that it serves")
+    error: Error = field("u2", doc="why there is none; 0: there is")
+    reason: str = field(doc="the error, readable")
+    begin: float = field(unit="rad", doc="path parameter at which it begins")
+    duration: float = field(unit="s", doc="from rest to rest")
+    earliest: float = field(
+        unit="s", doc="simulated time at which the segment could be done at the earliest"
+    )
+    count: int = field("u2", unit="1", doc="sections that follow")
+    sections: np.ndarray = field(
+        unit="s, 1, 1/s, 1/s2, 1/s3",
+        doc="start, s, ds, dds, jerk of the path parameter",
+        shape=(SECTIONS, 5),
+    )
+
+
+class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
+    """From the primitive level to the servo level: where the joints should be, and when."""
+
+    due: int = field(
+        unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
+    )
+    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
+    acceleration: np.ndarray = field(unit="rad/s2", doc="joint accelerations", shape="joints")
+    opening: float = field(unit="m or rad", doc="gripper joint position to go to")
+    force: float = field(unit="N or N m", doc="largest gripper force")
+    held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")
+
+
+class ServoPlan(Message, version=1):
+    """From the planner of the servo level to its executor: the inertia of arm and load."""
+
+    inertia: np.ndarray = field(
+        unit="kg m2",
+        doc="joint-space inertia, the object held included",
+        shape=("joints", "joints"),
+    )
+    held: int = field("i2", unit="1", doc="object included; -1: none")
+    payload_mass: float = field(unit="kg", doc="mass in the gripper")
+    payload_offset: np.ndarray = field(
+        unit="m", doc="its centre, in the frame of the tool", shape=3
+    )
+
+
+class DrivenArm(AnsweringStatus):
+    """Fields of the status of a level that drives an arm."""
+
+    position: np.ndarray = field(
+        unit="rad", doc="joint positions, measured; estimated for suspect sensors", shape="joints"
+    )
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities, likewise", shape="joints")
+    torque: np.ndarray = field(
+        unit="N m",
+        doc="torque given to the arm in this cycle, after the limit gate",
+        shape="joints",
+    )
+    target: np.ndarray = field(
+        unit="rad", doc="where the joints are wanted in this cycle", shape="joints"
+    )
+    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
+    opening: float = field(unit="m or rad", doc="gripper joint position, measured")
+    opening_velocity: float = field(unit="m/s or rad/s", doc="gripper joint velocity, measured")
+    grip_force: float = field(unit="N or N m", doc="force given to the gripper")
+    holding: bool = field(doc="1: no fresh set point, the arm ramps to rest and stays")
+    stopped: bool = field(
+        doc="1: set points are not followed: a demand, an operator, a fault, or brakes"
+    )
+    braked: bool = field(doc="1: the brakes are engaged")
+    demand: Demand = field(doc="stop that the rack's safety demands in this cycle")
+    clipped: int = field(
+        "u4", unit="1", doc="cycles in which the limit gate cut a torque or a set point"
+    )
+    touches: int = field("u4", unit="1", doc="unintended contacts, counted at every substep")
+    violations: int = field(
+        "u4",
+        unit="1",
+        doc="substeps in which the arm drove a position, velocity or torque beyond its limit",
+    )
+    pushed: int = field(
+        "u4", unit="1", doc="substeps in which a blow pushed a joint beyond a limit"
+    )
+    slowed: bool = field(doc="1: speeds are scaled down by robot.bring_up, until the release of it")
+
+
+class ServoStatus(DrivenArm, version=5):
+    """Status of the servo level."""
+
+
+class ArmState(Message, version=3):
+    """State of the arm, from which a restarted board continues."""
+
+    tick: int = field(unit="tick", doc="tick that the state belongs to")
+    clipped: int = field("u4", unit="1", doc="cycles in which the limit gate cut a command")
+    touches: int = field("u4", unit="1", doc="unintended contacts")
+    violations: int = field("u4", unit="1", doc="substeps in which the arm broke a limit")
+    pushed: int = field(
+        "u4", unit="1", doc="substeps in which a blow pushed a joint beyond a limit"
+    )
+    struck: int = field("i4", unit="tick", doc="ticks for which the motion is still that of a blow")
+    waited: int = field("i4", unit="tick", doc="ticks since the last command")
+    braked: bool = field(doc="1: the brakes are engaged")
+    rest: np.ndarray = field(unit="rad", doc="where engaged brakes hold the joints", shape="joints")
+    position: np.ndarray = field(
+        unit="rad", doc="joint positions as the servo level estimates them", shape="joints"
+    )
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities, likewise", shape="joints")
+    doubt: np.ndarray = field(unit="rad", doc="largest error of those positions", shape="joints")
+    kept: int = field(
+        unit="tick",
+        doc="ticks for which faults have kept the arm from its set points: see ArmParams.patience",
+    )
+    error: Error = field("u2", doc="latched fault; 0: none")
+    reason: str = field(doc="that fault, readable")
+    state: np.ndarray = field(
+        unit="", doc="of the simulated cell, see rack.levels.robot.state", shape="state"
+    )
+
+
+class Scene(Message, version=1):
+    """Bodies and tool as sensed."""
+
+    position: np.ndarray = field(unit="m", doc="body origins as sensed", shape=("bodies", 3))
+    quaternion: np.ndarray = field(unit="1", doc="body orientations as sensed", shape=("bodies", 4))
+    tool_position: np.ndarray = field(unit="m", doc="tool as sensed", shape=3)
+    tool_quaternion: np.ndarray = field(unit="1", doc="tool as sensed", shape=4)
+
+
+class WorldState(Message, version=1, message="world_model"):
+    """Bodies as the world model knows them."""
+
+    revision: int = field(
+        "u4",
+        unit="1",
+        doc="rises when a body starts to move and when it rests again; 0: nothing sensed",
+    )
+    position: np.ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))
+    quaternion: np.ndarray = field(unit="1", doc="body orientations", shape=("bodies", 4))
+    velocity: np.ndarray = field(unit="m/s", doc="body velocities, estimated", shape=("bodies", 3))
+    sensed: int = field(unit="tick", doc="cycle in which the newest scene was taken over")

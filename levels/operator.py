@@ -1,22 +1,20 @@
 """An operator's commands to any level: operations, messages, and how a level follows them.
 
 An operator may command every level that reads "own.operator" and declares `commands`, in addition
-to the level above it or in its place. The level follows with `Orders` and has `ANSWER` among the
-fields of its status. `RESTS_ON` is passed down with every command, so the lowest status shows on
-which command its torque is based: the system's response can be measured.
-"""
+to the level above it or in its place. The level follows with `Orders` and has `AnsweringStatus`
+among the fields of its status. `RESTS_ON` is passed down with every command, so the lowest status
+shows on which command its torque is based: the system's response can be measured."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import REASON_BYTES, Field, Message, command
-from rack.levels.fields import flag, number, real
+from rack.backplane.message import REASON_BYTES, Command, Message, Status, field
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -76,37 +74,43 @@ class Answer(IntEnum):
     REFUSED = 3  # the level continues as before
 
 
-OPERATOR_COMMAND = command(
-    "operator_command",
-    2,
-    Field("what", "u1", Operation, "what to do"),
-    Field("goal", "u1", Goal, "form of the goal"),
-    flag("count", "joints that follow"),
-    real("joints", "rad", "joint positions, for goal joints", MAX_JOINTS),
-    real("position", "m", "of the tool, for goals pose and direction", 3),
-    real("quaternion", "1", "of the tool, for goal pose", 4),
-    real("direction", "1", "of the tool's z axis, for goal direction", 3),
-    Field(
-        "name", f"S{NAME_BYTES}", "ASCII", "what a setting sets, or the level's own command to do"
-    ),
+class OperatorCommand(Command, version=2):
+    """An operator's command to a level."""
+
+    what: Operation = field(doc="what to do")
+    goal: Goal = field(doc="form of the goal")
+    count: int = field("u1", unit="1", doc="joints that follow")
+    joints: np.ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
+    position: np.ndarray = field(unit="m", doc="of the tool, for goals pose and direction", shape=3)
+    quaternion: np.ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
+    direction: np.ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
+    name: str = field(f"S{NAME_BYTES}", doc="what a setting sets, or the level's own command to do")
+
+
+RESTS_ON = field(
+    "u4", unit="1", doc="newest command of an operator, here or above, that this rests on; 0: none"
 )
 
-RESTS_ON = number(
-    "operator", "newest command of an operator, here or above, that this rests on; 0: none"
-)
-ANSWER = (
-    RESTS_ON,
-    number("order", "command of an operator that this answers, new or not; 0: none yet"),
-    Field("answer", "u1", Answer, "this level's answer to it"),
-    Field(
-        "standing",
-        "u1",
-        Operation,
-        "operator's command in force; 0: none, the level does its own work",
-    ),
-    Field("objection", f"S{REASON_BYTES}", "ASCII", "why it was refused, readable"),
-)
-"""Fields of a status that answer an operator."""
+
+class RelayedCommand(Command):
+    """Base of commands that pass on which operator's command they rest on."""
+
+    operator: int = RESTS_ON
+
+
+class AnsweringStatus(Status):
+    """Fields of a status that answer an operator."""
+
+    operator: int = RESTS_ON
+    order: int = field(
+        "u4", unit="1", doc="command of an operator that this answers, new or not; 0: none yet"
+    )
+    answer: Answer = field(doc="this level's answer to it")
+    standing: Operation = field(
+        doc="operator's command in force; 0: none, the level does its own work"
+    )
+    objection: str = field(f"S{REASON_BYTES}", doc="why it was refused, readable")
+
 
 Commands = Mapping[Operation, Sequence[Goal]]
 HOLDABLE: Commands = {Operation.HOLD: (), Operation.RESUME: ()}
@@ -195,7 +199,7 @@ class Orders:
         """Whether that is HOLD."""
         return self.standing is Operation.HOLD
 
-    def take(self, operator: Reading, judge: Callable[[Message], None] | None = None) -> bool:
+    def take(self, operator: Reading[Any], judge: Callable[[Message], None] | None = None) -> bool:
         """Read the mailbox; return True in the cycle that accepts a command other than a setting.
 
         `judge` is called with each command accepted: there a level may refuse it for its own
@@ -204,7 +208,7 @@ class Orders:
         if not operator.is_new:
             return False
         taken = False
-        for message in (*operator.earlier, operator.value):
+        for message in (*operator.earlier, operator.message):
             replaced = self.in_force
             if self._take_up(message):
                 taken = taken or message.what not in (*SETTINGS, *DRIVES)
@@ -291,7 +295,7 @@ class Orders:
         return max(self.basis, above)
 
     def report(self, status: Message, above: int = 0) -> None:
-        """Fill the fields of `ANSWER`."""
+        """Fill the fields of `AnsweringStatus`."""
         if self._news:
             self._shown = self._news.pop(0)
         status.operator = self.rests_on(above)
@@ -311,7 +315,7 @@ def answered(status: Message) -> int:
 def joints_of(
     message: Message, names: Sequence[str], ranges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the joint positions, (joints,), rad, of an `OPERATOR_COMMAND`; `ranges` (joints, 2)
+    """Return the joint positions, (joints,), rad, of an `OperatorCommand`; `ranges` (joints, 2)
     are permitted.
 
     Raises `ValueError` with the joint, its value and the range.

@@ -1,16 +1,14 @@
 """What a rack knows of another one on the network: the mailbox `lan.peer_<rack>` of its adapter,
 for levels to read.
 
-A level that works together with another rack reads it with `Input(PEER, "lan.peer_<rack>")`:
-whether that rack is there, and how its simulated time lies next to ours.
-"""
+A level that works together with another rack reads it with `Input(PeerPresence,
+"lan.peer_<rack>")`: whether that rack is there, and how its simulated time lies next to ours."""
 
 from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Field, MessageType
-from rack.levels.fields import number, real, tick
+from rack.backplane.message import Message, field
 
 DRIFT_PPM = 100
 """Largest difference between the rates of two clocks: each crystal within 50 ppm."""
@@ -24,33 +22,36 @@ class Presence(IntEnum):
     LOST = 2
 
 
-PEER = MessageType(
-    "peer",
-    1,
-    (
-        Field("presence", "u1", Presence, "awaited, there or lost"),
-        Field(
-            "launch",
-            "i8",
-            "1",
-            "number of the launch that is there, or was last; 0: none, or in lockstep",
-        ),
-        number("launches", "its launches seen so far: a number above 1 means restarts"),
-        number("losses", "how often it was lost"),
-        tick("since", "since when it is there, or lost"),
-        real("offset", "s", "its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"),
-        real(
-            "uncertainty", "s", "largest error of the offset; -1: not measured yet; 0 in lockstep"
-        ),
-        real("round_trip", "s", "shortest recent round trip; -1: not measured yet; 0 in lockstep"),
-        number(
-            "steps",
-            "how often its clock or ours was found to have stepped, as when a machine sleeps",
-        ),
-        real("ahead", "s", "its simulated time less that of this rack, at the same instant"),
-        real("speed", "1", "its simulated seconds in a real one"),
-    ),
-)
+class PeerPresence(Message, version=1, message="peer"):
+    """Where another rack is, and its clock; written by the network adapter."""
+
+    presence: Presence = field(doc="awaited, there or lost")
+    launch: int = field(
+        unit="1", doc="number of the launch that is there, or was last; 0: none, or in lockstep"
+    )
+    launches: int = field(
+        "u4", unit="1", doc="its launches seen so far: a number above 1 means restarts"
+    )
+    losses: int = field("u4", unit="1", doc="how often it was lost")
+    since: int = field(unit="tick", doc="since when it is there, or lost")
+    offset: float = field(
+        unit="s", doc="its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"
+    )
+    uncertainty: float = field(
+        unit="s", doc="largest error of the offset; -1: not measured yet; 0 in lockstep"
+    )
+    round_trip: float = field(
+        unit="s", doc="shortest recent round trip; -1: not measured yet; 0 in lockstep"
+    )
+    steps: int = field(
+        "u4",
+        unit="1",
+        doc="how often its clock or ours was found to have stepped, as when a machine sleeps",
+    )
+    ahead: float = field(
+        unit="s", doc="its simulated time less that of this rack, at the same instant"
+    )
+    speed: float = field(unit="1", doc="its simulated seconds in a real one")
 
 
 def peer_port(rack: str) -> str:

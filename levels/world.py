@@ -9,8 +9,8 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array, each
-from rack.levels.level import Executor, Input, LevelContext, Ports
-from rack.levels.messages import SCENE, WORLD_MODEL
+from rack.levels.level import Executor, Input, LevelContext, Output
+from rack.levels.messages import Scene, WorldState
 from rack.levels.tables import Positive, Table, read_params
 
 
@@ -35,8 +35,9 @@ class WorldModel(Executor):
     board. Until it receives a scene, a restarted board publishes its last model, with its age.
     """
 
-    inputs = {"scene": Input(SCENE, "servo.scene"), "last": Input(WORLD_MODEL, "own.model")}
-    outputs = {"model": WORLD_MODEL}
+    scene = Input(Scene, "servo.scene")
+    last = Input(WorldState, "own.model")
+    model = Output(WorldState)
     params = WorldParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -51,17 +52,17 @@ class WorldModel(Executor):
         self._interval = 0
         self._started = False
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Update from a new scene; when one is missing, keep poses and set velocities to zero."""
-        model: Message = write.model
+        model: Message = self.model
         if not self._started:
             self._started = True
-            model.copy_from(read.last.value)
-        if not read.scene.is_new:
+            model.copy_from(self.last.message)
+        if not self.scene.is_new:
             if tick - self._seen_tick > self._interval:
                 model.velocity[:] = 0.0
             return
-        scene: Message = read.scene.value
+        scene: Message = self.scene.message
         poses = np.hstack((scene.position, scene.quaternion))
         if self._seen_tick < 0:
             self._last = poses

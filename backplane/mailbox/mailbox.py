@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from xxhash import xxh3_64_intdigest as xxh3
 
@@ -46,17 +46,20 @@ class Verdict(IntEnum):
     BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one
 
 
-class Reading(NamedTuple):
+M = TypeVar("M", bound=Message, covariant=True)
+
+
+class Reading(NamedTuple, Generic[M]):
     """A message, all zero before the first one, and the verdict of the read.
 
     `is_lost`: its writer is dead, hangs, or has been silent for too long for its period. `earlier`:
     in a mailbox where every message counts, the unread ones before this one, oldest first.
     """
 
-    value: Message
+    message: M
     verdict: Verdict
     is_lost: bool = False
-    earlier: tuple[Message, ...] = ()
+    earlier: tuple[M, ...] = ()
 
     @property
     def is_new(self) -> bool:
@@ -214,7 +217,7 @@ class Reader:
         """Messages copied so far."""
         self.statistics = ReadStatistics()
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest message visible at `tick`, with its verdict."""
         self.accesses += 1
         serial = self._box[0]
@@ -231,7 +234,7 @@ class Reader:
             return self._unchanged
         return self._new if self._obtain(serial) else self._take_older(serial, tick)
 
-    def _take_older(self, serial: int, tick: int) -> Reading:
+    def _take_older(self, serial: int, tick: int) -> Reading[Any]:
         """Judge a bad message, and take the newest good one before it."""
         # The reader came too late: the slot is being overwritten.
         if not self.slots.keeps(serial):
@@ -260,7 +263,7 @@ class Reader:
         self.basis = basis
         return True
 
-    def _step_back(self, serial: int, tick: int) -> Reading:
+    def _step_back(self, serial: int, tick: int) -> Reading[Any]:
         """Take the newest good message before a lost, damaged or forged one, if it is unread."""
         slots = self.slots
         tries = MAX_STEP_BACK
@@ -290,20 +293,20 @@ class Reader:
         self.statistics.forged += 1
         self.statistics.forger = pid_of(self.slots.signature)
 
-    def _cut_off(self) -> Reading:
+    def _cut_off(self) -> Reading[Any]:
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
         verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
         return self._readings[verdict]
 
-    def with_earlier(self, reading: Reading, before: int) -> Reading:
+    def with_earlier(self, reading: Reading[Any], before: int) -> Reading[Any]:
         """Return a reading with the good messages after serial `before` and before its own, as far
         as the slots reach back."""
         if self.serial <= before + 1:
             return reading
         return reading._replace(earlier=tuple(self.slots.between(before, self.serial)))
 
-    def peek(self) -> Reading:
+    def peek(self) -> Reading[Any]:
         """Return the newest whole message at once, under any protocol: for the host side."""
         self.found = head = self._box[0]
         if head == self.serial:
@@ -326,7 +329,7 @@ class DoubleBufferReader(Reader):
     It reacts faster than time-slice; in real time it no longer depends on ticks alone.
     """
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest whole message, with its verdict."""
         self.accesses += 1
         return self.peek()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Protocol
@@ -105,7 +106,7 @@ class LockReader(Reader):
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest message; BUS_ERROR with the last good one after a timeout."""
         statistics = self.statistics
         self.accesses += 1

@@ -31,27 +31,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from struct import Struct
+from typing import Any
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.message import Field, Message, MessageType, copied, sending
+from rack.backplane.message import Message, copied, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
-TAKEN = MessageType(
-    "queue_taken",
-    1,
-    (
-        Field(
-            "taken",
-            "i8",
-            "1",
-            "serial of the newest message that the reader of the queue has taken; 0: none",
-        ),
-        Field("unread", "i8", "1", "messages that this reader could see, and left in the queue"),
-    ),
-)
+
+class QueueTaken(Message, version=1):
+    """How far the reader of a queue has come, written by that reader."""
+
+    taken: int = field(
+        unit="1", doc="serial of the newest message that the reader of the queue has taken; 0: none"
+    )
+    unread: int = field(unit="1", doc="messages that this reader could see, and left in the queue")
+
+
 # Plain integers for the hot path.
 _PUT_POSITION = Struct("@2q").pack_into
 ALL = 1 << 62
@@ -65,7 +63,7 @@ def taken_name(queue: str) -> str:
 
 def is_position(spec: MailboxSpec) -> bool:
     """Say whether a mailbox holds the position of a queue's reader: the board itself writes it."""
-    return spec.message == TAKEN.name
+    return spec.message == QueueTaken.message_type.name
 
 
 def queues_of(layout: Layout) -> list[MailboxSpec]:
@@ -78,7 +76,7 @@ def queues_of(layout: Layout) -> list[MailboxSpec]:
 
 
 class QueueWriter(Writer):
-    """The one writer of a queue. A level fills `message` and calls its `send`; the board calls
+    """The one writer of a queue. A level fills `message` and calls `send`; the board calls
     `write`, once a cycle.
 
     `taken` is the reader's position as of the writer's release tick: the board keeps it up to date.
@@ -92,7 +90,6 @@ class QueueWriter(Writer):
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before this.
         self._shared[Box.SENT] = self.serial
-        self.message = sending(slots.message, self._send, self.room)
         self.taken = 0
         self._pending: list[bytes] = []
         self._shown_at = 0
@@ -102,7 +99,8 @@ class QueueWriter(Writer):
         unread = self.serial - self.taken + self.held + len(self._pending)
         return max(0, self.spec.capacity - unread)
 
-    def _send(self, basis: int | None = None) -> bool:
+    def send(self, basis: int | None = None) -> bool:
+        """Put a copy of the message into the queue; return False if it is full."""
         if not self.room():
             self.refused += 1
             self._shared[Box.REFUSED] += 1
@@ -171,7 +169,7 @@ class QueueReader(Reader):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
-        written = int(Reader(segment, taken_name(name)).peek().value.taken)
+        written = int(Reader(segment, taken_name(name)).peek().message.taken)
         taken, rest = divmod(self._box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
@@ -179,11 +177,11 @@ class QueueReader(Reader):
         if self.taken and self._obtain(self.taken):
             self.transfers = 0
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Take every message visible at `tick`."""
         return self.take(tick, ALL)
 
-    def take(self, tick: int, most: int, now: int | None = None) -> Reading:
+    def take(self, tick: int, most: int, now: int | None = None) -> Reading[Any]:
         """Take the messages visible at `tick`, oldest first, at most `most`, and publish the
         position.
 

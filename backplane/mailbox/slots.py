@@ -29,7 +29,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
 from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.backplane.message import Message, copied
+from rack.backplane.message import AnyMessage, Message, copied
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
@@ -109,7 +109,8 @@ class Slots:
         self.depth = spec.depth
         self.mask = spec.depth - 1
         self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
-        self.message = Message(dtype, self.record[SLOT_HEAD_SIZE:])
+        kind = segment.message_classes.get(spec.name, AnyMessage)
+        self.message = kind(dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
         self.places = [

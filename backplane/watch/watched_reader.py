@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
@@ -53,7 +54,7 @@ class Watched(ABC):
         self._bad_reads = 0
 
     @abstractmethod
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
 
@@ -87,7 +88,7 @@ class WatchedReader(Watched):
         self._writer = segment.block(reader.spec.writer)
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
         reader = self.reader
@@ -127,7 +128,7 @@ class SporadicReader(Watched):
     board must know them.
     """
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest message visible at `tick`, with its verdict, and the unread ones before
         it."""
         before = self.reader.serial
@@ -164,7 +165,7 @@ class WatchedQueue(Watched):
         self._room = room
         self._writer = segment.block(reader.spec.writer)
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Take the messages visible at `tick`; the reading says whether their writer is lost."""
         reader = self.reader
         reading = reader.take(tick, self._room(), self._task.now())
@@ -194,7 +195,7 @@ class GridReader:
         self._kept = [(reading, reading._replace(is_lost=True)) for reading in kept]
         self._was_lost = False
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest message visible at `tick` if it is due, otherwise that of the last
         read."""
         if (tick - self._phase) % self._every == 0:

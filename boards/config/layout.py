@@ -21,8 +21,8 @@ from rack.backplane.layout import (
     TaskSpec,
     depth_for,
 )
-from rack.backplane.mailbox.queue import TAKEN, taken_name
-from rack.backplane.message import MessageType
+from rack.backplane.mailbox.queue import QueueTaken, taken_name
+from rack.backplane.message_type import MessageType
 from rack.boards.config.protocols import UNREAD
 from rack.boards.config.schema import RackConfig, TaskPlace
 from rack.boards.config.wiring import TaskPorts, Wiring
@@ -111,7 +111,7 @@ class LayoutMaker:
             depth = depth_for(capacity + SPARE, 1)
             yield self._mailbox(
                 name,
-                output.type,
+                output.message.message_type,
                 writer=ports.task,
                 every=1,
                 delay=0,
@@ -127,7 +127,7 @@ class LayoutMaker:
         slowest = max((reader.slice for reader in readers), default=0)
         box = self._mailbox(
             name,
-            output.type,
+            output.message.message_type,
             writer=writer.name,
             every=every,
             delay=delay,
@@ -169,7 +169,7 @@ class LayoutMaker:
             "depth": depth,
             "phase": visible,
         }
-        position = self._mailbox(taken_name(box.name), TAKEN, **place)
+        position = self._mailbox(taken_name(box.name), QueueTaken.message_type, **place)
         yield replace(position, readers=(writer.name,), protocol="time-slice")
 
     def _capacity(self, queue: str) -> int:

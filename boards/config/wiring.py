@@ -12,13 +12,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 
 from rack.backplane.errors import ClockError
 from rack.backplane.layout import Protocol, Role
-from rack.backplane.message import MessageType
+from rack.backplane.message import Message
+from rack.backplane.message_type import MessageType
 from rack.boards.classes import find_class
 from rack.boards.config.schema import (
     LAN,
@@ -31,8 +32,9 @@ from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
-from rack.levels.level import Executor, Input, Output, Planner, Program
-from rack.levels.operator import OPERATOR_COMMAND, Commands
+from rack.levels.level import Executor, Output, Planner, Program
+from rack.levels.operator import Commands, OperatorCommand
+from rack.levels.ports import InputPort
 
 OWN_OPERATOR = "own.operator"
 LevelClass = type[Executor] | type[Planner] | type[HostProgram]
@@ -43,7 +45,7 @@ class Connection(NamedTuple):
     that follow."""
 
     port: str
-    entry: Input
+    entry: InputPort[Any]
     key: str
     given: Sources
     mailboxes: Sources
@@ -79,8 +81,8 @@ class TaskPorts:
 
     place: TaskPlace
     kind: LevelClass
-    inputs: Mapping[str, Input]
-    outputs: Mapping[str, Output]
+    inputs: Mapping[str, InputPort[Any]]
+    outputs: Mapping[str, Output[Any]]
     reads: Mapping[str, Source]
     exchange: Mapping[str, ExchangeConfig]
     connections: tuple[Connection, ...]
@@ -112,7 +114,8 @@ class TaskPorts:
 
     def rests_on(self, output: str) -> tuple[str, ...]:
         """Return the mailboxes on whose information an output rests."""
-        return mailboxes_of(self.reads.get(self.outputs[output].rests_on or output, {}))
+        source = self.outputs[output].rests_on
+        return () if source is None else mailboxes_of(self.reads.get(source.name, {}))
 
 
 def rewired(config: RackConfig, place: TaskPlace) -> Mapping[str, Sources]:
@@ -132,12 +135,14 @@ def declared_ports(config: RackConfig, place: TaskPlace) -> TaskPorts:
 
 
 def with_made_ports(
-    config: RackConfig, ports: TaskPorts, types: Mapping[str, MessageType]
+    config: RackConfig, ports: TaskPorts, types: Mapping[str, type[Message]]
 ) -> TaskPorts:
     """Add the ports that the config makes: their types may be those of other mailboxes."""
     if not issubclass(ports.kind, Executor):
         return ports
     made = ports.kind.made_ports(config.board[ports.place.board].params, types)
+    for port, entry in made.inputs.items():
+        entry.name = port
     return replace(
         ports,
         inputs={**ports.inputs, **made.inputs},
@@ -157,31 +162,25 @@ def with_exchange(ports: TaskPorts) -> TaskPorts:
     return replace(ports, outputs=outputs)
 
 
-def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output]]:
+def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output[Any]]]:
     if role == "host":
         program = find_class(wanted, HostProgram)
         if many := [port for port, entry in program.inputs.items() if entry.many]:
             raise LookupError(
                 f"port '{many[0]}' reads many mailboxes; permitted on the host side: one"
             )
-        return program, _outputs(program.outputs)
+        return program, program.outputs
     if role == "executor":
         executor = find_class(wanted, Executor)
-        return executor, _outputs(executor.outputs)
+        return executor, executor.outputs
     planner = find_class(wanted, Planner)
-    if not isinstance(output := getattr(planner, "output", None), MessageType | Output):
-        raise LookupError("the class has no 'output', the message type of its plan")
-    return planner, _outputs({"plan": output})
-
-
-def _outputs(given: Mapping[str, MessageType | Output]) -> dict[str, Output]:
-    return {
-        port: kind if isinstance(kind, Output) else Output(kind) for port, kind in given.items()
-    }
+    if not planner.outputs:
+        raise LookupError("the class has no 'output', the port of its plan")
+    return planner, planner.outputs
 
 
 def _connections(
-    config: RackConfig, place: TaskPlace, inputs: Mapping[str, Input]
+    config: RackConfig, place: TaskPlace, inputs: Mapping[str, InputPort[Any]]
 ) -> Iterator[Connection]:
     own = {place.board}
     wired = rewired(config, place)
@@ -218,7 +217,7 @@ class Wiring:
         """The ports of all others, in order."""
         self.tasks = [ports for ports in self.ports.values() if ports.place.role != "host"]
         self.hosts = [ports for ports in self.ports.values() if ports.place.role == "host"]
-        self.writers: dict[str, tuple[TaskPorts, Output]] = {}
+        self.writers: dict[str, tuple[TaskPorts, Output[Any]]] = {}
         """The first task that writes each mailbox, and its declaration."""
         self.reading: dict[str, list[tuple[TaskPorts, str]]] = {}
         """Tasks and their ports that read each mailbox."""
@@ -227,7 +226,9 @@ class Wiring:
                 self.writers.setdefault(mailbox, (ports, ports.outputs[port]))
             for port, mailbox in ports.sources:
                 self.reading.setdefault(mailbox, []).append((ports, port))
-        self.operated = {f"{board}.operator": OPERATOR_COMMAND for board in commandable(config)}
+        self.operated = {
+            f"{board}.operator": OperatorCommand.message_type for board in commandable(config)
+        }
         """The message types of operators' mailboxes."""
         self.from_host = {mailbox for ports in self.hosts for mailbox in ports.writes.values()}
         """The mailboxes that host boards write."""
@@ -257,7 +258,7 @@ class Wiring:
     def _connected(self) -> dict[TaskPlace, TaskPorts]:
         config = self.config
         declared = dict[TaskPlace, TaskPorts]()
-        types = dict[str, MessageType]()
+        types = dict[str, type[Message]]()
         for place in (*config.tasks(), *config.hosts()):
             try:
                 declared[place] = declared_ports(config, place)
@@ -269,7 +270,9 @@ class Wiring:
         while len(types) != before:
             before = len(types)
             types = {
-                box: p.outputs[port].type for p in found.values() for port, box in p.writes.items()
+                box: p.outputs[port].message
+                for p in found.values()
+                for port, box in p.writes.items()
             }
             found = {
                 place: with_made_ports(config, ports, types) for place, ports in declared.items()
@@ -305,7 +308,9 @@ class Wiring:
     def type_of(self, mailbox: str) -> MessageType | None:
         """Return the message type of a mailbox; None if it does not exist."""
         return (
-            self.writers[mailbox][1].type if mailbox in self.writers else self.operated.get(mailbox)
+            self.writers[mailbox][1].message.message_type
+            if mailbox in self.writers
+            else self.operated.get(mailbox)
         )
 
     def names(self) -> str:

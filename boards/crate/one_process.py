@@ -20,16 +20,16 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.message import Message
+from rack.backplane.message import AnyMessage, Message
 from rack.boards.classes import find_class
 from rack.boards.config import RackConfig, load, resolve
 from rack.boards.errors import LaunchError
 from rack.boards.wiring import TaskWiring
-from rack.levels.level import Executor, Planner, Ports, Reading, Verdict
+from rack.levels.level import Executor, Planner, Reading, Verdict
 
 
 class OneProcess:
@@ -94,7 +94,7 @@ class OneProcess:
                     if tick % every == phase:
                         cycle(tick)
 
-    def newest(self, mailbox: str) -> Message:
+    def newest(self, mailbox: str) -> AnyMessage:
         """Return a copy of the newest message that was visible in the last tick. Raises
         `LookupError`: there was none, or no such mailbox."""
         post = self._posts.get(mailbox)
@@ -103,7 +103,7 @@ class OneProcess:
         newest = post.newest(self.tick - 1)
         if newest is None:
             raise LookupError(f"'{mailbox}' is empty at tick {self.tick - 1}")
-        message = Message(post.dtype)
+        message = AnyMessage(post.dtype)
         message.raw[:] = newest[1]
         return message
 
@@ -121,7 +121,7 @@ class Post:
     def __init__(self, spec: MailboxSpec) -> None:
         self.spec = spec
         self.dtype = message_dtype(spec.fields, spec.size)
-        self.message = Message(self.dtype)
+        self.message = AnyMessage(self.dtype)
         self.serial = 0
         # All that are not visible yet, and the newest that is.
         self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
@@ -144,13 +144,13 @@ class Post:
 class PostReader:
     """One reader of a mailbox."""
 
-    def __init__(self, post: Post) -> None:
+    def __init__(self, post: Post, kind: type[Message]) -> None:
         self._post = post
         self._serial = 0
-        self._message = Message(post.dtype)
+        self._message = kind(post.dtype)
         self._readings = {verdict: Reading(self._message, verdict) for verdict in Verdict}
 
-    def read(self, tick: int) -> Reading:
+    def read(self, tick: int) -> Reading[Any]:
         """Return the newest message visible at `tick`, and its verdict."""
         newest = self._post.newest(tick)
         if newest is None:
@@ -168,40 +168,38 @@ class LoneTask:
 
     def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post]) -> None:
         self.spec = layout.task(wiring.task)
-        self._values = Ports()
-        # Where each reading goes: the ports themselves, or the dict of a port that reads many
-        # mailboxes.
-        self._readers: list[tuple[dict[str, Reading], str, Callable[[int], Reading]]] = []
-        for port, source in wiring.inputs.items():
-            if isinstance(source, str):
-                self._add(self._values.__dict__, port, posts[source])
-            else:
-                by_board: dict[str, Reading] = {}
-                setattr(self._values, port, by_board)
-                for board, mailbox in source.items():
-                    self._add(by_board, board, posts[mailbox])
-        self._posts = [posts[name] for name in wiring.outputs.values()]
-        self._messages = Ports(
-            **{port: posts[name].message for port, name in wiring.outputs.items()}
-        )
-        self._busy_until = 0
         kind: type[Executor] | type[Planner] = find_class(
             wiring.target,
             Executor if self.spec.role == "executor" else Planner,
         )
         kind.preload()
-        self.level = kind(wiring.context)
-        self.cycle = self._execute if isinstance(self.level, Executor) else self._plan
+        self.level = level = kind(wiring.context)
+        # Where each reading goes: the level's ports, or the dict of one that reads many mailboxes.
+        self._readers: list[tuple[dict[str, Any], str, Callable[[int], Reading[Any]]]] = []
+        for port, source in wiring.inputs.items():
+            message = level.inputs[port].message if port in level.inputs else AnyMessage
+            table = level.input_table(port)
+            if isinstance(source, str):
+                self._add(table, port, PostReader(posts[source], message))
+                continue
+            table[port] = {}
+            for board, mailbox in source.items():
+                self._add(table[port], board, PostReader(posts[mailbox], message))
+        self._posts = [posts[name] for name in wiring.outputs.values()]
+        for port, name in wiring.outputs.items():
+            message = level.outputs[port].message if port in level.outputs else AnyMessage
+            level.place_output(port, message(posts[name].dtype, posts[name].message.raw))
+        self._busy_until = 0
+        self.cycle = self._execute if isinstance(level, Executor) else self._plan
 
-    def _add(self, values: dict[str, Reading], key: str, post: Post) -> None:
-        reader = PostReader(post)
+    def _add(self, values: dict[str, Any], key: str, reader: PostReader) -> None:
         values[key] = reader.read(-1)
         self._readers.append((values, key, reader.read))
 
     def _execute(self, tick: int) -> None:
         self._read(tick)
         assert isinstance(self.level, Executor), "a planner plans"
-        self.level.process(self._values, self._messages, tick)
+        self.level.process(tick)
         self.level.findings.clear()
         self._write(tick)
 
@@ -210,9 +208,9 @@ class LoneTask:
             return
         self._read(tick)
         assert isinstance(self.level, Planner), "an executor executes"
-        if self.level.wanted(self._values, tick):
+        if self.level.wanted(tick):
             self._busy_until = tick + self.spec.slice
-            self.level.plan(self._values, self._messages.plan, tick)
+            self.level.plan(tick)
             self._write(tick)
 
     def _read(self, tick: int) -> None:

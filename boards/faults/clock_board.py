@@ -268,7 +268,7 @@ class FaultStage:
         observer = self._observer(entry.when_box)
         reading = observer.read(tick - 1)
         field = observer.spec.fields[entry.when_field].name
-        return reading.is_there and int(getattr(reading.value, field)) == entry.when_value
+        return reading.is_there and int(getattr(reading.message, field)) == entry.when_value
 
     def _begin(self, entry: FaultEntry, tick: int) -> None:
         kind = kind_of(entry)

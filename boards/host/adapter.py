@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.boards.wiring import Entries
-from rack.levels.level import Executor
+from rack.levels.level import Executor, LevelContext, Reading
 
 STATUS = "status"
 
@@ -21,6 +21,15 @@ class Adapter(Executor):
     """Key of its board under which its ports are listed."""
     joins_sides: ClassVar[bool] = False
     """Whether what is not on the backplane are host boards: it reads on both sides."""
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self.readings: dict[str, Reading[Any]] = {}
+        """What it has read, by port: a port that it writes may have the same name."""
+
+    def input_table(self, port: str) -> dict[str, Any]:
+        """Return where the board puts what it has read."""
+        return self.readings
 
     @classmethod
     def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:

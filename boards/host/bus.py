@@ -106,7 +106,7 @@ class HostBus:
         block[Block.DONE] = block[Block.RELEASED]
         done_semaphore(self._segment.rack, self._wiring.board).release()
 
-    def read(self, port: str) -> Reading:
+    def read(self, port: str) -> Reading[Any]:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the
         mailbox keeps them; the first read returns the newest alone."""
         reader = _of(self._readers, port)

@@ -37,13 +37,13 @@ from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.layout import Layout, TaskSpec
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Field, Message, MessageType, State, status
+from rack.backplane.message import Message, State, Status, field, make_message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.host.entries import (
-    ENTRY,
     NEVER,
+    AdapterEntry,
     AdapterParams,
     Crossing,
     EntryConfig,
@@ -54,7 +54,7 @@ from rack.boards.host.entries import (
 )
 from rack.boards.wiring import Entries
 from rack.levels.errors import CannotGoOn
-from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
+from rack.levels.level import Input, LevelContext, MadePorts, Output, QueuedOutput, Sender
 from rack.levels.tables import read_params
 
 LONGEST_S = 30.0
@@ -81,18 +81,20 @@ class BusAdapter(Adapter):
         self._statuses: Replayed | None = None
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return a port to read and one to write for each entry, and the status."""
         entries = AdapterParams.entries_of(params)
         known = {port: entry for port, entry in entries.items() if entry.source in types}
         inputs = {
-            port: Input(types.get(entry.source, ENTRY), entry.source)
+            port: Input(types.get(entry.source, AdapterEntry), entry.source)
             for port, entry in entries.items()
         }
         # A message that is passed once must not be sampled; to host boards a bridge writes by
         # itself.
         outputs = {
-            port: Output(types[entry.source], queued=entry.asynchronous)
+            port: (QueuedOutput if entry.asynchronous else Output)(
+                types[entry.source], rests_on=inputs[port]
+            )
             for port, entry in known.items()
         }
         is_whole = bool(entries) and known == entries
@@ -125,7 +127,7 @@ class BusAdapter(Adapter):
                 entry = Outward(segment, own.spec.name, port, table, self._counts[port])
             else:
                 if before.is_there:
-                    self._before[port] = bytes(before.value.raw)
+                    self._before[port] = bytes(before.message.raw)
                 if entries is None:
                     self._hosts[writer] = segment.block(writer)
                     entry = Inward(segment, port, table, self._counts[port])
@@ -146,24 +148,25 @@ class BusAdapter(Adapter):
         if not before.is_there:
             return
         for port, count in self._counts.items():
-            count.resume(getattr(before.value, port), status.newest)
+            count.resume(getattr(before.message, port), status.newest)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Exchange the entries that are due; then, in lockstep, let programs run."""
         if self._before:
             for port, message in self._before.items():
-                getattr(write, port).raw[:] = message
+                out = self.ports[port]
+                (out.message if isinstance(out, Sender) else out).raw[:] = message
             self._before.clear()
         cycle = (tick - self.context.phase) // self.context.every
         for table, entry in self._entries:
             if table.is_due(cycle):
-                entry.exchange(read, write, tick)
+                entry.exchange(self.readings, self.ports, tick)
         for turn in self._turns:
             turn.take(tick)
         if self._statuses is not None:
-            self._statuses.exchange(read, write, tick)
+            self._statuses.exchange(self.readings, self.ports, tick)
         else:
-            self._report(write.status, tick)
+            self._report(self.ports[STATUS], tick)
 
     def _report(self, status: Message, tick: int) -> None:
         for port, count in self._counts.items():
@@ -226,8 +229,7 @@ class HostTurn(ReleasedTask):
             block[Block.LOST] = tick + 1
 
 
-def status_of(entries: Mapping[str, EntryConfig]) -> MessageType:
-    """Return the type of a bridge's status: one group of counts for each entry."""
-    return status(
-        "adapter_status", 1, *(Field(port, ENTRY, "1", f"entry {port}") for port in entries)
-    )
+def status_of(entries: Mapping[str, EntryConfig]) -> type[Status]:
+    """Return the class of a bridge's status: one group of counts for each entry."""
+    groups = {port: field(AdapterEntry, doc=f"entry {port}") for port in entries}
+    return make_message("adapter_status", 1, Status, groups)

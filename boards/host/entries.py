@@ -14,13 +14,11 @@ from pydantic import ValidationError, model_validator
 from rack.backplane.mailbox.host_ring import HostReader
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer, open_writer
-from rack.backplane.message import MessageType, fill_counts
+from rack.backplane.message import Message, field, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block
 from rack.boards.wiring import Rows
-from rack.levels.fields import number, tick
-from rack.levels.level import Ports
 from rack.levels.tables import LAST_TICK, Table
 
 NEVER = -1
@@ -28,20 +26,27 @@ PORT = re.compile(r"[a-z][a-z0-9_]*")
 RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clear", "copy_from")
 """Names that the status of a bridge needs for itself."""
 
-ENTRY = MessageType(
-    "adapter_entry",
-    1,
-    (
-        number("passed", "messages passed to the other side"),
-        number("refused", "messages refused: damaged, forged, or not what its type permits"),
-        number("superseded", "messages that a newer one overtook before the exchange"),
-        number("full", "messages that the host board could not send, since too many waited"),
-        number("waiting", "messages that wait for the next cycles"),
-        tick("arrived", "tick at which the newest message reached the other side; -1: none yet"),
-        tick("age", "time since that message was written; -1: none yet"),
-    ),
-)
-"""One entry, in the status of its bridge."""
+
+class AdapterEntry(Message, version=1):
+    """One entry, in the status of its bridge."""
+
+    passed: int = field("u4", unit="1", doc="messages passed to the other side")
+    refused: int = field(
+        "u4", unit="1", doc="messages refused: damaged, forged, or not what its type permits"
+    )
+    superseded: int = field(
+        "u4", unit="1", doc="messages that a newer one overtook before the exchange"
+    )
+    full: int = field(
+        "u4", unit="1", doc="messages that the host board could not send, since too many waited"
+    )
+    waiting: int = field("u4", unit="1", doc="messages that wait for the next cycles")
+    arrived: int = field(
+        unit="tick", doc="tick at which the newest message reached the other side; -1: none yet"
+    )
+    age: int = field(unit="tick", doc="time since that message was written; -1: none yet")
+
+
 _COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
 
 
@@ -100,7 +105,8 @@ class AdapterParams(Table):
 
 @dataclass
 class EntryCount:
-    """The counts of one entry: the fields of `ENTRY`. `written`: tick at which the newest message
+    """The counts of one entry: the fields of `AdapterEntry`. `written`: tick at which the newest
+    message
     was written."""
 
     passed: int = 0
@@ -133,7 +139,9 @@ class EntryCount:
 class Crossing(Protocol):
     """One entry, at work."""
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> object:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> object:
         """Exchange, in a cycle in which that is due."""
 
 
@@ -150,17 +158,19 @@ class Inward:
         self._ring.superseded = count.superseded
         self._writer = segment.block(self._ring.spec.writer)
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> None:
         """Take what waits, and check it. In lockstep what a program sends is there once its
         computing is over."""
         ring = self._ring
         count = self._count
-        out = getattr(write, self._port)
+        out = write[self._port]
         waiting = ring.waiting if self._writer[Block.DEADLINE] <= tick else 0
         if self._table.asynchronous:
             for _ in range(min(waiting, self._table.most, out.room())):
                 if (message := ring.take()) is not None:
-                    out.copy_from(message)
+                    out.message.copy_from(message)
                     out.send()
                     count.passes(tick, ring.written)
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
@@ -189,12 +199,14 @@ class Outward:
             (segment.block(name), wake_semaphore(segment.rack, name)) for name in readers
         ]
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> None:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> None:
         """Copy what is there."""
-        reading: Reading = getattr(read, self._port)
+        reading = read[self._port]
         if not reading.is_there or (self._table.asynchronous and not reading.is_new):
             return
-        for message in (*reading.earlier, reading.value):
+        for message in (*reading.earlier, reading.message):
             self._writer.message.copy_from(message)
             self._writer.write(tick)
         # A reading does not say when its message was written.
@@ -221,14 +233,17 @@ class Replayed:
         self._is_sent = is_sent
         self._at = sum(tick <= since for tick, _, _ in rows) if is_sent else 0
 
-    def exchange(self, read: Ports, write: Ports, tick: int) -> bool:
+    def exchange(
+        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+    ) -> bool:
         """Give out what the recorded run wrote up to this cycle; return whether there was some."""
-        out = getattr(write, self._port)
+        out = write[self._port]
+        message = out.message if self._is_sent else out
         rows = self._rows
         before = self._at
         while self._at < len(rows) and rows[self._at][0] <= tick:
             _, basis, content = rows[self._at]
-            out.raw[:] = content
+            message.raw[:] = content
             self._at += 1
             if self._is_sent:
                 out.send(basis)

@@ -20,7 +20,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Field, Message, MessageType, State, fill_counts, status
+from rack.backplane.message import Message, State, Status, field, fill_counts, make_message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
@@ -36,95 +36,108 @@ from rack.boards.lan.peers import Peers
 from rack.boards.lan.replayed import ReplayedNetwork
 from rack.boards.wiring import Entries
 from rack.levels.errors import LevelError
-from rack.levels.level import Input, LevelContext, MadePorts, Output, Ports
-from rack.levels.peer import PEER, peer_port
+from rack.levels.level import Input, LevelContext, MadePorts, Output, TimedOutput
+from rack.levels.peer import PeerPresence, peer_port
 from rack.levels.tables import read_params
 
 _LAUNCH_MASK = (1 << 62) - 1
 
 
-def _counts(**meanings: str) -> tuple[Field, ...]:
-    """Return a field for each count: its name, and what is counted."""
-    return tuple(Field(name, "u4", "1", meaning) for name, meaning in meanings.items())
+class LanExport(Message, version=1):
+    """Counts of one export, in the status of the network adapter."""
+
+    sent: int = field("u4", unit="1", doc="messages sent")
+    serial: int = field(unit="1", doc="serial of the newest message sent; 0: none")
 
 
-EXPORT = MessageType(
-    "lan_export",
-    1,
-    (
-        *_counts(sent="messages sent"),
-        Field("serial", "i8", "1", "serial of the newest message sent; 0: none"),
-    ),
-)
-IMPORT = MessageType(
-    "lan_import",
-    1,
-    (
-        *_counts(
-            taken="messages passed to the backplane",
-            missing="messages sent that never came, or came after a later one",
-            disordered="messages that came after a later one, and were not passed",
-            repeated="messages that came twice",
-            late="messages older than max_age_ms when they came",
-            refused=(
-                "messages refused: malformed, unsigned, oversized, or not what its type permits"
-            ),
-            unknown_launch="messages of a launch that is over, or not there",
-            superseded="messages that a newer one overtook before the exchange",
-        ),
-        Field(
-            "launch",
-            "i8",
-            "1",
-            "number of the launch that wrote the newest message taken; 0: none, or in lockstep",
-        ),
-        Field("number", "i8", "1", "number of that message among those sent from its mailbox"),
-        Field("serial", "i8", "1", "its serial in its mailbox; 0: none"),
-        Field("age", "i8", "tick", "age of its information in this rack's ticks; -1: none yet"),
-        Field("age_s", "f8", "s", "the same in simulated time; -1: none yet"),
-    ),
-)
-FLAWS = MessageType(
-    "lan_flaws",
-    1,
-    _counts(
-        malformed="not of this protocol, or of another version of it; in lockstep always 0",
-        unsigned="changed on the way, under another key, or not sealed by whom it names; likewise",
-        oversized="longer than most_bytes; likewise",
-    ),
-)
-CLOCKS = MessageType(
-    "lan_clocks",
-    1,
-    _counts(
-        taken="round trips measured",
-        answered="pings of other racks answered",
-        withheld="pings not answered: they came too fast, or from too many racks",
-        refused="pings and answers refused: malformed, unsigned, or to nothing that was asked",
-    ),
-)
-DESK = MessageType(
-    "lan_desk",
-    1,
-    _counts(
-        answered="emergency stops from other machines that were set; in lockstep always 0",
-        refused="emergency stops refused: not permitted; likewise",
-        dropped="requests dropped: malformed, unsigned or oversized; likewise",
-    ),
-)
+class LanImport(Message, version=1):
+    """Counts of one import, and its newest message, in the status of the network adapter."""
 
-
-def status_of(exports: Iterable[str], imports: Iterable[str]) -> MessageType:
-    """Return the type of an adapter's status: a group for each export and import."""
-    return status(
-        "lan_status",
-        1,
-        Field("clocks", CLOCKS, "1", "round trips to compare clocks; none in lockstep"),
-        *(Field(f"export_{port}", EXPORT, "1", f"export {port}") for port in exports),
-        *(Field(f"import_{port}", IMPORT, "1", f"import {port}") for port in imports),
-        Field("desk", DESK, "1", "emergency stops from other machines"),
-        Field("flaws", FLAWS, "1", "all that came and was dropped unread, by cause"),
+    taken: int = field("u4", unit="1", doc="messages passed to the backplane")
+    missing: int = field(
+        "u4", unit="1", doc="messages sent that never came, or came after a later one"
     )
+    disordered: int = field(
+        "u4", unit="1", doc="messages that came after a later one, and were not passed"
+    )
+    repeated: int = field("u4", unit="1", doc="messages that came twice")
+    late: int = field("u4", unit="1", doc="messages older than max_age_ms when they came")
+    refused: int = field(
+        "u4",
+        unit="1",
+        doc="messages refused: malformed, unsigned, oversized, or not what its type permits",
+    )
+    unknown_launch: int = field(
+        "u4", unit="1", doc="messages of a launch that is over, or not there"
+    )
+    superseded: int = field(
+        "u4", unit="1", doc="messages that a newer one overtook before the exchange"
+    )
+    launch: int = field(
+        unit="1",
+        doc="number of the launch that wrote the newest message taken; 0: none, or in lockstep",
+    )
+    number: int = field(unit="1", doc="number of that message among those sent from its mailbox")
+    serial: int = field(unit="1", doc="its serial in its mailbox; 0: none")
+    age: int = field(unit="tick", doc="age of its information in this rack's ticks; -1: none yet")
+    age_s: float = field(unit="s", doc="the same in simulated time; -1: none yet")
+
+
+class LanFlaws(Message, version=1):
+    """Counts of what came over the network and was dropped unread, by cause."""
+
+    malformed: int = field(
+        "u4",
+        unit="1",
+        doc="not of this protocol, or of another version of it; in lockstep always 0",
+    )
+    unsigned: int = field(
+        "u4",
+        unit="1",
+        doc="changed on the way, under another key, or not sealed by whom it names; likewise",
+    )
+    oversized: int = field("u4", unit="1", doc="longer than most_bytes; likewise")
+
+
+class LanClocks(Message, version=1):
+    """Counts of the round trips by which racks compare their clocks."""
+
+    taken: int = field("u4", unit="1", doc="round trips measured")
+    answered: int = field("u4", unit="1", doc="pings of other racks answered")
+    withheld: int = field(
+        "u4", unit="1", doc="pings not answered: they came too fast, or from too many racks"
+    )
+    refused: int = field(
+        "u4",
+        unit="1",
+        doc="pings and answers refused: malformed, unsigned, or to nothing that was asked",
+    )
+
+
+class LanDesk(Message, version=1):
+    """Counts of the emergency stops that other machines asked for."""
+
+    answered: int = field(
+        "u4",
+        unit="1",
+        doc="emergency stops from other machines that were set; in lockstep always 0",
+    )
+    refused: int = field("u4", unit="1", doc="emergency stops refused: not permitted; likewise")
+    dropped: int = field(
+        "u4", unit="1", doc="requests dropped: malformed, unsigned or oversized; likewise"
+    )
+
+
+def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
+    """Return the class of an adapter's status: a group for each export and import."""
+    groups = {
+        "clocks": field(LanClocks, doc="round trips to compare clocks; none in lockstep"),
+        **{f"export_{port}": field(LanExport, doc=f"export {port}") for port in exports},
+        **{f"import_{port}": field(LanImport, doc=f"import {port}") for port in imports},
+        "desk": field(LanDesk, doc="emergency stops from other machines"),
+        "flaws": field(LanFlaws, doc="all that came and was dropped unread, by cause"),
+    }
+    return make_message("lan_status", 1, Status, groups)
 
 
 class LanAdapter(Adapter):
@@ -153,7 +166,7 @@ class LanAdapter(Adapter):
         return () if table is None else tuple(dict.fromkeys([*table.racks, *table.estop_from]))
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return a port to read for each export, one to write for each import and rack, and the
         status."""
         table = _table_in(params)
@@ -161,14 +174,15 @@ class LanAdapter(Adapter):
             return MadePorts(is_whole=False)
         known = {port: entry for port, entry in table.exports.items() if entry.source in types}
         inputs = {port: Input(types[entry.source], entry.source) for port, entry in known.items()}
-        outputs = {STATUS: Output(status_of(table.exports, table.imports))}
+        status = Output(status_of(table.exports, table.imports))
+        outputs: dict[str, Output[Any]] = {STATUS: status}
         for port, entry in table.imports.items():
             try:
-                outputs[port] = Output(entry.message_type(), max_age_s=entry.max_age_ms * 1e-3)
+                outputs[port] = TimedOutput(entry.message_class(), entry.max_age_ms * 1e-3)
             except LookupError:
                 continue
         is_whole = len(known) == len(table.exports) and len(outputs) == 1 + len(table.imports)
-        outputs |= {peer_port(rack): Output(PEER) for rack in table.racks}
+        outputs |= {peer_port(rack): Output(PeerPresence) for rack in table.racks}
         return MadePorts(inputs, outputs, is_whole)
 
     @classmethod
@@ -195,7 +209,7 @@ class LanAdapter(Adapter):
             if (
                 before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()
             ).is_there:
-                peer.resume(before.value, seen_by)
+                peer.resume(before.message, seen_by)
         self._imports = {
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack], self._grid)
             for port, entry in table.imports.items()
@@ -215,11 +229,11 @@ class LanAdapter(Adapter):
         observer = open_observer(segment, f"{board}.{STATUS}")
         if (before := observer.peek()).is_there:
             for port, export in self._exports.items():
-                export.resume(getattr(before.value, f"export_{port}"))
+                export.resume(getattr(before.message, f"export_{port}"))
             for port, entry in self._imports.items():
-                entry.resume(getattr(before.value, f"import_{port}"), observer.newest)
-            self._desk.resume(before.value.desk)
-            self._flaws = before.value.flaws.tolist()
+                entry.resume(getattr(before.message, f"import_{port}"), observer.newest)
+            self._desk.resume(before.message.desk)
+            self._flaws = before.message.flaws.tolist()
         if self._grid.is_lockstep and table.racks:
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
@@ -257,12 +271,12 @@ class LanAdapter(Adapter):
                 export.recall(barrier.done, self.context.every)
             barrier.prepare(barrier.done)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Exchange what is due."""
         if self._replayed is not None:
             self._replayed.begin(tick)
             self._look(tick)
-            self._replayed.give(read, write, tick)
+            self._replayed.give(self.ports, tick)
             return
         cycle = tick // self.context.every
         if self._barrier is None:
@@ -277,10 +291,10 @@ class LanAdapter(Adapter):
         for port, entry in self._imports.items():
             entry.look(tick)
             if cycle % entry.every == 0:
-                entry.exchange(getattr(write, port), tick)
+                entry.exchange(self.ports[port], tick)
         self._clocks.exchange()
         self._desk.answer(tick)
-        self._report(write, tick)
+        self._report(tick)
 
     def _look(self, tick: int) -> None:
         """Note who has come, and who has gone."""
@@ -300,8 +314,8 @@ class LanAdapter(Adapter):
             since = tick + self.context.every if self._grid.is_lockstep else tick
             self._words[System.PEER_STOP] = switch(since, must_stop)
 
-    def _report(self, write: Ports, tick: int) -> None:
-        own: Message = write.status
+    def _report(self, tick: int) -> None:
+        own = self.ports[STATUS]
         self._clocks.count(own.clocks)
         for port, export in self._exports.items():
             export.fill(getattr(own, f"export_{port}"))
@@ -309,7 +323,7 @@ class LanAdapter(Adapter):
             entry.fill(getattr(own, f"import_{port}"), tick)
         self._desk.fill(own.desk)
         for peer in self._peers:
-            out = getattr(write, peer_port(peer.rack))
+            out = self.ports[peer_port(peer.rack)]
             self._clocks.fill(out, peer.rack, tick)
             peer.fill(out, self._grid.is_lockstep)
         if self._link is not None and not self._grid.is_lockstep:

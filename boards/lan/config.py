@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints
 
-from rack.backplane.message import MessageType
+from rack.backplane.message import Message
 from rack.backplane.rack_name import RACK_NAME
 from rack.levels.references import module_and_name
 from rack.levels.tables import Positive, Table
@@ -17,6 +17,7 @@ FASTEST_HZ = 50.0
 """Fastest exchange over a network."""
 MOST_CHAIN = 8192
 """Bytes of a rack's certificates in DER form, as they travel with its seals."""
+MessageKind = type[Message]
 OnPeerLoss = Literal["hold", "stop", "go on"]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 PortName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
@@ -55,7 +56,7 @@ class ImportConfig(Table):
     source: Remote = Field(alias="from")
     """rack and mailbox, as in cell/task.orders"""
     type: TypeName
-    """message type of that mailbox, package.module:TYPE"""
+    """message class of that mailbox, package.module:Class"""
     rate_hz: float = Field(10.0, gt=0, le=FASTEST_HZ)
     """rate of the exchange, Hz; divides the adapter's"""
     max_age_ms: Positive
@@ -71,12 +72,12 @@ class ImportConfig(Table):
         """Name of the mailbox there."""
         return self.source.partition("/")[2]
 
-    def message_type(self) -> MessageType:
-        """Return the message type. Raises `LookupError` with the reason if there is none."""
+    def message_class(self) -> MessageKind:
+        """Return the message class. Raises `LookupError` with the reason if there is none."""
         module, name = module_and_name(self.type)
         found = getattr(module, name, None)
-        if not isinstance(found, MessageType):
-            raise LookupError(f"module '{module.__name__}' has no message type '{name}'")
+        if not (isinstance(found, type) and issubclass(found, Message)):
+            raise LookupError(f"module '{module.__name__}' has no message class '{name}'")
         return found
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from rack.backplane.mailbox.host_ring import is_proper
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.slots import Slots, message_dtype
-from rack.backplane.message import Message, fill_counts
+from rack.backplane.message import AnyMessage, Message, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, switch
 from rack.boards.lan.config import ExportConfig, ImportConfig
@@ -168,7 +168,7 @@ class Export:
             return
         self.is_asked = False
         written = source.newest
-        payload = bytes(reading.value.raw)
+        payload = bytes(reading.message.raw)
         times = written, grid.time_ns(written), grid.stamp_ns(written)
         head = Envelope(self._kind, self._launch, self.serial, self.sent, *times)
         self._put(payload, self._sealer.seal(self._key, head, payload))
@@ -192,7 +192,7 @@ class Import:
         spec = segment.layout.mailbox(own)
         dtype = message_dtype(spec.fields, spec.size)
         self._kind = kind_of(spec.message, spec.version, dtype)
-        self._buffer = Message(dtype)
+        self._buffer = AnyMessage(dtype)
         self._key = out_key(table.rack, table.mailbox)
         self._fields = spec.fields
         self._max_age = spec.max_age
@@ -264,7 +264,7 @@ class Import:
             return
         self.count.taken += 1
         self._basis = basis
-        out.raw[:] = self._buffer.raw
+        out.message.raw[:] = self._buffer.raw
         # Ticks of mailboxes are not negative; what was written before this rack's first one is.
         out.send(max(0, basis))
         self.comes(tick)
@@ -317,7 +317,7 @@ class Import:
 
     def _is_next(self, head: Envelope, payload: bytes) -> bool:
         """Say whether a message is good and the newest so far, and if so keep its content."""
-        message = Message(self._buffer.record.dtype, memoryview(bytearray(payload)))
+        message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not is_proper(message.record, self._fields):
             self.count.refused += 1
             return False

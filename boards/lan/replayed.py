@@ -8,17 +8,16 @@ who was lost, and when; what follows from that, alarms and messages that are voi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.boards.host.adapter import STATUS
 from rack.boards.host.entries import NEVER, Replayed
 from rack.boards.lan.entries import Import
 from rack.boards.lan.peers import NONE, Peers
 from rack.boards.wiring import Entries, Rows
-from rack.levels.level import Ports
-from rack.levels.peer import PEER, Presence, peer_port
+from rack.levels.peer import PeerPresence, Presence, peer_port
 
 
 class ReplayedNetwork:
@@ -55,14 +54,14 @@ class ReplayedNetwork:
             _, rack, is_there = self._changes.pop(0)
             yield rack, NONE, is_there
 
-    def give(self, read: Ports, write: Ports, tick: int) -> None:
+    def give(self, write: Mapping[str, Any], tick: int) -> None:
         """Write what was written in this cycle."""
         for entry, sent in self._imports.values():
             entry.look(tick)
-            if sent.exchange(read, write, tick):
+            if sent.exchange({}, write, tick):
                 entry.comes(tick)
         for shown in self._shown:
-            shown.exchange(read, write, tick)
+            shown.exchange({}, write, tick)
 
 
 def _sent(segment: Segment, board: str, port: str, rows: Rows) -> Replayed:
@@ -74,7 +73,7 @@ def _sent(segment: Segment, board: str, port: str, rows: Rows) -> Replayed:
 
 def _seen(rack: str, rows: Rows) -> Iterator[tuple[int, str, bool]]:
     """Yield when a rack came, and when it was lost."""
-    message = Message(PEER.dtype({}))
+    message = PeerPresence.zeros({})
     before = int(Presence.AWAITED)
     for tick, _, content in rows:
         message.raw[:] = content

@@ -20,7 +20,7 @@ from rack.boards.exchange import EXCHANGE, ExchangeRecord
 from rack.boards.run.task import ClockGuard, Task, in_turn, slowed
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ArmState
 
 _DEMANDS = tuple(Demand)
 
@@ -50,7 +50,7 @@ class VirtualControlLoop(Task):
             (
                 writer.message
                 for writer in self.outputs.writers.values()
-                if writer.spec.message == ARM_STATE.name
+                if writer.spec.message == ArmState.message_type.name
             ),
             None,
         )
@@ -61,8 +61,8 @@ class VirtualControlLoop(Task):
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
         record = None
         if wiring.exchange:
-            messages = self.outputs.messages
-            record = ExchangeRecord(self.inputs.taken, getattr(messages, EXCHANGE)).fill
+            message = self.outputs.writers[EXCHANGE].message
+            record = ExchangeRecord(self.inputs.taken, message).fill
         reads = in_turn(self.inputs.read_command_and_status, record)
         self.read_command_and_status = in_turn(self.serve, slowed(reads, times.read_ns))
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
@@ -102,7 +102,7 @@ class VirtualControlLoop(Task):
         faults that acted."""
         executor = self.executor
         executor.demand = _DEMANDS[self.words[System.DEMAND]]
-        executor.process(self.inputs.values, self.outputs.messages, tick)
+        executor.process(tick)
         for complete_cycle in executor.complete_cycle:
             complete_cycle(self._arm_state)
         if executor.findings or executor.acted or self.faults.loads:
@@ -148,7 +148,7 @@ class PlannerLoop(Task):
         watch.start(tick, self.next_cycle.skipped)
         self.read(tick)
         watch.read_ns = monotonic_ns()
-        if not self.planner.wanted(self.inputs.values, tick):
+        if not self.planner.wanted(tick):
             self._pass(tick)
             return
         self._take_time_slice(tick)
@@ -165,7 +165,7 @@ class PlannerLoop(Task):
 
     def plan(self, tick: int) -> None:
         """Let the level plan."""
-        self.planner.plan(self.inputs.values, self.outputs.messages.plan, tick)
+        self.planner.plan(tick)
         self.faults.burn(tick)
 
     def _take_time_slice(self, tick: int) -> None:

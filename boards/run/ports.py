@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 from rack.backplane.fault_table import FaultEntry
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.mailbox.queue import ALL, QueueWriter, taken_name
-from rack.backplane.message import sending
+from rack.backplane.mailbox.queue import QueueWriter, taken_name
+from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
@@ -20,14 +21,15 @@ from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
 from rack.boards.faults.messages import FaultyWriter
 from rack.boards.wiring import Source
-from rack.levels.level import Ports, Reading, Verdict
+from rack.levels.level import LevelSection, Reading, Verdict
+from rack.levels.ports import Sender
 
-Line = tuple[dict[str, Reading], str, Callable[[int], Reading]]
+Line = tuple[dict[str, Reading[Any]], str, Callable[[int], Reading[Any]]]
 """One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
 
 
 class InputPorts:
-    """The mailboxes that a task reads, watched; `values` holds the last `Reading` of each port.
+    """The mailboxes that a task reads, watched; the level holds the last `Reading` of each port.
 
     `readers` holds the reader of each mailbox, `taken` every mailbox in the order of the ports.
     """
@@ -35,44 +37,50 @@ class InputPorts:
     def __init__(
         self,
         segment: Segment,
+        level: LevelSection,
         sources: Mapping[str, Source],
         alarms: AlarmWriter,
         plan: str = "",
         *,
-        room: Callable[[str], int] = lambda port: ALL,
         exchange: Mapping[str, ExchangeSpec] | None = None,
         inbox: BoardInbox | None = None,
     ) -> None:
-        """Read `sources` by port, from a queue as many messages as there is `room` for on its port.
+        """Open the mailboxes.
 
-        `plan` is the mailbox that holds the task's own plan, `exchange` the ports that are not
-        simply read in every cycle, `inbox` that of the task's board.
+        Args:
+            segment: The rack's memory.
+            level: The level that reads; it says how many messages to take from a queue.
+            sources: The mailboxes by port.
+            alarms: Where faults of messages are reported.
+            plan: The mailbox that holds the task's own plan.
+            exchange: The ports that are not simply read in every cycle.
+            inbox: The inbox of the task's board.
         """
         self.task = ReadingTask(inbox)
         self.taken: list[Taken] = []
-        self.values = Ports()
         self.readers: dict[str, Reader] = {}
         # Where each reading goes: the ports themselves, or the dict of a port that reads many
         # mailboxes.
         self._plan: list[Line] = []
         self._rest: list[Line] = []
         for port, source in sources.items():
-            by_board: dict[str, Reading] = {}
             boxes = {port: source} if isinstance(source, str) else source
-            values = self.values.__dict__ if isinstance(source, str) else by_board
+            values = level.input_table(port)
+            if not isinstance(source, str):
+                values[port] = values = {}
             how = (exchange or {}).get(port)
             open_port = partial(
-                watched, segment, alarms=alarms, task=self.task, room=partial(room, port)
+                watched, segment, alarms=alarms, task=self.task, room=partial(level.room, port)
             )
             for key, mailbox in boxes.items():
+                if port in level.inputs:
+                    segment.message_classes[mailbox] = level.inputs[port].message
                 found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
                 read = found.read if how is None else GridReader(found, how.grid).read
                 values[key] = Reading(found.reader.message, Verdict.NONE)
                 (self._plan if mailbox == plan else self._rest).append((values, key, read))
                 self.taken.append(Taken(values, key, found.reader))
                 self.readers[mailbox] = found.reader
-            if not isinstance(source, str):
-                setattr(self.values, port, by_board)
         self.reads_plan = bool(self._plan)
         self._readers = [entry.reader for entry in self.taken]
 
@@ -81,9 +89,9 @@ class InputPorts:
         its ports."""
         found = watched(segment, taken_name(queue.spec.name), alarms, self.task)
 
-        def read_and_note(tick: int) -> Reading:
+        def read_and_note(tick: int) -> Reading[Any]:
             reading = found.read(tick)
-            queue.taken = int(reading.value.taken)
+            queue.taken = int(reading.message.taken)
             return reading
 
         self._rest.append(({}, "", read_and_note))
@@ -123,7 +131,7 @@ class InputPorts:
 
 
 class OutputPort:
-    """One mailbox that a task writes; `message` is its outgoing message.
+    """One mailbox that a task writes.
 
     It rests on the messages of `sources`: its basis is the oldest of theirs.
 
@@ -142,15 +150,18 @@ class OutputPort:
     ) -> None:
         spec = writer.spec
         self.writer = writer
-        self.message = writer.message
         self._sources = sources
         self._is_on_demand = spec.max_age > 0
         self._is_sent = not self._is_on_demand
         self._basis: int | None = None
-        if self._is_on_demand:
-            self.message = sending(writer.message, self._send, lambda: 1)
         self._is_queue = isinstance(writer, QueueWriter)
         self._sends_itself = self._is_queue and not sends
+        self.value: Message | Sender[Message] = writer.message
+        """What the level finds in its port."""
+        if self._is_on_demand:
+            self.value = Sender(writer.message, self._send, lambda: 1)
+        elif isinstance(writer, QueueWriter) and sends:
+            self.value = Sender(writer.message, writer.send, writer.room)
         # A message that is not written in every cycle becomes visible at multiples of its period,
         # from its phase.
         self._ahead = spec.ahead - spec.phase
@@ -192,8 +203,8 @@ class OutputPort:
             if self._is_on_demand:
                 self._is_sent = False
                 basis = basis if self._basis is None else self._basis
-            elif self._sends_itself:
-                writer.message.send()
+            elif isinstance(writer, QueueWriter) and self._sends_itself:
+                writer.send()
             in_time = (self._faulty or writer).write(tick, now, basis)
         if writer.intruder or writer.held_up or writer.refused:
             self._report(tick)
@@ -220,7 +231,7 @@ class OutputPort:
 
 
 class OutputPorts:
-    """The mailboxes that a task writes; `messages` holds the outgoing message of each port.
+    """The mailboxes that a task writes; the level holds the outgoing message of each port.
 
     Each message carries the tick of the oldest information that it rests on. A command inherits the
     tick of the command that it follows, a status that of the status below: see `Output.rests_on`.
@@ -230,21 +241,34 @@ class OutputPorts:
     def __init__(
         self,
         segment: Segment,
+        level: LevelSection,
         mailboxes: Mapping[str, str],
         alarms: AlarmWriter,
         inputs: InputPorts,
         sent: Collection[str] = (),
     ) -> None:
-        """Write `mailboxes` by port. `inputs`: what the task reads. `sent`: the ports whose level
-        sends by itself."""
+        """Open the mailboxes.
+
+        Args:
+            segment: The rack's memory.
+            level: The level that writes.
+            mailboxes: The mailboxes by port.
+            alarms: Where faults of mailboxes are reported.
+            inputs: What the task reads.
+            sent: The ports whose messages the level sends itself.
+        """
+        segment.message_classes |= {
+            name: level.outputs[port].message
+            for port, name in mailboxes.items()
+            if port in level.outputs
+        }
         self.writers = {port: open_writer(segment, name) for port, name in mailboxes.items()}
-        self.messages = Ports()
         self._ports: list[OutputPort] = []
         for port, writer in self.writers.items():
             sources = [inputs.readers[name] for name in writer.spec.rests_on]
             output = OutputPort(segment, writer, alarms, sources, port in sent)
             self._ports.append(output)
-            setattr(self.messages, port, output.message)
+            level.place_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.follow(segment, writer, alarms)
 

@@ -8,7 +8,9 @@ that a release is done.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from time import monotonic_ns, thread_time_ns
+from typing import Any
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.segment import Segment
@@ -175,8 +177,10 @@ class Stopwatch:
 def _state_of(outputs: OutputPorts) -> tuple[int, memoryview]:
     """Return where, in which bytes, a level's status holds its state, one byte; always 0 without a
     status."""
-    status = getattr(outputs.messages, "status", None)
-    at = (status.record.dtype.fields or {}).get("state") if status is not None else None
+    writer = outputs.writers.get("status")
+    status = None if writer is None else writer.message
+    fields: Mapping[str, Any] = {} if status is None else status.record.dtype.fields or {}
+    at = fields.get("state")
     return (
         (at[1], status.raw) if status is not None and at is not None else (0, memoryview(bytes(1)))
     )

@@ -241,10 +241,10 @@ class OperatorDesk:
         status = self._statuses[mailbox].peek()
         if not status.is_there:
             return False
-        order = status.value.order
+        order = status.message.order
         if order == serial:
-            return bool(status.value.answer == Answer.REFUSED)
-        accepted = status.value.answer in (Answer.TAKEN, Answer.DONE)
+            return bool(status.message.answer == Answer.REFUSED)
+        accepted = status.message.answer in (Answer.TAKEN, Answer.DONE)
         return bool(newest > serial and order == newest and accepted)
 
 
@@ -289,7 +289,7 @@ class EndOfRun:
             reading = self._reader.read(boundary)
             if reading.is_new or self._heard is None or self._writer[Block.LOST]:
                 self._heard = boundary
-            is_over = reading.is_new and reading.value.state in (State.DONE, State.ERROR)
+            is_over = reading.is_new and reading.message.state in (State.DONE, State.ERROR)
             if is_over or boundary - self._heard >= self._silent:
                 self._task_ends = max(boundary + self._linger, tick)
         return self._task_ends if self._stop_tick is None else self._stop_tick

@@ -53,15 +53,17 @@ class Task(ABC):
             self.serve = InterruptHandler(segment, wiring.task, inbox, self.alarms).serve
         self.inputs = InputPorts(
             segment,
+            level,
             wiring.inputs,
             self.alarms,
             f"{spec.board}.plan",
-            room=level.room,
             exchange=wiring.exchange,
             inbox=inbox,
         )
         self.inputs.task.now = self.clock.now
-        self.outputs = OutputPorts(segment, wiring.outputs, self.alarms, self.inputs, wiring.sent)
+        self.outputs = OutputPorts(
+            segment, level, wiring.outputs, self.alarms, self.inputs, wiring.sent
+        )
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
         self.faults = TaskFaults(segment, spec, self.outputs.apply, level)
         self._generation = 0

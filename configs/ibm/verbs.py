@@ -8,10 +8,10 @@ request.
 from collections.abc import Sequence
 
 from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input
-from rack.levels.systems.joint_boards.messages import ARM_STATUS
+from rack.levels.level import Input, Output
+from rack.levels.systems.joint_boards.messages import ArmStatus
 from rack.levels.systems.trajectory.commands import Motions
-from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, RequestEnd
+from rack.levels.systems.trajectory.messages import MotionRequest, MotionStatus, RequestEnd
 
 PRESSED = 6.0
 """Change of a joint's torque that counts as touch, N m."""
@@ -33,11 +33,9 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
 class Assembly(HostProgram):
     """Puts a block on the table, and the other one on it; how high that is, only touch tells."""
 
-    inputs = {
-        "motion": Input(MOTION_STATUS, "below.motion"),
-        "sensors": Input(ARM_STATUS, "below.sensors"),
-    }
-    outputs = {"requests": MOTION_REQUEST}
+    motion = Input(MotionStatus, "below.motion")
+    sensors = Input(ArmStatus, "below.sensors")
+    requests = Output(MotionRequest)
 
     def run(self, bus: Bus) -> None:
         """Carry both blocks."""
@@ -56,7 +54,7 @@ class Assembly(HostProgram):
         motions.line((0.0, 0.0, 0.15), body=block)
         motions.line((0.0, 0.0, 0.0), body=block)
         motions.wait(motions.grip())
-        opening = bus.read("sensors").value.opening
+        opening = bus.read("sensors").message.opening
         if opening < LEAST:
             raise RuntimeError(f"{block}: the gripper closed to {1e3 * opening:.1f} mm, on nothing")
         motions.wait(motions.line((0.0, 0.0, 0.20), body=block))

@@ -4,6 +4,7 @@ fresh."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from rack.levels.level import LevelContext, Reading, Verdict
 from rack.levels.robot.limits import MotorPatience
@@ -28,7 +29,7 @@ class CommandsAbove:
             for board, pace in context.above.items()
         }
 
-    def missing(self, commands: Mapping[str, Reading], tick: int, since: int) -> str:
+    def missing(self, commands: Mapping[str, Reading[Any]], tick: int, since: int) -> str:
         """Return why commands are missing at `tick`; empty: all are fresh, and rest on a status of
         `since` or later."""
         all_know = True

@@ -6,15 +6,15 @@ from typing import Any
 
 from rack.backplane.message import Message, State
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
-from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import (
-    MOVE_COMMAND,
-    MOVE_PLAN,
-    MOVE_STATUS,
-    PRIMITIVE_STATUS,
-    TASK_COMMAND,
     Error,
+    MoveCommand,
+    MovePlan,
+    MoveStatus,
+    PrimitiveStatus,
     SegmentKind,
+    TaskCommand,
     Verb,
 )
 from rack.levels.operator import (
@@ -22,7 +22,7 @@ from rack.levels.operator import (
     BELOW_LOST,
     HELD_FROM_ABOVE,
     HOLDABLE,
-    OPERATOR_COMMAND,
+    OperatorCommand,
     Orders,
 )
 from rack.levels.tables import read_params
@@ -36,17 +36,16 @@ class ElementalMoveExecutor(Executor):
     its path while the board above is lost, and on `hold` from above or from an operator.
     """
 
-    inputs = {
-        "command": Input(TASK_COMMAND, "above.command"),
-        "status": Input(PRIMITIVE_STATUS, "below.status"),
-        "plan": Input(MOVE_PLAN, "own.plan"),
-        "last_command": Input(MOVE_COMMAND, "own.command"),
-        "last_status": Input(MOVE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
+    above = Input(TaskCommand, "above.command")
+    below = Input(PrimitiveStatus, "below.status")
+    plan = Input(MovePlan, "own.plan")
+    last_command = Input(MoveCommand, "own.command")
+    last_status = Input(MoveStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
     # The status first: a board killed between the two finds done moves still in its window, and
     # removes them again.
-    outputs = {"status": MOVE_STATUS, "command": MOVE_COMMAND}
+    status = Output(MoveStatus, rests_on=below)
+    command = Output(MoveCommand, rests_on=above)
     commands = HOLDABLE
     params = ElementalMoveParams
 
@@ -66,16 +65,16 @@ class ElementalMoveExecutor(Executor):
         self._error = Error.NONE
         self._reason = ""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Read command, status and plan; keep the window of segments full."""
-        segments = SegmentWindow(write.command)
+        segments = SegmentWindow(self.command)
         if not self._started:
-            self._recall(read, write, segments)
-        command = read.command
-        status = read.status.value
-        self._orders.take(read.operator)
-        self._plans.take(read.plan, self._done, self._handed_down, write.status.end)
-        self._take_window(command.value, status, segments)
+            self._recall(segments)
+        command = self.above
+        status = self.below.message
+        self._orders.take(self.operator)
+        self._plans.take(self.plan, self._done, self._handed_down, self.status.end)
+        self._take_window(command.message, status, segments)
         if not self._error:
             # Count segments that are done; fail on a grasp that holds nothing.
             while (taken := segments.take_done(status.done)) is not None:
@@ -88,32 +87,32 @@ class ElementalMoveExecutor(Executor):
             self._check_below(status, segments)
         if not self._error:
             self._replan_if_blocked(status, segments, tick)
-            self._fill(command.value, segments, tick)
+            self._fill(command.message, segments, tick)
         if self._error:
             segments.clear()
-        held = command.is_lost or bool(command.value.hold) or self._orders.holds
-        write.command.hold = self._request > 0 or self._error > 0 or held
-        self._report(read, segments, write.status)
-        self._answer(read, write)
+        held = command.is_lost or bool(command.message.hold) or self._orders.holds
+        self.command.hold = self._request > 0 or self._error > 0 or held
+        self._report(segments, self.status)
+        self._answer()
 
-    def _recall(self, read: Ports, write: Ports, segments: SegmentWindow) -> None:
+    def _recall(self, segments: SegmentWindow) -> None:
         """Continue from the last command and status in the mailboxes; the stock of plans is
         lost."""
         self._started = True
-        write.status.end = read.status.value.position
-        if read.last_command.is_there and read.last_status.is_there:
-            last = read.last_status.value
-            write.command.copy_from(read.last_command.value)
+        self.status.end = self.below.message.position
+        if self.last_command.is_there and self.last_status.is_there:
+            last = self.last_status.message
+            self.command.copy_from(self.last_command.message)
             self._done = last.done
             self._replans = last.replans
             if last.state == State.ERROR:
                 self._fail(Error(last.error), last.reason)
-            self._handed_down = max(last.done, *write.command.segments["move"].tolist())
+            self._handed_down = max(last.done, *self.command.segments["move"].tolist())
             if self._handed_down >= last.planned:
-                write.status.end = last.end
+                self.status.end = last.end
             end = segments.end()
             if end is not None:
-                write.status.end = end
+                self.status.end = end
 
     def _take_window(self, command: Message, status: Message, segments: SegmentWindow) -> None:
         """Start anew, once the arm rests, on a window that does not continue the last one."""
@@ -241,13 +240,13 @@ class ElementalMoveExecutor(Executor):
             self._reason = reason
             self._request = 0
 
-    def _report(self, read: Ports, segments: SegmentWindow, report: Message) -> None:
-        command = read.command.value
-        status = read.status.value
+    def _report(self, segments: SegmentWindow, report: Message) -> None:
+        command = self.above.message
+        status = self.below.message
         report.echo = command.id
         report.state = self._state(command)
         waits = ""
-        if report.state == State.EXECUTING and (waits := self._reason_to_wait(read)):
+        if report.state == State.EXECUTING and (waits := self._reason_to_wait()):
             report.state = State.HOLDING
         report.error = self._error
         report.reason = self._reason if self._error else waits
@@ -276,22 +275,22 @@ class ElementalMoveExecutor(Executor):
         report.replan = self._request
         report.start = status.position
 
-    def _answer(self, read: Ports, write: Ports) -> None:
+    def _answer(self) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""
-        above = read.command.value.operator
-        below = read.status.value
-        write.command.operator = self._orders.rests_on(above)
+        above = self.above.message.operator
+        below = self.below.message
+        self.command.operator = self._orders.rests_on(above)
         # Rest counts only once the level below has received the command.
-        write.status.resting = below.resting and below.operator >= write.command.operator
-        if write.status.resting:
+        self.status.resting = below.resting and below.operator >= self.command.operator
+        if self.status.resting:
             self._orders.done()
-        self._orders.report(write.status, above)
+        self._orders.report(self.status, above)
 
-    def _reason_to_wait(self, read: Ports) -> str:
+    def _reason_to_wait(self) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
-        command = read.command
-        below = read.status
+        command = self.above
+        below = self.below
         if self._orders.stands:
             return self._orders.keeps(self.context.board)
         if command.is_lost:
@@ -300,9 +299,9 @@ class ElementalMoveExecutor(Executor):
             return BELOW_LOST
         if self._reason:
             return self._reason
-        if below.value.state == State.HOLDING and below.value.reason != HELD_FROM_ABOVE:
-            return str(below.value.reason)
-        return HELD_FROM_ABOVE if command.value.hold else ""
+        if below.message.state == State.HOLDING and below.message.reason != HELD_FROM_ABOVE:
+            return str(below.message.reason)
+        return HELD_FROM_ABOVE if command.message.hold else ""
 
     def _state(self, command: Message) -> State:
         if self._error:

@@ -46,7 +46,7 @@ class PlanStore:
         self._by_move: dict[int, Message] = {}
         self._answer: Message | None = None
 
-    def take(self, plan: Reading, done: int, handed_down: int, end: Array) -> None:
+    def take(self, plan: Reading[Any], done: int, handed_down: int, end: Array) -> None:
         """Keep a new plan of a move after `handed_down`, if it begins where the path before it
         ends.
 
@@ -57,7 +57,7 @@ class PlanStore:
         """
         if not plan.is_new:
             return
-        message = copied(plan.value)
+        message = copied(plan.message)
         if message.replan:
             self._answer = message
             return

@@ -12,18 +12,18 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, SegmentWindow
 from rack.levels.errors import Refused
-from rack.levels.level import Input, LevelContext, Planner, Ports
+from rack.levels.level import Input, LevelContext, Output, Planner
 from rack.levels.messages import (
-    MOVE_COMMAND,
-    MOVE_PLAN,
-    MOVE_STATUS,
-    PRIMITIVE_STATUS,
-    SCENE,
-    TASK_COMMAND,
-    WORLD_MODEL,
     Error,
+    MoveCommand,
+    MovePlan,
+    MoveStatus,
+    PrimitiveStatus,
+    Scene,
     SegmentKind,
+    TaskCommand,
     Verb,
+    WorldState,
 )
 from rack.levels.motion.path import Path
 from rack.levels.planning.moves import Move, Situation, read_window
@@ -71,15 +71,13 @@ class ElementalMovePlanner(Planner):
     After a restart it continues from the executor's status.
     """
 
-    inputs = {
-        "command": Input(TASK_COMMAND, "above.command"),
-        "status": Input(MOVE_STATUS, "own.status"),
-        "handed_down": Input(MOVE_COMMAND, "own.command"),
-        "primitive": Input(PRIMITIVE_STATUS, "below.status"),
-        "scene": Input(SCENE, "servo.scene"),
-        "world": Input(WORLD_MODEL, "world.model"),
-    }
-    output = MOVE_PLAN
+    above = Input(TaskCommand, "above.command")
+    status = Input(MoveStatus, "own.status")
+    handed_down = Input(MoveCommand, "own.command")
+    primitive = Input(PrimitiveStatus, "below.status")
+    scene = Input(Scene, "servo.scene")
+    world = Input(WorldState, "world.model")
+    output = Output(MovePlan)
     params = ElementalMoveParams
 
     @classmethod
@@ -109,14 +107,14 @@ class ElementalMovePlanner(Planner):
         self._answered = 0  # newest request answered
         self._answer_due = 0  # tick by which the executor must have used the answer
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return whether a path is requested, blocked or missing."""
-        ports = (read.command, read.status, read.primitive, read.scene, read.world)
+        ports = (self.above, self.status, self.primitive, self.scene, self.world)
         # A plan for a lost executor would be based on an old status; wait until it reports again.
-        if not all(port.is_there for port in ports) or read.status.is_lost:
+        if not all(port.is_there for port in ports) or self.status.is_lost:
             return False
-        self._window = read_window(read.command.value)
-        status = read.status.value
+        self._window = read_window(self.above.message)
+        status = self.status.message
         # Drop paths that are done, and those that the executor should have acknowledged but
         # has not.
         late = tick - ACKNOWLEDGED_CYCLES * self.context.every
@@ -125,9 +123,9 @@ class ElementalMovePlanner(Planner):
         self._published = [p for p in kept if not lost or p.move.id < lost[0]]
         # Store how the next object, still at rest, will be grasped; after a restart, how it
         # is held.
-        world = read.world.value
-        held = read.primitive.value.held
-        done = read.status.value.done
+        world = self.world.message
+        held = self.primitive.message.held
+        done = self.status.message.done
         if held < 0:
             ahead = [
                 (m.object, m.tool) for m in self._window if m.verb is Verb.GRASP and m.id > done
@@ -136,73 +134,73 @@ class ElementalMovePlanner(Planner):
                 ((row, grip_of(row, tool, world)) for row, tool in ahead if row is not None), None
             )
         elif self._grip is None or self._grip[0] != held:
-            scene = read.scene.value
+            scene = self.scene.message
             tool = pose(scene.tool_position, scene.tool_quaternion)
             self._grip = (held, grip_of(held, tool, scene))
-        self._job = self._requested(read, tick) or self._blocked(read) or self._ahead(read)
-        return self._job is not None and self._may_try(self._job, read.world.value.revision, tick)
+        self._job = self._requested(tick) or self._blocked() or self._ahead()
+        return self._job is not None and self._may_try(self._job, self.world.message.revision, tick)
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Make the path of one move, or give the reason why there is none."""
         job = self._job
         assert job is not None, "plan is called only when one is wanted"
-        write.clear()
-        write.move = job.move.id
-        write.replan = job.request
+        self.output.clear()
+        self.output.move = job.move.id
+        self.output.replan = job.request
         visible_at = tick + self.context.every * self.context.within_cycles
         try:
-            situation = self._situation(job.move, read)
+            situation = self._situation(job.move)
             path = self._motion.plan(
                 job.move, job.start, situation, attempt=self._tries, goal=job.goal
             )
         except Refused as refused:
-            write.error = refused.code
-            write.reason = str(refused)
+            self.output.error = refused.code
+            self.output.reason = str(refused)
             again_at = visible_at + round(self._params.retry / self.context.tick_s)
             self._refusal = Refusal(
-                job.move.id, job.request, refused.code, read.world.value.revision, again_at
+                job.move.id, job.request, refused.code, self.world.message.revision, again_at
             )
             self._tries += 1
             if not job.request:
                 self._published = [p for p in self._published if p.move.id < job.move.id]
             return
         count = len(path.waypoints)
-        write.kind = SegmentKind.PATH
-        write.count = count
-        write.waypoints[:count], write.blend[:count] = path
+        self.output.kind = SegmentKind.PATH
+        self.output.count = count
+        self.output.waypoints[:count], self.output.blend[:count] = path
         self._note_path(job, path, visible_at)
 
-    def _requested(self, read: Ports, tick: int) -> PlanningJob | None:
+    def _requested(self, tick: int) -> PlanningJob | None:
         """Return the job that the executor requests where the arm is blocked; its end stays, for
         the moves after it."""
-        status = read.status.value
+        status = self.status.message
         if not status.replan or (status.replan == self._answered and tick < self._answer_due):
             return None
         for move in self._window:
             if move.id == status.current:
-                end = SegmentWindow(read.handed_down.value).end(move.id)
+                end = SegmentWindow(self.handed_down.message).end(move.id)
                 return PlanningJob(move, np.array(status.start), end, status.replan)
         return None
 
-    def _blocked(self, read: Ports) -> PlanningJob | None:
+    def _blocked(self) -> PlanningJob | None:
         """Return the first path ahead that a change of the world has blocked; its end stays."""
-        status = read.status.value
-        revision = read.world.value.revision
+        status = self.status.message
+        revision = self.world.message.revision
         if revision == self._revision:
             return None
         handed_down = max(status.current, status.done) + MAX_HANDED_DOWN
         for move, path, _ in self._published:
             if move.id > handed_down and not self._motion.still_free(
-                move, path, self._situation(move, read)
+                move, path, self._situation(move)
             ):
                 return PlanningJob(move, path.waypoints[0], path.end)
         self._revision = revision
         return None
 
-    def _ahead(self, read: Ports) -> PlanningJob | None:
+    def _ahead(self) -> PlanningJob | None:
         """Return the first move without a path."""
-        status = read.status.value
-        primitive = read.primitive.value
+        status = self.status.message
+        primitive = self.primitive.message
         # The executor's report of a path's end is exact, but it may not have received the newest
         # path yet.
         unseen = [p for p in self._published[-1:] if p.move.id > status.planned]
@@ -215,12 +213,12 @@ class ElementalMovePlanner(Planner):
             return PlanningJob(move, np.array(status.end))
         return PlanningJob(move, np.array(primitive.position)) if primitive.resting else None
 
-    def _situation(self, move: Move, read: Ports) -> Situation:
+    def _situation(self, move: Move) -> Situation:
         """Return the situation when `move` begins: the world as sensed, changed by the moves before
         it."""
-        world = read.world.value
-        held = read.primitive.value.held
-        done = read.status.value.done
+        world = self.world.message
+        held = self.primitive.message.held
+        done = self.status.message.done
         situation = Situation(np.array(world.position), np.array(world.quaternion))
         if held >= 0:
             grip = None if self._grip is None else self._grip[1]
@@ -269,6 +267,6 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 
 def grip_of(row: int, tool: Pose, seen: Message) -> Pose:
-    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a SCENE or a
-    WORLD_MODEL."""
+    """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a Scene or a
+    WorldState."""
     return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])

@@ -6,19 +6,19 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import (
-    JOINT_SET_POINT,
-    MOVE_COMMAND,
-    PRIMITIVE_STATUS,
-    SERVO_STATUS,
-    TRAJECTORY,
-    WORLD_MODEL,
     Error,
+    JointCommand,
+    MoveCommand,
+    PrimitiveStatus,
     SegmentKind,
+    ServoStatus,
+    TrajectoryPlan,
+    WorldState,
 )
 from rack.levels.motion import path as paths
-from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLDABLE, OperatorCommand, Orders
 from rack.levels.planning import collision
 from rack.levels.primitive.guard import Guard, Sight
 from rack.levels.primitive.path_motion import JointSetPoint
@@ -58,16 +58,15 @@ class PrimitiveExecutor(Executor):
     `hold` from above or from an operator; while the servo does not follow, it waits.
     """
 
-    inputs = {
-        "command": Input(MOVE_COMMAND, "above.command"),
-        "status": Input(SERVO_STATUS, "below.status"),
-        "plan": Input(TRAJECTORY, "own.plan"),
-        "world": Input(WORLD_MODEL, "world.model"),
-        "last_command": Input(JOINT_SET_POINT, "own.command"),
-        "last_status": Input(PRIMITIVE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": JOINT_SET_POINT, "status": PRIMITIVE_STATUS}
+    above = Input(MoveCommand, "above.command")
+    below = Input(ServoStatus, "below.status")
+    plan = Input(TrajectoryPlan, "own.plan")
+    world = Input(WorldState, "world.model")
+    last_command = Input(JointCommand, "own.command")
+    last_status = Input(PrimitiveStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(JointCommand, rests_on=above)
+    status = Output(PrimitiveStatus, rests_on=below)
     commands = HOLDABLE
     preloads = (collision, paths)
     params = PrimitiveParams
@@ -101,36 +100,36 @@ class PrimitiveExecutor(Executor):
             False  # the servo was out of step since the last path: the arm may not be at its end
         )
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Read command, status, plan and world model; write the next set point and this level's
         status."""
         if self._tick is None:
             self._tick = tick - self.context.every
-            self._memory = recall(read)
+            self._memory = recall(self.last_status, self.last_command)
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
-        servo = read.status.value
-        self._orders.take(read.operator)
-        serials = window(read.command.value)
-        self._plans.accept(read.plan, serials)
+        servo = self.below.message
+        self._orders.take(self.operator)
+        serials = window(self.above.message)
+        self._plans.accept(self.plan, serials)
         if servo.error == Error.DISABLED:
             # Plan from where the arm is: while it is not enabled, it may be moved by hand.
             self._displaced = True
             if not self._memory.is_known:
                 self._position[:] = servo.position
-        if self._tracking.update(read.status):
+        if self._tracking.update(self.below):
             self._resume(servo, tick)
-        self._sight.update(read.world, servo.position, tick)
+        self._sight.update(self.world, servo.position, tick)
         if self._tracking.in_step:
-            self._do_segments(read, serials, tick, passed_s)
+            self._do_segments(serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._silent_cycles:
             reason = f"no status from below for {self._tracking.silent_cycles} cycles"
             self._fault = SegmentFault(Error.BELOW, reason)
         if servo.state == State.ERROR:
             self._fault = SegmentFault(Error(servo.error), servo.reason)
-        self._write_set_point(write.command, tick)
-        self._write_status(read, write.status, serials, tick)
-        self._answer(write, read.command.value.operator)
+        self._write_set_point(self.command, tick)
+        self._write_status(self.status, serials, tick)
+        self._answer(self.above.message.operator)
 
     def _resume(self, servo: Message, tick: int) -> None:
         """Continue from the position at which the servo holds the arm."""
@@ -152,15 +151,15 @@ class PrimitiveExecutor(Executor):
     def _carry(self, row: int, tick: int) -> None:
         self._sight.carry(row, tick - SEEN_CYCLES * self.context.every)
 
-    def _do_segments(self, read: Ports, serials: list[int], tick: int, passed_s: float) -> None:
+    def _do_segments(self, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish, drop, begin or advance it."""
-        hold = bool(read.command.value.hold) or read.command.is_lost or self._orders.holds
-        if read.status.is_new:
-            self._finish(read.status.value, tick)
-            self._straying.update(read.status.value)
+        hold = bool(self.above.message.hold) or self.above.is_lost or self._orders.holds
+        if self.below.is_new:
+            self._finish(self.below.message, tick)
+            self._straying.update(self.below.message)
         withdrawn = self._withdraw(serials)
         if self._work is None and self._fault is None:
-            self._begin(read, serials, hold)
+            self._begin(serials, hold)
         work = self._work
         if work is None:
             return
@@ -176,8 +175,8 @@ class PrimitiveExecutor(Executor):
             )
             plan = self._plans.trajectory(work.segment.id, work.motion.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
-            part = self._bring_up if read.status.value.slowed else 1.0
-            work.step(WorkCycle(hold, plan, read.world.value, due_s, passed_s, part))
+            part = self._bring_up if self.below.message.slowed else 1.0
+            work.step(WorkCycle(hold, plan, self.world.message, due_s, passed_s, part))
             self._position[:] = work.motion.set_point.position
 
     def _finish(self, servo: Message, tick: int) -> None:
@@ -206,7 +205,7 @@ class PrimitiveExecutor(Executor):
         self._fault = None
         return False
 
-    def _begin(self, read: Ports, serials: list[int], hold: bool) -> None:
+    def _begin(self, serials: list[int], hold: bool) -> None:
         """Begin the oldest segment that is not done; with `hold`, the gripper waits."""
         memory = self._memory
         serial = next((s for s in serials if s > memory.done), 0)
@@ -214,11 +213,11 @@ class PrimitiveExecutor(Executor):
             return
         self._begun = serial
         try:
-            segment = read_segment(read.command.value, serial)
+            segment = read_segment(self.above.message, serial)
             if hold and segment.kind is SegmentKind.GRIPPER:
                 return
             if segment.kind is SegmentKind.PATH:
-                self._work = self._begin_path(segment, memory, read)
+                self._work = self._begin_path(segment, memory)
             elif self._gripper is None:
                 raise ValueError(f"segment {serial}: the arm has no gripper; valid: paths")
             else:
@@ -229,9 +228,9 @@ class PrimitiveExecutor(Executor):
             self._fault = SegmentFault(Error.LIMIT, str(error))
         memory.interrupted = 0
 
-    def _begin_path(self, segment: MotionSegment, memory: Memory, read: Ports) -> PathWork:
+    def _begin_path(self, segment: MotionSegment, memory: Memory) -> PathWork:
         path = segment.path()
-        self._guard.watch(segment, path, read.status.value.opening, read.world.value)
+        self._guard.watch(segment, path, self.below.message.opening, self.world.message)
         work = PathWork(segment, path, self._guard, self._rules)
         if segment.id == memory.interrupted:
             work.begin_near(self._position, memory.progress)
@@ -242,11 +241,11 @@ class PrimitiveExecutor(Executor):
         self._displaced = False
         return work
 
-    def _wanted(self, read: Ports, serials: list[int]) -> tuple[int, float]:
+    def _wanted(self, serials: list[int]) -> tuple[int, float]:
         """Return the segment for which a trajectory is wanted, and the path parameter of its start;
         0: none."""
         work = self._work
-        kinds = read.command.value.segments["kind"].tolist()
+        kinds = self.above.message.segments["kind"].tolist()
         for serial, kind in zip(serials, kinds, strict=False):
             begin = 0.0 if kind == SegmentKind.PATH else None
             if work is not None and serial == work.segment.id:
@@ -279,12 +278,12 @@ class PrimitiveExecutor(Executor):
             command.force = memory.force
             command.held = memory.held
 
-    def _write_status(self, read: Ports, status: Message, serials: list[int], tick: int) -> None:
+    def _write_status(self, status: Message, serials: list[int], tick: int) -> None:
         memory = self._memory
         work = self._work
-        status.echo = read.command.value.id
+        status.echo = self.above.message.id
         status.state = self._state(serials)
-        reason = self._reason_to_wait(read) if status.state == State.EXECUTING else ""
+        reason = self._reason_to_wait() if status.state == State.EXECUTING else ""
         if reason:
             status.state = State.HOLDING
         status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
@@ -292,11 +291,11 @@ class PrimitiveExecutor(Executor):
         status.held = memory.held
         interrupted = memory.interrupted if memory.interrupted in serials else 0
         status.current = work.segment.id if work is not None else interrupted
-        if read.status.is_there:
-            status.opening = read.status.value.opening
+        if self.below.is_there:
+            status.opening = self.below.message.opening
         status.position[:] = self._position
         status.progress = memory.progress * bool(interrupted)
-        servo = read.status.value
+        servo = self.below.message
         status.operated = self._orders.stands or servo.standing > 0 or servo.error == Error.DISABLED
         status.blocked = False
         status.resting = True
@@ -307,15 +306,15 @@ class PrimitiveExecutor(Executor):
             status.blocked = work.blocked and self._tracking.in_step
             status.resting = work.motion.resting
             status.ends = work.ends_s(self._due(tick) * self.context.tick_s)
-        status.wants, status.begin = self._wanted(read, serials)
+        status.wants, status.begin = self._wanted(serials)
 
-    def _reason_to_wait(self, read: Ports) -> str:
+    def _reason_to_wait(self) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
         work = self._work
-        command = read.command
+        command = self.above
         if not self._tracking.in_step:
-            return self._tracking.awaited(read.status.value)
+            return self._tracking.awaited(self.below.message)
         if isinstance(work, GripperWork):
             return ""
         if self._orders.stands:
@@ -326,19 +325,19 @@ class PrimitiveExecutor(Executor):
                 return reason
         if command.is_lost:
             return ABOVE_LOST
-        if command.value.hold:
+        if command.message.hold:
             return HELD_FROM_ABOVE
         unplanned = work is not None and work.unplanned_cycles > MAX_UNEXPLAINED_CYCLES
         if work and unplanned:
             return f"segment {work.segment.id} waits for its trajectory from the planner"
         return ""
 
-    def _answer(self, write: Ports, above: int) -> None:
+    def _answer(self, above: int) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""
-        if write.status.resting:
+        if self.status.resting:
             self._orders.done()
-        write.command.operator = self._orders.rests_on(above)
-        self._orders.report(write.status, above)
+        self.command.operator = self._orders.rests_on(above)
+        self._orders.report(self.status, above)
 
     def _state(self, serials: list[int]) -> State:
         if self._fault is not None:

@@ -3,6 +3,8 @@ enough for motion."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rack.backplane.message import Message
@@ -160,9 +162,9 @@ class Sight:
         if row < 0:
             self._guard.carry_nothing()
 
-    def update(self, world: Reading, q: Array, tick: int) -> None:
+    def update(self, world: Reading[Any], q: Array, tick: int) -> None:
         """Process the newest world model; `q` (joints,), rad, is where the arm rests."""
-        model = world.value
+        model = world.message
         seen = world.is_there and model.revision > 0
         self._blind = self._has_bodies and (not seen or tick - model.sensed > self._blind_ticks)
         if self._waiting is not None and seen and model.sensed >= self._waiting[1]:

@@ -4,12 +4,12 @@ moves."""
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message
-from rack.levels.level import Input, LevelContext, Planner, Ports, Reading
-from rack.levels.messages import MOVE_COMMAND, PRIMITIVE_STATUS, TRAJECTORY, Error
+from rack.levels.level import Input, LevelContext, Output, Planner, Reading
+from rack.levels.messages import Error, MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory, make_trajectory
 from rack.levels.primitive.segment import MotionSegment, SegmentFault, read_segment, window
@@ -22,11 +22,9 @@ class PrimitivePlanner(Planner):
     """Makes the trajectory that the executor's status requests: of the next segment, or from where
     a path was held."""
 
-    inputs = {
-        "command": Input(MOVE_COMMAND, "above.command"),
-        "status": Input(PRIMITIVE_STATUS, "own.status"),
-    }
-    output = TRAJECTORY
+    above = Input(MoveCommand, "above.command")
+    status = Input(PrimitiveStatus, "own.status")
+    output = Output(TrajectoryPlan)
     params = PrimitiveParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -38,44 +36,48 @@ class PrimitivePlanner(Planner):
         self._made = (0, 0.0)
         self._answered_at = 0
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return whether the executor wants a trajectory that it has not received."""
-        status = read.status.value
-        if status.wants not in window(read.command.value):
+        status = self.status.message
+        if status.wants not in window(self.above.message):
             return False
         # The status shows a plan one cycle later. If it is still wanted after that, it was lost
         # with the board.
         return (status.wants, status.begin) != self._made or tick > self._answered_at
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Time the wanted segment from its point of departure, or give the reason why not."""
-        status = read.status.value
+        status = self.status.message
         context = self.context
         serial = status.wants
         begin = status.begin
         published = tick + context.within_cycles * context.every
         self._made = (serial, begin)
         self._answered_at = published + context.every
-        write.segment = serial
-        write.begin = begin
-        write.duration = 0.0
-        write.earliest = 0.0
-        write.count = 0
+        self.output.segment = serial
+        self.output.begin = begin
+        self.output.duration = 0.0
+        self.output.earliest = 0.0
+        self.output.count = 0
         fault: SegmentFault | None = None
         try:
-            segment = read_segment(read.command.value, serial)
+            segment = read_segment(self.above.message, serial)
             trajectory = make_trajectory(self._path(segment), self._rules.limits, begin)
             start_s = max((published + context.every) * context.tick_s, status.ends)
             sections = trajectory.sections
-            write.duration = trajectory.duration
-            write.count = len(sections)
-            write.sections[: len(sections)] = sections
-            write.earliest = start_s + trajectory.duration + self._rules.latency_s
-            if trajectory.begin == 0.0 and 0.0 < segment.by < write.earliest:
-                fault = segment.too_late(write.earliest)
+            self.output.duration = trajectory.duration
+            self.output.count = len(sections)
+            self.output.sections[: len(sections)] = sections
+            self.output.earliest = start_s + trajectory.duration + self._rules.latency_s
+            if trajectory.begin == 0.0 and 0.0 < segment.by < self.output.earliest:
+                fault = segment.too_late(self.output.earliest)
         except (ValueError, ArithmeticError) as error:
             fault = SegmentFault(Error.LIMIT, f"segment {serial}: {error}")
-        write.error, write.reason, write.earliest = fault or (0, "", write.earliest)
+        self.output.error, self.output.reason, self.output.earliest = fault or (
+            0,
+            "",
+            self.output.earliest,
+        )
 
     def _path(self, segment: MotionSegment) -> BlendedPath:
         """Return the segment's path. Raises `ValueError` for one that is invalid or leaves a
@@ -100,11 +102,11 @@ class Plans:
     def __init__(self) -> None:
         self._plans: dict[int, Trajectory | SegmentFault] = {}
 
-    def accept(self, plan: Reading, window: Collection[int]) -> None:
+    def accept(self, plan: Reading[Any], window: Collection[int]) -> None:
         """Copy a new plan; drop those of segments that have left the window."""
         for serial in [s for s in self._plans if s not in window]:
             del self._plans[serial]
-        message = plan.value
+        message = plan.message
         serial = message.segment
         if not plan.is_new or serial not in window:
             return

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.level import Ports
-from rack.levels.messages import Error, SegmentKind
+from rack.levels.messages import Error, JointCommand, PrimitiveStatus, SegmentKind
 from rack.levels.motion.path import BlendedPath
 
 
@@ -95,18 +95,16 @@ class Memory:
     force: float = 0.0  # commanded to the gripper, N
 
 
-def recall(read: Ports) -> Memory:
+def recall(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
     """Return the state in the level's own last messages; not `is_known` before the first ones."""
-    status = read.last_status
-    command = read.last_command
-    if not (status.is_there and command.is_there and command.value.id):
+    if not (status.is_there and command.is_there and command.message.id):
         return Memory()
     return Memory(
         is_known=True,
-        done=status.value.done,
-        interrupted=status.value.current,
-        progress=status.value.progress,
-        held=status.value.held,
-        opening=command.value.opening,
-        force=command.value.force,
+        done=status.message.done,
+        interrupted=status.message.current,
+        progress=status.message.progress,
+        held=status.message.held,
+        opening=command.message.opening,
+        force=command.message.force,
     )

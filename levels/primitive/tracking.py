@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -42,12 +43,12 @@ class Tracking:
         self._cycles_in_step = 0
         self._unexplained_cycles = 0
 
-    def update(self, status: Reading) -> bool:
+    def update(self, status: Reading[Any]) -> bool:
         """Process one status; True in the cycle in which servo and level get into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
-        servo = status.value
+        servo = status.message
         left_alone = bool(servo.holding) and self._cycles_in_step > HANDOVER_CYCLES
         if self.silent_cycles > MAX_MISSED_STATUSES or left_alone or servo.stopped:
             self.in_step = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -26,10 +26,9 @@ from rack.levels.level import (
     LevelContext,
     Misfits,
     Output,
-    Ports,
     Reading,
 )
-from rack.levels.messages import SCENE, Error
+from rack.levels.messages import ArmState, DrivenArm, Error, Scene
 from rack.levels.operator import Operation, Orders
 from rack.levels.robot.cell import cell_of, sensed_by
 from rack.levels.robot.dynamics import Terms
@@ -42,7 +41,7 @@ from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Cause, Reaction, Stopping
 from rack.levels.tables import read_params
 
-SCENES = Output(SCENE, cycles=8)
+SCENES = Output(Scene, cycles=8)
 """At 400 Hz, a scene for every cycle of the levels that read it."""
 
 
@@ -75,6 +74,10 @@ class ArmDriver(Executor):
     """The set points of a cycle, for drives that take them; None: they take torques."""
     orders: Orders
     """The operator's."""
+    before: Reading[ArmState]
+    status: DrivenArm
+    state: ArmState
+    scene: Scene
 
     def __init__(self, context: LevelContext, params: ArmParams) -> None:
         super().__init__(context)
@@ -115,7 +118,7 @@ class ArmDriver(Executor):
         self._started = False  # the first cycle has begun
         self._adopted = False  # the arm is enabled, and its pose then was taken over
         self.abandoned = False  # set points were abandoned in the last cycle: the arm was braked
-        self.command = self.rests_on = (
+        self.followed = self.rests_on = (
             0  # serials of the newest command, and of the operator's that it rests on
         )
 
@@ -163,7 +166,7 @@ class ArmDriver(Executor):
         self._link = self._faulty if faults else self._sound
 
     @abstractmethod
-    def take_messages(self, read: Ports) -> None:
+    def take_messages(self) -> None:
         """Take over what is new."""
 
     @abstractmethod
@@ -195,7 +198,7 @@ class ArmDriver(Executor):
     def has_work(self) -> bool:
         """Whether the level has work from which it can be kept. Default: once there was a
         command."""
-        return self.command > 0
+        return self.followed > 0
 
     @property
     def note(self) -> str:
@@ -222,10 +225,10 @@ class ArmDriver(Executor):
         """React to the start of a board whose arm was restored from its last state. Default:
         nothing."""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
-        missed = self._catch_up(read.before, tick)
-        self.take_messages(read)
+        missed = self._catch_up(self.before, tick)
+        self.take_messages()
         sensed = self._link.sense()
         sensors = self.sensors
         contact = self.arm.contact
@@ -254,18 +257,18 @@ class ArmDriver(Executor):
         else:
             self.motors.drop()  # without a new sample the arm keeps its last torque
         self.arm.brake_cause = BY_DEMAND if self.demand else self.stopping.cause
-        self._report(write, sensed, reaction)
-        self.orders.report(write.status, self.rests_on)
-        self.arm.save(write.state)
-        self.stopping.remember(write.state)
+        self._report(sensed, reaction)
+        self.orders.report(self.status, self.rests_on)
+        self.arm.save(self.state)
+        self.stopping.remember(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
-            self.arm.look(write.scene)
+            self.arm.look(self.scene)
 
-    def _catch_up(self, before: Reading, tick: int) -> bool:
+    def _catch_up(self, before: Reading[Any], tick: int) -> bool:
         """Advance the arm to `tick`; return whether cycles were missed. A restarted board first
         restores the arm."""
         if not self._started:
-            state = before.value if before.is_there else None
+            state = before.message if before.is_there else None
             self._start(state, tick)
             return False
         ticks = tick - self.arm.tick
@@ -336,16 +339,16 @@ class ArmDriver(Executor):
         self.stopping.refused = None
         return self.motors.begin()
 
-    def _report(self, write: Ports, sensed: Sensed, reaction: Reaction) -> None:
+    def _report(self, sensed: Sensed, reaction: Reaction) -> None:
         """Fill the status, and the estimate in the state; the steady fields only when they
         change."""
         arm = self.arm
-        status = write.status
+        status = self.status
         if self._numbers is None:
             self._numbers = (
                 numbers(status, "position", "target_velocity").reshape(5, -1),
                 numbers(status, "opening", "grip_force"),
-                numbers(write.state, "position", "doubt").reshape(3, -1),
+                numbers(self.state, "position", "doubt").reshape(3, -1),
             )
         joints, gripper, kept = self._numbers
         kept[:] = self.sensors.estimate

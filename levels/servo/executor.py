@@ -10,9 +10,9 @@ import numpy as np
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.level import Input, LevelContext, Misfits, Ports, Verdict
-from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SERVO_PLAN, SERVO_STATUS
-from rack.levels.operator import DRIVES, OPERATOR_COMMAND, Goal, Operation
+from rack.levels.level import Input, LevelContext, Misfits, Output, Verdict
+from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
+from rack.levels.operator import DRIVES, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import control, curves, reference
 from rack.levels.servo.control import ComputedTorque, Grip, ServoParams, SetPointLaw
@@ -33,13 +33,13 @@ class ServoExecutor(ArmDriver):
     See `ArmDriver`.
     """
 
-    inputs = {
-        "command": Input(JOINT_SET_POINT, "above.command"),
-        "plan": Input(SERVO_PLAN, "own.plan"),
-        "before": Input(ARM_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENES}
+    above = Input(JointCommand, "above.command")
+    plan = Input(ServoPlan, "own.plan")
+    before = Input(ArmState, "own.state")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(ServoStatus)
+    state = Output(ArmState)
+    scene = SCENES
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
@@ -65,10 +65,10 @@ class ServoExecutor(ArmDriver):
             self.ahead = SetPointLaw(cell, params, context.period_s)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         joints = context.robot.joints
-        self.operator = OperatorControl(
+        self.operator_control = OperatorControl(
             self.commands, joints, cell.limits.position, obey=self._obey
         )
-        self.orders = self.operator.orders
+        self.orders = self.operator_control.orders
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
 
     @classmethod
@@ -88,15 +88,15 @@ class ServoExecutor(ArmDriver):
             why = f'they modify a law of torques; [robot] interface is "{interface}"'
             yield "params.modifications", ", ".join(names), why
 
-    def take_messages(self, read: Ports) -> None:
+    def take_messages(self) -> None:
         """Take over what is new."""
-        if read.operator.verdict is Verdict.NEW:
-            self.operator.take(read.operator, self.sensors.position)
-        if read.plan.verdict is Verdict.NEW:
-            self._loop.take(read.plan.value)
-        if read.command.verdict is Verdict.NEW:
-            command: Message = read.command.value
-            self.command = command.id
+        if self.operator.verdict is Verdict.NEW:
+            self.operator_control.take(self.operator, self.sensors.position)
+        if self.plan.verdict is Verdict.NEW:
+            self._loop.take(self.plan.message)
+        if self.above.verdict is Verdict.NEW:
+            command: Message = self.above.message
+            self.followed = command.id
             self.rests_on = command.operator
             self.reference.take(command)
             if self._grip is not None:
@@ -122,7 +122,7 @@ class ServoExecutor(ArmDriver):
 
     def adopted(self) -> None:
         """Forget the operator's way: the arm may have been moved away from it."""
-        self.operator.forget()
+        self.operator_control.forget()
 
     def started(self) -> None:
         """Keep the grip on a part."""
@@ -142,7 +142,11 @@ class ServoExecutor(ArmDriver):
             reference.meet(sensors.position, sensors.velocity, tick)
         if reaction:
             return reference.rest(tick)
-        return self.operator.wanted(reference, tick) if self.operator.stands else reference.at(tick)
+        return (
+            self.operator_control.wanted(reference, tick)
+            if self.operator_control.stands
+            else reference.at(tick)
+        )
 
     def terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with the held object."""
@@ -181,11 +185,11 @@ class ServoExecutor(ArmDriver):
 
     def course(self, reaction: Reaction) -> Course:
         """Return what the status says of set points."""
-        operator = self.operator
+        operator = self.operator_control
         cut = self.reference.refused + self._loop.cut
         kept = self.stopping.reason
         if operator.stands and not kept:
             kept = operator.reason
         holding = self.abandoned or self.reference.holding
         stopped = self.abandoned or reaction > 0 or operator.stands
-        return Course(self.command, holding, stopped, cut, kept)
+        return Course(self.followed, holding, stopped, cut, kept)

@@ -4,6 +4,7 @@ return the same way."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +50,7 @@ class OperatorControl:
             Array
         ] = []  # (joints,), rad each: places from which the arm set out, oldest first
 
-    def take(self, operator: Reading, position: Array) -> None:
+    def take(self, operator: Reading[Any], position: Array) -> None:
         """Accept new commands, with the arm at `position`, (joints,), rad."""
         self._position[:] = position
         if not self.orders.take(operator, self._judge):

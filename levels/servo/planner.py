@@ -7,8 +7,8 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import mat_vec, transposed_mat_vec
-from rack.levels.level import Input, LevelContext, Planner, Ports
-from rack.levels.messages import JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.levels.level import Input, LevelContext, Output, Planner
+from rack.levels.messages import JointCommand, Scene, ServoPlan, ServoStatus
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
 
@@ -16,12 +16,10 @@ from rack.levels.robot.dynamics import Dynamics, Payload
 class ServoPlanner(Planner):
     """Plans the inertia at the set point due next, with the object held, at every release."""
 
-    inputs = {
-        "command": Input(JOINT_SET_POINT, "above.command"),
-        "status": Input(SERVO_STATUS, "own.status"),
-        "scene": Input(SCENE, "own.scene"),
-    }
-    output = SERVO_PLAN
+    above = Input(JointCommand, "above.command")
+    status = Input(ServoStatus, "own.status")
+    scene = Input(Scene, "own.scene")
+    output = Output(ServoPlan)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -35,28 +33,28 @@ class ServoPlanner(Planner):
         self._rotation = np.zeros(9)
         self._rest = np.zeros(len(cell.home))
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return True: the arm keeps moving, so its inertia keeps changing."""
         return True
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Fill a `SERVO_PLAN`."""
-        command: Message = read.command.value
+    def plan(self, tick: int) -> None:
+        """Fill a `ServoPlan`."""
+        command: Message = self.above.message
         held = -1
         payload = Payload(0.0, np.zeros(3))
-        if command.due != 0 and read.scene.is_there and 0 <= command.held < self._objects:
+        if command.due != 0 and self.scene.is_there and 0 <= command.held < self._objects:
             held = command.held
-            payload = self._payload(read.scene.value, held)
+            payload = self._payload(self.scene.message, held)
         # Plan for the set point due, else for where the arm is, else for home.
         position = self._home
         if command.due != 0 and np.isfinite(command.position).all():
             position = command.position
-        elif read.status.is_there:
-            position = read.status.value.position
-        write.inertia = self._dynamics.terms(position, self._rest, payload).inertia
-        write.held = held
-        write.payload_mass = payload.mass
-        write.payload_offset = payload.offset
+        elif self.status.is_there:
+            position = self.status.message.position
+        self.output.inertia = self._dynamics.terms(position, self._rest, payload).inertia
+        self.output.held = held
+        self.output.payload_mass = payload.mass
+        self.output.payload_offset = payload.offset
 
     def _payload(self, scene: Message, held: int) -> Payload:
         """Return mass and centre, in the frame of the tool, of an object as the scene shows it."""

@@ -8,26 +8,29 @@ from typing import Annotated
 
 from pydantic import Field as Parameter
 
-from rack.backplane.message import Message, MessageType, State, status
+from rack.backplane.message import Message, State, Status, field
 from rack.backplane.process import compute_until
-from rack.levels.fields import tick
-from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output, Planner
 from rack.levels.tables import Table, read_params
 
-FIGURE_PLAN = MessageType(
-    "figure_plan",
-    1,
-    (
-        tick("made_at", "release that the plan answers"),
-        tick("cycle", "cycle of the executor whose status the plan rests on; -1: none was there"),
-    ),
-)
-FIGURE_STATUS = status(
-    "figure_status",
-    1,
-    tick("cycle", "release of this cycle"),
-    tick("plan", "release that the plan in force answers; -1: there is none yet"),
-)
+
+class FigurePlan(Message, version=1):
+    """A plan of the level of the paper's Gantt charts."""
+
+    made_at: int = field(unit="tick", doc="release that the plan answers")
+    cycle: int = field(
+        unit="tick", doc="cycle of the executor whose status the plan rests on; -1: none was there"
+    )
+
+
+class FigureStatus(Status, version=1):
+    """Status of the level of the paper's Gantt charts."""
+
+    cycle: int = field(unit="tick", doc="release of this cycle")
+    plan: int = field(
+        unit="tick", doc="release that the plan in force answers; -1: there is none yet"
+    )
+
 
 NS_PER_MS = 1e6
 Milliseconds = Annotated[float, Parameter(ge=0, le=10_000, allow_inf_nan=False)]
@@ -46,9 +49,9 @@ class FigureParams(Table):
 class FigureLoop(Executor):
     """Computes for X of processor time in every cycle: a level without a planner."""
 
-    outputs = {"status": FIGURE_STATUS}
+    status = Output(FigureStatus)
     params = FigureParams
-    plan = -1
+    plan_in_use = -1
     """Release that the plan in force answers; -1: there is none."""
 
     def __init__(self, context: LevelContext) -> None:
@@ -59,33 +62,33 @@ class FigureLoop(Executor):
             times_ms = (times_ms,)
         self._times_ns = [round(ms * NS_PER_MS) for ms in times_ms]
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Report, then compute; time spent preempted does not count."""
         end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
-        status = write.status
+        status = self.status
         status.state = State.EXECUTING
         status.cycle = tick
-        status.plan = self.plan
+        status.plan = self.plan_in_use
         compute_until(end)
 
 
 class FigureExecutor(FigureLoop):
     """Reports which plan is in force, too."""
 
-    inputs = {"plan": Input(FIGURE_PLAN, "own.plan")}
+    plan = Input(FigurePlan, "own.plan")
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Report, with the plan in force, then compute."""
-        if read.plan.is_there:
-            self.plan = read.plan.value.made_at
-        super().process(read, write, tick)
+        if self.plan.is_there:
+            self.plan_in_use = self.plan.message.made_at
+        super().process(tick)
 
 
 class FigurePlanner(Planner):
     """Computes for P of processor time, then begins the next plan: one is always wanted."""
 
-    inputs = {"status": Input(FIGURE_STATUS, "own.status")}
-    output = FIGURE_PLAN
+    status = Input(FigureStatus, "own.status")
+    output = Output(FigurePlan)
     params = FigureParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -93,13 +96,13 @@ class FigurePlanner(Planner):
         super().__init__(context)
         self._time_ns = round(read_params(FigureParams, context.params).plan_ms * NS_PER_MS)
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return True: a plan is always wanted."""
         return True
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Report, then compute; time spent preempted does not count."""
         end = process_time_ns() + self._time_ns
-        write.made_at = tick
-        write.cycle = read.status.value.cycle if read.status.is_there else -1
+        self.output.made_at = tick
+        self.output.cycle = self.status.message.cycle if self.status.is_there else -1
         compute_until(end)

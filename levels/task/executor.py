@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, Input, LevelContext, Ports, Program, Reading
-from rack.levels.messages import MOVE_STATUS, TASK_COMMAND, TASK_PLAN, TASK_STATUS, Error
+from rack.levels.level import Executor, Input, LevelContext, Output, Program, Reading
+from rack.levels.messages import Error, MoveStatus, TaskCommand, TaskPlan, TaskStatus
 from rack.levels.operator import (
     BELOW_LOST,
     HELD_FROM_ABOVE,
-    OPERATOR_COMMAND,
     Goal,
     Operation,
+    OperatorCommand,
     Orders,
     answered,
 )
@@ -27,14 +27,13 @@ class TaskExecutor(Executor):
     An operator may hold it, or send the arm elsewhere between two of its moves.
     """
 
-    inputs = {
-        "status": Input(MOVE_STATUS, "below.status"),
-        "plan": Input(TASK_PLAN, "own.plan"),
-        "last_command": Input(TASK_COMMAND, "own.command"),
-        "last_status": Input(TASK_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": TASK_COMMAND, "status": TASK_STATUS}
+    below = Input(MoveStatus, "below.status")
+    plan = Input(TaskPlan, "own.plan")
+    last_command = Input(TaskCommand, "own.command")
+    last_status = Input(TaskStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TaskCommand)
+    status = Output(TaskStatus, rests_on=below)
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
@@ -58,15 +57,15 @@ class TaskExecutor(Executor):
         self._progress: tuple[float, ...] = ()  # all values that change while anything moves
         self._moved_at = 0  # tick of the last such change
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Read the progress below, and the operator's commands; hand down the next moves."""
         if not self._started:
-            self._recall(read, write)
+            self._recall()
         self._orders.take(
-            read.operator, lambda command: self._judge(command, answered(read.last_status.value))
+            self.operator, lambda command: self._judge(command, answered(self.last_status.message))
         )
-        plan = self._plan_to_follow(read, write, tick)
-        below = read.status.value
+        plan = self._plan_to_follow(tick)
+        below = self.below.message
         if not self._error:
             self._follow(plan, below)
             # Fail when an action is not done by its time.
@@ -79,33 +78,33 @@ class TaskExecutor(Executor):
                     self._error = Error.TOO_LATE
                     self._reason = self._about(k, why)
         self._done = self._step_aside(plan, below)
-        waits = self._reason_to_wait(read.status)
+        waits = self._reason_to_wait(self.below)
         if self._state(plan) == State.EXECUTING:
-            self._check_progress(plan, read, waits, tick)
-        self._hand_down(plan, write.command)
-        self._report(plan, waits, write)
-        self._answer(below, write)
+            self._check_progress(plan, waits, tick)
+        self._hand_down(plan, self.command)
+        self._report(plan, waits)
+        self._answer(below)
 
     def _first_actions(self) -> tuple[AnyAction, ...]:
         """Return the actions with which the level begins: its whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
-    def _plan_to_follow(self, read: Ports, write: Ports, tick: int) -> Message:
-        """Return the `TASK_PLAN` of the present actions; one of zeros if there is none yet."""
-        plan: Message = read.plan.value
+    def _plan_to_follow(self, tick: int) -> Message:
+        """Return the `TaskPlan` of the present actions; one of zeros if there is none yet."""
+        plan: Message = self.plan.message
         return plan
 
-    def _recall(self, read: Ports, write: Ports) -> None:
+    def _recall(self) -> None:
         """Continue from the last command and status in the mailboxes, after a restart of the
         board."""
         self._started = True
-        last = read.last_status.value
+        last = self.last_status.message
         self._done = last.moves_done
         self._error = Error(last.error)
         self._reason = last.reason
-        if read.last_status.is_there and read.last_command.is_there:
+        if self.last_status.is_there and self.last_command.is_there:
             before = (last.detour or last.first + self._done) - 1
-            self._window = ShownWindow(last.first, read.last_command.value.id, before)
+            self._window = ShownWindow(last.first, self.last_command.message.id, before)
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
     def _judge(self, command: Message, answered: int) -> None:
@@ -134,7 +133,7 @@ class TaskExecutor(Executor):
         """Interrupt the program for an operator; return how many moves of the plan are done."""
         return self._detour.step(plan, self._done, below)
 
-    def _reason_to_wait(self, below: Reading) -> str:
+    def _reason_to_wait(self, below: Reading[Any]) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
         orders = self._orders
@@ -144,12 +143,12 @@ class TaskExecutor(Executor):
             return orders.keeps(self.context.board)
         if below.is_lost:
             return BELOW_LOST
-        is_held = below.value.state == State.HOLDING and below.value.reason != HELD_FROM_ABOVE
-        return str(below.value.reason) if is_held else ""
+        is_held = below.message.state == State.HOLDING and below.message.reason != HELD_FROM_ABOVE
+        return str(below.message.reason) if is_held else ""
 
-    def _check_progress(self, plan: Message, read: Ports, waits: str, tick: int) -> None:
+    def _check_progress(self, plan: Message, waits: str, tick: int) -> None:
         """Fail when nothing has moved for too long, unless an operator keeps it from moving."""
-        below = read.status.value
+        below = self.below.message
         reported = below.done, below.planned, below.current, below.progress
         progress = (plan.id, self._done, *reported, self._detour.move, *self._stage())
         operated = below.operated or self._orders.stands
@@ -187,8 +186,8 @@ class TaskExecutor(Executor):
         """Return the first move of the plan that must not begin."""
         return plan.count if self._detour.until is None else self._detour.until
 
-    def _report(self, plan: Message, waits: str, write: Ports) -> None:
-        status: Message = write.status
+    def _report(self, plan: Message, waits: str) -> None:
+        status: Message = self.status
         status.echo = plan.id
         status.state = self._state(plan)
         holds = waits and status.state == State.EXECUTING
@@ -203,15 +202,15 @@ class TaskExecutor(Executor):
         status.first = self._window.first
         status.detour = self._detour.move
 
-    def _answer(self, below: Message, write: Ports) -> None:
+    def _answer(self, below: Message) -> None:
         """Obey and answer the operator, and pass down the newest command on which this cycle is
         based."""
         orders = self._orders
-        write.command.hold = orders.holds or self._detour.holds
-        write.command.operator = orders.rests_on(0)
+        self.command.hold = orders.holds or self._detour.holds
+        self.command.operator = orders.rests_on(0)
         if orders.holds and below.resting and below.operator >= orders.basis:
             orders.done()
-        orders.report(write.status)
+        orders.report(self.status)
 
     def _state(self, plan: Message) -> State:
         if self._error:

@@ -10,8 +10,8 @@ import numpy as np
 
 from rack.backplane.message import Message, copied
 from rack.levels.errors import Refused
-from rack.levels.level import Input, LevelContext, Planner, Ports, Program
-from rack.levels.messages import MOVES, SERVO_STATUS, TASK_PLAN, TASK_STATUS, WORLD_MODEL, Error
+from rack.levels.level import Input, LevelContext, Output, Planner, Program
+from rack.levels.messages import MOVES, Error, ServoStatus, TaskPlan, TaskStatus, WorldState
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
@@ -31,13 +31,11 @@ class TaskPlanner(Planner):
     A program that cannot be done is refused before anything moves, with a possible alternative.
     """
 
-    inputs = {
-        "status": Input(TASK_STATUS, "own.status"),
-        "made": Input(TASK_PLAN, "own.plan"),
-        "servo": Input(SERVO_STATUS, "servo.status"),
-        "world": Input(WORLD_MODEL, "world.model"),
-    }
-    output = TASK_PLAN
+    status = Input(TaskStatus, "own.status")
+    made = Input(TaskPlan, "own.plan")
+    servo = Input(ServoStatus, "servo.status")
+    world = Input(WorldState, "world.model")
+    output = Output(TaskPlan)
     params: ClassVar[type[TaskParams]] = TaskParams
     program: ClassVar[type[Program] | None] = TaskConfig
 
@@ -67,36 +65,36 @@ class TaskPlanner(Planner):
         """Return the program to plan first."""
         return read_program(self.context.task, self.context.robot, self.context.scene)
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return whether the program is still to be planned and the world is known and at rest."""
         self._since = tick if self._since is None else self._since
-        followed = read.status.value.echo == self._id
-        if not self._program.action or followed or self._is_on_its_way(read, tick, self._since):
+        followed = self.status.message.echo == self._id
+        if not self._program.action or followed or self._is_on_its_way(tick, self._since):
             return False
         if self._plan is not None:
             return True
-        if not (read.servo.is_there and read.world.is_there and read.world.value.revision):
+        if not (self.servo.is_there and self.world.is_there and self.world.message.revision):
             return False
         objects = len(self.context.scene.objects)
-        speeds = np.linalg.norm(read.world.value.velocity[:objects], axis=1)
+        speeds = np.linalg.norm(self.world.message.velocity[:objects], axis=1)
         return bool(np.all(speeds < MAX_REST_M_S))
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Decompose the whole program into `write`, or refuse it; a plan that was lost is published
         again."""
         self._visible_at = tick + self._slice
         if self._plan is not None:
-            write.copy_from(self._plan)
+            self.output.copy_from(self._plan)
             return
-        write.clear()
-        write.id = self._id
+        self.output.clear()
+        self.output.id = self._id
         try:
-            self._decompose(read, write, tick)
+            self._decompose(tick)
         except Refused as refused:
-            write.error = refused.code
-            write.reason = self._reason(refused)
-            write.count = 0
-        self._plan = copied(write)
+            self.output.error = refused.code
+            self.output.reason = self._reason(refused)
+            self.output.count = 0
+        self._plan = copied(self.output)
 
     def _reason(self, refused: Refused) -> str:
         """Return why the program is refused, with the number of the action."""
@@ -106,31 +104,31 @@ class TaskPlanner(Planner):
     def _slice(self) -> int:
         return self.context.within_cycles * self.context.every
 
-    def _is_on_its_way(self, read: Ports, tick: int, since: int) -> bool:
+    def _is_on_its_way(self, tick: int, since: int) -> bool:
         """Return whether the executor may still report a plan: of this process, or of one before
         it."""
         if self._plan is not None:
             # Once visible, the status acknowledges it a cycle later.
             return tick <= self._visible_at + self.context.every
         # A plan published just before a restart of this planner becomes visible later.
-        return read.made.value.id == self._id or 0 < since <= tick < since + self._slice
+        return self.made.message.id == self._id or 0 < since <= tick < since + self._slice
 
-    def _decompose(self, read: Ports, write: Message, tick: int) -> None:
+    def _decompose(self, tick: int) -> None:
         from rack.levels.task.actions import rehearse
 
-        world = read.world.value
+        world = self.world.message
         situation = Situation(np.array(world.position), np.array(world.quaternion))
-        start = Rehearsal(self._motion, np.array(read.servo.value.target), situation)
+        start = Rehearsal(self._motion, np.array(self.servo.message.target), situation)
         moves = self._with_times(rehearse(self._program, self.context.scene, start).moves)
         if len(moves) > MOVES:
             raise Refused(
                 Error.LIMIT,
                 f"the program has {len(moves)} elemental moves; at most {MOVES} are valid",
             )
-        self._promise(moves, self._visible_s(tick), write)
+        self._promise(moves, self._visible_s(tick))
         for k, (move, _) in enumerate(moves):
-            move.write_to(write.moves[k])
-        write.count = len(moves)
+            move.write_to(self.output.moves[k])
+        self.output.count = len(moves)
 
     def _visible_s(self, tick: int) -> float:
         """Return when the first moves of a plan begun at `tick` become visible below, s of
@@ -153,7 +151,7 @@ class TaskPlanner(Planner):
                 )
         return timed
 
-    def _promise(self, moves: Sequence[Rehearsed], visible_s: float, write: Message) -> None:
+    def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
         """Raise `Refused` with the earliest possible time if an action cannot be done by its
         time."""
         finish_s = finish_times(moves, visible_s, self.context, self._needs)
@@ -161,6 +159,6 @@ class TaskPlanner(Planner):
             action = self._program.action[move.action]
             earliest_s = finished_s + self._ahead_s
             if move.by_s and action.by is not None and earliest_s > action.by + ROUNDING_S:
-                write.earliest = earliest_s
+                self.output.earliest = earliest_s
                 text = f"{action}, by {action.by:g} s: the earliest is {earliest_s:.2f} s"
                 raise Refused(Error.TOO_LATE, text, move.action)

@@ -91,7 +91,7 @@ class ShownWindow:
 def is_free(plan: Message, k: int) -> bool:
     """Return whether move `k` of the plan is a free motion; before the first and after the last
     move, True."""
-    return not 0 <= k < plan.count or int(plan.moves["verb"][k]) in FREE
+    return not 0 <= k < plan.count or plan.moves["verb"][k] in FREE
 
 
 class Detour:

@@ -25,7 +25,7 @@ class Newest:
         if mailbox not in self._readers:
             self._readers[mailbox] = open_observer(self.segment, mailbox)
         reading = self._readers[mailbox].peek()
-        return reading.value if reading.is_there else None
+        return reading.message if reading.is_there else None
 
     def messages(self, is_wanted: Callable[[MailboxSpec], bool]) -> Iterator[tuple[str, Message]]:
         """Yield the newest message of every wanted mailbox that has one, with its writer."""

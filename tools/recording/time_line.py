@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.peer import DRIFT_PPM, PEER, Presence, peer_port
+from rack.levels.peer import DRIFT_PPM, PeerPresence, Presence, peer_port
 from rack.tools.console.answer import Failure
 from rack.tools.recording.divergence import unlike_messages
 from rack.tools.recording.origin import continued_at
@@ -244,7 +244,8 @@ def _mailbox(of: RackGrid, peer: RackGrid) -> str | None:
     names = (
         box.name
         for box in boxes
-        if box.message == PEER.name and box.name.endswith(f".{peer_port(peer.rack)}")
+        if box.message == PeerPresence.message_type.name
+        and box.name.endswith(f".{peer_port(peer.rack)}")
     )
     return next((name for name in names if name in of.recording.mailboxes), None)
 

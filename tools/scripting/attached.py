@@ -74,7 +74,7 @@ class AttachedRack:
         return self._monitor.look()
 
     @as_failure()
-    def read(self, mailbox: str) -> Reading:
+    def read(self, mailbox: str) -> Reading[Any]:
         """Return the newest message of a mailbox, a copy; it costs no board anything."""
         return open_observer(self._segment, mailbox_of(mailbox, self._boxes).name).peek()
 
@@ -86,7 +86,7 @@ class AttachedRack:
         reading = self.read(signal.mailbox)
         if not reading.is_there:
             raise Failure(f"mailbox '{signal.mailbox}' has no message yet")
-        return signal.in_message(reading.value.record)
+        return signal.in_message(reading.message.record)
 
     @as_failure()
     def command(self, level: str, what: str, wait_s: float | None = None, **goal: Any) -> Reply:

@@ -16,9 +16,9 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
-from rack.levels.systems.hand.messages import GRASP_STATUS
+from rack.levels.systems.hand.messages import GraspStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
-from rack.levels.systems.trajectory.messages import MOTION_STATUS
+from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, extent_of, floor_of
 from rack.tools.viewer.curves import (
@@ -220,7 +220,7 @@ class RackViews:
                 name="queue and moving goal",
             )
             for box in self._layout.mailboxes
-            if box.message == MOTION_STATUS.name
+            if box.message == MotionStatus.message_type.name
         ]
 
     def _gripper(self) -> list[rrb.View]:
@@ -275,7 +275,7 @@ class RackViews:
         pulls = [
             _curves("weight and pull, N", self._fields(box, "load"))
             for box in self._layout.mailboxes
-            if box.message == GRASP_STATUS.name
+            if box.message == GraspStatus.message_type.name
         ]
         return rrb.Horizontal(
             rrb.Tabs(*tabs, active_tab=0),

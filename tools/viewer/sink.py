@@ -17,18 +17,18 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, rack_timing, read_stored
 from rack.levels.messages import (
-    ARM_STATE,
-    MOVE_PLAN,
-    MOVE_STATUS,
-    SCENE,
-    TASK_PLAN,
-    WORLD_MODEL,
+    ArmState,
+    MovePlan,
+    MoveStatus,
+    Scene,
+    TaskPlan,
+    WorldState,
 )
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_STATUS, WRENCH, Mode
-from rack.levels.systems.hand.messages import GRASP_STATUS, HAND_STATUS, STREAMED_DOWN
-from rack.levels.systems.joint_boards.messages import DRIVING, JOINT_STATUS, JOINT_TORQUE, STREAMED
-from rack.levels.systems.trajectory.messages import MOTION_STATUS
+from rack.levels.systems.force.messages import ForceStatus, Mode, ServerStatus, Wrench
+from rack.levels.systems.hand.messages import STREAMED_DOWN, GraspStatus, HandStatus
+from rack.levels.systems.joint_boards.messages import DRIVING, STREAMED, JointStatus, JointTorque
+from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.recording.occasions import Retention
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
 from rack.tools.viewer.cell import Goals, Marks, PlannedPath, Poses, Pushes, write_geometry
@@ -52,7 +52,7 @@ from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_
 from rack.tools.viewer.style import write_legend
 from rack.tools.viewer.timing import LOAD, Age, CycleLanes, Load, Misses, boards_of, colours_of
 
-SHOWN_IN_3D = (ARM_STATE.name, SCENE.name, WORLD_MODEL.name)
+SHOWN_IN_3D = (ArmState.message_type.name, Scene.message_type.name, WorldState.message_type.name)
 """Messages whose numbers are not shown as curves."""
 BLOCK_S = 1.0
 """Simulated time in one block: a call costs the same for 4 rows as for 400."""
@@ -229,7 +229,7 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
     names = {field.name for field in mailbox.fields}
     board, _, port = mailbox.name.partition(".")
     parts: list[ViewPart] = []
-    if {"state", "error", "reason"} <= names and mailbox.message != ARM_STATE.name:
+    if {"state", "error", "reason"} <= names and mailbox.message != ArmState.message_type.name:
         parts.append(Activity(stream, mailbox).write)
     elif (
         mailbox.name.endswith(".command")
@@ -239,20 +239,20 @@ def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
         parts.append(ValueLane(stream, (board, port), "id", numbered).write)
     if names.issuperset(FIRED):
         parts.append(FiredRows(stream, mailbox).write)
-    if mailbox.message == MOVE_STATUS.name:
+    if mailbox.message == MoveStatus.message_type.name:
         parts.append(ValueLane(stream, (board, "move"), ["current", "verb"], move_name).write)
-    if mailbox.message in (MOTION_STATUS.name, SERVER_STATUS.name):
+    if mailbox.message in (MotionStatus.message_type.name, ServerStatus.message_type.name):
         parts.append(ValueLane(stream, (board, "request"), "current", numbered).write)
-    if mailbox.message == GRASP_STATUS.name:
+    if mailbox.message == GraspStatus.message_type.name:
         parts.append(ValueLane(stream, (board, "step"), ["step", "kind"], step_name).write)
-    if mailbox.message == SERVER_STATUS.name:
+    if mailbox.message == ServerStatus.message_type.name:
         parts.append(ValueLane(stream, (board, "mode"), "mode", partial(worded, Mode)).write)
     if mailbox.message not in (
         *SHOWN_IN_3D,
         *DRIVING,
-        JOINT_TORQUE.name,
-        JOINT_STATUS.name,
-        HAND_STATUS.name,
+        JointTorque.message_type.name,
+        JointStatus.message_type.name,
+        HandStatus.message_type.name,
     ):
         parts.append(Fields(stream, mailbox).write)
     return parts
@@ -265,24 +265,24 @@ def _of_arm(
     robot = config.robot
     assert robot is not None, "there is an arm"
     match mailbox.message:
-        case ARM_STATE.name:
+        case ArmState.message_type.name:
             pushes = [Pushes(stream, cell).write] if config.scene.push else []
             return [Poses(stream, cell).write, *pushes]
-        case HAND_STATUS.name if cell.hand is not None:
+        case HandStatus.message_type.name if cell.hand is not None:
             arrows = ContactArrows(stream, cell, "force")
             return [HandCurves(stream, robot.joints, cell.hand).write, arrows.write]
         case driving if driving in DRIVING:
             return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
-        case WRENCH.name if cell.wrist is not None:
+        case Wrench.message_type.name if cell.wrist is not None:
             arrows = ContactArrows(stream, cell, "wrench")
             return [arrows.write, ContactForces(stream, cell.wrist.most).write]
-        case FORCE_STATUS.name:
+        case ForceStatus.message_type.name:
             return [TaskForces(stream).write]
-        case MOVE_PLAN.name:
+        case MovePlan.message_type.name:
             return [PlannedPath(stream, cell).write]
-        case TASK_PLAN.name:
+        case TaskPlan.message_type.name:
             return [goals.write]
-        case MOVE_STATUS.name:
+        case MoveStatus.message_type.name:
             return [goals.write_status]
         case _:
             return []

@@ -150,7 +150,7 @@ def entries(wiring: Wiring) -> Mistakes:
             yield Mistake(f"{PLACE}.export.{port}.from", export.source, why)
     for port, entry in table.imports.items():
         try:
-            entry.message_type()
+            entry.message_class()
         except LookupError as error:
             yield Mistake(f"{PLACE}.import.{port}.type", entry.type, str(error))
 

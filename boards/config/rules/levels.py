@@ -51,7 +51,7 @@ def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
     """Check that the rack knows each size that a message needs."""
     for mailbox, (ports, output) in wiring.writers.items():
         try:
-            output.type.dtype(sizes)
+            output.message.message_type.dtype(sizes)
         except MailboxError as error:
             yield Mistake(f"mailbox {mailbox}", ports.task, str(error))
 

@@ -29,8 +29,8 @@ def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Mistakes:
     table = place.table
     inputs = ", ".join(ports.kind.inputs) or "none"
     for output, told in ports.outputs.items():
-        if told.rests_on and told.rests_on not in ports.inputs:
-            why = f"its output '{output}' rests on '{told.rests_on}'; inputs: {inputs}"
+        if told.rests_on is not None and told.rests_on.name not in ports.inputs:
+            why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
             yield Mistake(f"{table}.{role}", place.target, why)
     for port, given in rewired(wiring.config, place).items():
         if port not in ports.kind.inputs:
@@ -63,7 +63,7 @@ def reads(wiring: Wiring) -> Mistakes:
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
             place = _wired_at(ports, port)
-            wanted = ports.inputs[port].type
+            wanted = ports.inputs[port].message.message_type
             if not wiring.is_known(mailbox):
                 yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names()}")
             elif (
@@ -179,7 +179,8 @@ def exchange(wiring: Wiring) -> Mistakes:
             elif entry.phase >= entry.every:
                 why = f"must be less than every; permitted: 0 to {entry.every - 1} cycles"
                 yield Mistake(f"{place}.phase", entry.phase, why)
-        if ports.outputs[EXCHANGE].type != exchange_message(ports.reads):
+        made = exchange_message(ports.reads).message_type
+        if ports.outputs[EXCHANGE].message.message_type != made:
             why = "the executor writes a mailbox of that name itself; rename its output"
             yield Mistake(f"board.{ports.task}.exchange", None, why)
 

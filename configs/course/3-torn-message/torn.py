@@ -5,17 +5,24 @@ from time import sleep
 
 import numpy as np
 
-from rack.backplane.message import Field, MessageType, State, status
-from rack.levels.level import Executor, Input
+from rack.backplane.message import Message, State, Status, field
+from rack.levels.level import Executor, Input, Output
 
-NUMBERS = MessageType("numbers", 1, (Field("numbers", "i8", "1", "all the same", (16,)),))
-COUNTS = status(
-    "torn_counts",
-    1,
-    Field("reads", "i8", "1", "messages read"),
-    Field("memory", "i8", "1", "torn messages in memory"),
-    Field("mailbox", "i8", "1", "torn messages in the mailbox"),
-)
+
+class Numbers(Message, version=1):
+    """Sixteen equal numbers: a reader sees at once whether a message is torn."""
+
+    numbers: np.ndarray = field("i8", unit="1", doc="all the same", shape=16)
+
+
+class TornCounts(Status, version=1):
+    """How many torn messages a reader has seen."""
+
+    reads: int = field(unit="1", doc="messages read")
+    memory: int = field(unit="1", doc="torn messages in memory")
+    mailbox: int = field(unit="1", doc="torn messages in the mailbox")
+
+
 READS = 1000
 WORD_S = 0.0002  # a word on a slow bus
 MEMORY = np.frombuffer(mmap(-1, 16 * 8), "i8")  # shared by all boards: they are forked after this
@@ -29,28 +36,28 @@ def is_torn(numbers):
 class Writer(Executor):
     """Writes the number of its cycle 16 times."""
 
-    outputs = {"message": NUMBERS}
+    message = Output(Numbers)
 
-    def process(self, read, write, tick):
+    def process(self, tick):
         for place in range(16):
             MEMORY[place] = tick
-            write.message.numbers[place] = tick
+            self.message.numbers[place] = tick
             sleep(WORD_S)
 
 
 class Reader(Executor):
     """Counts the messages that are torn."""
 
-    inputs = {"message": Input(NUMBERS, "writer.message")}
-    outputs = {"status": COUNTS}
+    message = Input(Numbers, "writer.message")
+    status = Output(TornCounts)
 
-    def process(self, read, write, tick):
-        counts = write.status
+    def process(self, tick):
+        counts = self.status
         if counts.reads == READS:
             return
         counts.reads += 1
         counts.memory += is_torn(MEMORY.copy())
-        counts.mailbox += is_torn(read.message.value.numbers)
+        counts.mailbox += is_torn(self.message.message.numbers)
         counts.state = State.DONE if counts.reads == READS else State.EXECUTING
         counts.reason = (
             f"{counts.reads} reads: {counts.memory} torn in memory, {counts.mailbox} in the mailbox"

@@ -1,19 +1,23 @@
 """A level of one's own: the greatest speed of any joint so far."""
 
-from rack.backplane.message import Field, State, status
-from rack.levels.level import Executor, Input
-from rack.levels.messages import SERVO_STATUS
+from rack.backplane.message import State, Status, field
+from rack.levels.level import Executor, Input, Output
+from rack.levels.messages import ServoStatus
 
-PEAK = status("peak_status", 1, Field("speed", "f8", "rad/s", "greatest speed of a joint so far"))
+
+class PeakStatus(Status, version=1):
+    """The greatest speed of a joint so far."""
+
+    speed: float = field(unit="rad/s", doc="greatest speed of a joint so far")
 
 
 class Peak(Executor):
     """Reads the servo level's status, and keeps the greatest speed in it."""
 
-    inputs = {"servo": Input(SERVO_STATUS, "servo.status")}
-    outputs = {"status": PEAK}
+    servo = Input(ServoStatus, "servo.status")
+    status = Output(PeakStatus)
 
-    def process(self, read, write, tick):
-        speed = abs(read.servo.value.velocity).max()
-        write.status.state = State.EXECUTING
-        write.status.speed = max(write.status.speed, speed)
+    def process(self, tick):
+        speed = abs(self.servo.message.velocity).max()
+        self.status.state = State.EXECUTING
+        self.status.speed = max(self.status.speed, speed)

@@ -1,24 +1,24 @@
-from rack.backplane.message import Field, State, status
-from rack.levels.level import Executor, Input
-from rack.levels.messages import SERVO_STATUS
+from rack.backplane.message import State, Status, field
+from rack.levels.level import Executor, Input, Output
+from rack.levels.messages import ServoStatus
 
-POWER = status(
-    "power_status",
-    1,
-    Field("power", "f8", "W", "mechanical power"),
-    Field("energy", "f8", "J", "spent"),
-)
+
+class PowerStatus(Status, version=1):
+    """Power drawn by the arm."""
+
+    power: float = field(unit="W", doc="mechanical power")
+    energy: float = field(unit="J", doc="spent")
 
 
 class PowerMeter(Executor):
     """What the arm takes, from torque and velocity."""
 
-    inputs = {"servo": Input(SERVO_STATUS, "servo.status")}
-    outputs = {"status": POWER}
+    servo = Input(ServoStatus, "servo.status")
+    status = Output(PowerStatus)
 
-    def process(self, read, write, tick):
-        arm = read.servo.value
-        meter = write.status
+    def process(self, tick):
+        arm = self.servo.message
+        meter = self.status
         meter.state = State.EXECUTING
         meter.power = float((arm.torque * arm.velocity).sum())
         meter.energy += max(meter.power, 0.0) * self.context.period_s

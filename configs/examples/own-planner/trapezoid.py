@@ -7,9 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from rack.backplane.message import Message
-from rack.levels import Error, Input, LevelContext, Planner, Ports
-from rack.levels.messages import MOVE_COMMAND, PRIMITIVE_STATUS, TRAJECTORY
+from rack.levels import Error, Input, LevelContext, Output, Planner
+from rack.levels.messages import MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
 from rack.levels.primitive.segment import read_segment, window
 from rack.levels.robot.cell import build_cell
@@ -24,42 +23,42 @@ class TrapezoidPlanner(Planner):
     """Accelerates, cruises and brakes along the path: between stops, with one speed and one
     acceleration."""
 
-    inputs = {
-        "command": Input(MOVE_COMMAND, "above.command"),
-        "status": Input(PRIMITIVE_STATUS, "own.status"),
-    }
-    output = TRAJECTORY
+    above = Input(MoveCommand, "above.command")
+    status = Input(PrimitiveStatus, "own.status")
+    output = Output(TrajectoryPlan)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.limits = build_cell(context.robot, context.scene, context.clock_ns).limits
         self.made = (0, 0.0)  # segment, and path parameter at its begin, rad, of the newest plan
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return whether the executor wants a trajectory that has not been made."""
-        status = read.status.value
+        status = self.status.message
         return (
-            status.wants in window(read.command.value) and (status.wants, status.begin) != self.made
+            status.wants in window(self.above.message) and (status.wants, status.begin) != self.made
         )
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Time the wanted segment, or give the reason why it cannot be timed."""
-        status = read.status.value
+        status = self.status.message
         self.made = status.wants, status.begin
-        write.clear()
-        write.segment, write.begin = self.made
+        self.output.clear()
+        self.output.segment, self.output.begin = self.made
         try:
-            path = read_segment(read.command.value, status.wants).path()
+            path = read_segment(self.above.message, status.wants).path()
         except ValueError as error:
-            write.error = Error.LIMIT
-            write.reason = str(error)
+            self.output.error = Error.LIMIT
+            self.output.reason = str(error)
             return
         sections = self.sections(path, status.begin)
-        write.count = len(sections) - 1
-        write.duration = sections[-1][0]
-        write.sections[: write.count] = sections[:-1]
+        self.output.count = len(sections) - 1
+        self.output.duration = sections[-1][0]
+        self.output.sections[: self.output.count] = sections[:-1]
         published = tick + (self.context.within_cycles + 1) * self.context.every
-        write.earliest = max(published * self.context.tick_s, status.ends) + write.duration
+        self.output.earliest = (
+            max(published * self.context.tick_s, status.ends) + self.output.duration
+        )
 
     def sections(
         self, path: BlendedPath, begin: float

@@ -6,8 +6,8 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.arm import SimulatedArm
-from rack.levels.level import Executor, Input, LevelContext, Ports
-from rack.levels.messages import ARM_STATE, JOINT_SET_POINT, SCENE, SERVO_PLAN, SERVO_STATUS
+from rack.levels.level import Executor, Input, LevelContext, Output
+from rack.levels.messages import ArmState, JointCommand, Scene, ServoPlan, ServoStatus
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo.control import Grip
@@ -27,12 +27,12 @@ class PdServo(Executor):
     """Drives every joint towards its newest set point; gains are scaled by the inertia of each
     joint."""
 
-    inputs = {
-        "command": Input(JOINT_SET_POINT, "above.command"),
-        "plan": Input(SERVO_PLAN, "own.plan"),
-        "before": Input(ARM_STATE, "own.state"),
-    }
-    outputs = {"status": SERVO_STATUS, "state": ARM_STATE, "scene": SCENE}
+    above = Input(JointCommand, "above.command")
+    plan = Input(ServoPlan, "own.plan")
+    before = Input(ArmState, "own.state")
+    status = Output(ServoStatus)
+    state = Output(ArmState)
+    scene = Output(Scene)
     params = Gains
 
     def __init__(self, context: LevelContext) -> None:
@@ -46,13 +46,13 @@ class PdServo(Executor):
         self.target = cell.home  # (joints,), rad
         self.target_velocity = self.rest  # rad/s
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Let the arm's time pass to `tick`, sense, drive, report."""
-        if self.arm.tick == 0 and read.before.is_there:
-            self.arm.restore(read.before.value)  # the board was restarted
+        if self.arm.tick == 0 and self.before.is_there:
+            self.arm.restore(self.before.message)  # the board was restarted
         self.arm.step(tick - self.arm.tick)
         sensed = self.arm.sense()
-        command = read.command.value
+        command = self.above.message
         holding = not command.due or tick > command.due + 4 * self.context.every
         if not holding:
             ahead_s = (tick - command.due) * self.context.tick_s
@@ -60,19 +60,19 @@ class PdServo(Executor):
             self.target_velocity = command.velocity
         error = self.target - sensed.position
         slip = self.target_velocity - sensed.velocity
-        load = Payload(read.plan.value.payload_mass, read.plan.value.payload_offset)
+        load = Payload(self.plan.message.payload_mass, self.plan.message.payload_offset)
         inertia, gravity = self.dynamics.terms(sensed.position, self.rest, load)
         torque = (
             inertia.diagonal() * (self.gains.stiffness * error + self.gains.damping * slip)
             + gravity
         )
-        if self.grip is not None and read.command.is_new:
+        if self.grip is not None and self.above.is_new:
             self.grip.take(command)
         force = (
             0.0 if self.grip is None else self.grip.force(sensed.opening, sensed.opening_velocity)
         )
         self.arm.drive(torque, force)
-        status = write.status
+        status = self.status
         status.echo = command.id
         status.operator = command.operator
         status.state = State.IDLE if holding else State.EXECUTING
@@ -84,5 +84,5 @@ class PdServo(Executor):
         status.target_velocity = self.rest if holding else self.target_velocity
         status.opening = sensed.opening
         status.opening_velocity = sensed.opening_velocity
-        self.arm.save(write.state)
-        self.arm.look(write.scene)
+        self.arm.save(self.state)
+        self.arm.look(self.scene)

@@ -32,7 +32,7 @@ def main(seconds: float | None = None) -> int:
         seen = 0
         while rack.watch(timeout_s=0.5):
             if (newest := servo.peek()).is_there:
-                joints = ", ".join(f"{q:6.3f}" for q in newest.value.position)
+                joints = ", ".join(f"{q:6.3f}" for q in newest.message.position)
                 print(f"tick {rack.segment.words[System.TICK]:6}  joints {joints} rad")
             for event in rack.events[seen:]:
                 if event.kind in SHOWN:

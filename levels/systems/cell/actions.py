@@ -11,15 +11,15 @@ from rack.backplane.message import Message
 from rack.levels.errors import ProgramError
 from rack.levels.level import LevelContext
 from rack.levels.operator import Goal
-from rack.levels.systems.cell.messages import ACTION_FIELDS, OrderAction
+from rack.levels.systems.cell.messages import CellAction, OrderAction
 from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, misfits
 
 _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 
 def write_action(action: AnyAction, message: Message) -> None:
-    """Fill the `ACTION_FIELDS` of a message; what the action lacks is zero."""
-    for field in ACTION_FIELDS:
+    """Fill the `CellAction` of a message; what the action lacks is zero."""
+    for field in CellAction.message_type.fields:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
     message.by = action.by or 0.0
     if isinstance(action, Transfer):
@@ -48,13 +48,13 @@ def write_action(action: AnyAction, message: Message) -> None:
 
 
 def copy_action(source: Message, target: Message) -> None:
-    """Copy the `ACTION_FIELDS` from one message to another."""
-    for field in ACTION_FIELDS:
+    """Copy the `CellAction` from one message to another."""
+    for field in CellAction.message_type.fields:
         target.record[field.name] = source.record[field.name]
 
 
 def read_action(message: Message, context: LevelContext) -> AnyAction:
-    """Return the action in the `ACTION_FIELDS` of a message. Raises `ProgramError`: it does not
+    """Return the action in the `CellAction` of a message. Raises `ProgramError`: it does not
     suit arm or scene."""
     try:
         action: AnyAction = _ACTION.validate_python({**_table(message), "by": message.by or None})

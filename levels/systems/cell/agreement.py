@@ -21,6 +21,7 @@ begin together, or not at all:
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 from rack.backplane.message import Message
 from rack.levels.level import Reading
@@ -52,7 +53,7 @@ class Agreement:
         self._margin_s = margin_s
         self._farewell_s = farewell_s
         self._arms = list(dict.fromkeys(arm for step in steps for arm in step))
-        self._answers: Mapping[str, Reading] = {}  # as of this cycle
+        self._answers: Mapping[str, Reading[Any]] = {}  # as of this cycle
         self._now_s = 0.0  # likewise, simulated time
         self.phase = Phase.AWAITING
         self.step = 0
@@ -101,7 +102,7 @@ class Agreement:
             return OrderVerb.END
         return VERBS[self.phase] if arm in self.partners else OrderVerb.NONE
 
-    def advance(self, answers: Mapping[str, Reading], now_s: float) -> None:
+    def advance(self, answers: Mapping[str, Reading[Any]], now_s: float) -> None:
         """Take one step forward, if the answers allow it; be over once every arm has confirmed the
         end, or had time to."""
         self._answers = answers
@@ -124,7 +125,7 @@ class Agreement:
         """Return the answers of these arms to the present order."""
         said = dict.fromkeys(arms, Response.NONE)
         for arm in arms:
-            answer = self._answers[arm].value
+            answer = self._answers[arm].message
             if (answer.program, answer.echo) == (self.program, self.order):
                 said[arm] = Response(answer.response)
         return said
@@ -136,7 +137,7 @@ class Agreement:
 
     def _await(self) -> None:
         """Go on once every arm reports, with the step that the reports show, or with the end."""
-        answers = [reading.value for reading in self._answers.values()]
+        answers = [reading.message for reading in self._answers.values()]
         ours = [answer for answer in answers if answer.program == self.program]
         ended = [answer for answer in ours if answer.response == Response.ENDED]
         newest = max([answer.echo for answer in ended or ours], default=0)
@@ -168,7 +169,7 @@ class Agreement:
             self.phase = Phase.DOING  # told so by a launch before this one
         elif all(r is Response.POSSIBLE for r in said.values()) and self._are_there(said):
             arrives_s = self._now_s + self._margin_s
-            times = [self._answers[arm].value.until for arm in said]
+            times = [self._answers[arm].message.until for arm in said]
             in_time = all(arrives_s <= until_s for until_s in times if until_s)
             self.phase = Phase.DOING if in_time else Phase.CANCELLING
 
@@ -202,7 +203,7 @@ class Agreement:
         """End the program if an arm has given one of these answers; return whether it has."""
         for arm, response in said.items():
             if response in kinds:
-                answer = self._answers[arm].value
+                answer = self._answers[arm].message
                 what = f"step {self.step} {response.name.lower()}: {arm}"
                 reason = f"{what}: {answer.reason}".removesuffix(": ")
                 self.end(Error(answer.error) or Error.GIVEN_UP, reason)

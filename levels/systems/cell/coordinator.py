@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints, ValidationError
 
-from rack.backplane.message import Message, MessageType, State, fill_counts
+from rack.backplane.message import Message, State, fill_counts
 from rack.levels.level import (
     Executor,
     Input,
@@ -17,19 +17,18 @@ from rack.levels.level import (
     MadePorts,
     Misfits,
     Output,
-    Ports,
     Program,
     Reading,
 )
-from rack.levels.messages import TASK_STATUS, Error
-from rack.levels.operator import HOLDABLE, MAX_JOINTS, OPERATOR_COMMAND, Orders
+from rack.levels.messages import Error, TaskStatus
+from rack.levels.operator import HOLDABLE, MAX_JOINTS, OperatorCommand, Orders
 from rack.levels.systems.cell.actions import write_action
 from rack.levels.systems.cell.agreement import Agreement
 from rack.levels.systems.cell.messages import (
-    CELL_ORDER,
-    CELL_PROGRESS,
-    CELL_REPORT,
     OBJECT_BYTES,
+    CellOrder,
+    CellProgress,
+    CellReport,
     MailboxName,
     OrderVerb,
     Phase,
@@ -148,13 +147,12 @@ class Coordinator(Executor):
     from when every arm has reported: anew with each launch of this rack.
     """
 
-    inputs = {
-        "last_progress": Input(CELL_PROGRESS, "own.progress"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
+    last_progress = Input(CellProgress, "own.progress")
+    operator = Input(OperatorCommand, "own.operator")
     # The progress first: a board killed before it has written its orders writes them when it is
     # back.
-    outputs = {"progress": CELL_PROGRESS, "status": TASK_STATUS}
+    progress = Output(CellProgress)
+    status = Output(TaskStatus)
     commands = HOLDABLE
     params = CoordinatorParams
     program = CellProgram
@@ -166,7 +164,7 @@ class Coordinator(Executor):
         self._steps = [step.actions for step in program.step]
         margin_s = 2.0 * context.period_s
         self._agreement = Agreement(program.checksum, self._steps, margin_s, self._table.farewell_s)
-        self._readings: Mapping[str, Reading] = {}  # of the arms' reports, in this cycle
+        self._readings: Mapping[str, Reading[Any]] = {}  # of the arms' reports, in this cycle
         self._operated = Orders(self.commands)
         self._started = False
         self._moves = 0  # moves of the steps done
@@ -174,14 +172,14 @@ class Coordinator(Executor):
         self._moved_at = 0  # tick of the last such change
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the orders and the report of each arm."""
         try:
             arms = CoordinatorParams.model_validate(params).arms
         except ValidationError:
             return MadePorts(is_whole=False)
-        reports = {f"report_{arm}": Input(CELL_REPORT, mailbox) for arm, mailbox in arms.items()}
-        return MadePorts(reports, {f"order_{arm}": Output(CELL_ORDER) for arm in arms})
+        reports = {f"report_{arm}": Input(CellReport, mailbox) for arm, mailbox in arms.items()}
+        return MadePorts(reports, {f"order_{arm}": Output(CellOrder) for arm in arms})
 
     @classmethod
     def misfits(
@@ -195,16 +193,16 @@ class Coordinator(Executor):
                     why = f"lacks '{action.arm}', the arm of task.step[{k}].do[{n}]"
                     yield "params.arms", ", ".join(known), why
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Read what the arms report, go on with the program, order what is next."""
         if not self._started:
             # Continue from the last progress in the mailbox, after a restart of the board.
             self._started = True
-            if read.last_progress.is_there:
-                self._agreement.recall(read.last_progress.value)
-                self._moves = read.last_progress.value.moves
-        self._operated.take(read.operator)
-        self._readings = {arm: getattr(read, f"report_{arm}") for arm in self._table.arms}
+            if self.last_progress.is_there:
+                self._agreement.recall(self.last_progress.message)
+                self._moves = self.last_progress.message.moves
+        self._operated.take(self.operator)
+        self._readings = {arm: self.ports[f"report_{arm}"] for arm in self._table.arms}
         held = self._reason_to_hold()
         if self._steps:
             agreement = self._agreement
@@ -217,15 +215,15 @@ class Coordinator(Executor):
         if self._steps:
             self._check_progress(waits, tick)
         for arm in self._table.arms:
-            self._order(arm, held, getattr(write, f"order_{arm}"))
-        self._agreement.write_to(write.progress)
-        fill_counts(write.progress.record[["moves"]], (self._moves,))
-        self._report(waits, write.status)
+            self._order(arm, held, self.ports[f"order_{arm}"])
+        self._agreement.write_to(self.progress)
+        fill_counts(self.progress.record[["moves"]], (self._moves,))
+        self._report(waits, self.status)
 
     def _moves_of_step(self) -> tuple[int, int]:
         """Return how many moves of the present step are done, of how many."""
         agreement = self._agreement
-        reports = [self._readings[arm].value for arm in agreement.partners]
+        reports = [self._readings[arm].message for arm in agreement.partners]
         mine = [r for r in reports if (r.program, r.echo) == (agreement.program, agreement.order)]
         return sum(r.moves_done for r in mine), sum(r.moves for r in mine)
 
@@ -250,7 +248,7 @@ class Coordinator(Executor):
                 if not reading.is_there:
                     return f"no report from {arm} yet"
         for arm in agreement.partners:
-            report = self._readings[arm].value
+            report = self._readings[arm].message
             if report.state == State.HOLDING:
                 return f"{arm}: {report.reason}"
         return ""
@@ -259,7 +257,7 @@ class Coordinator(Executor):
         """End the program when nothing has happened for too long, unless an operator keeps it from
         going on."""
         agreement = self._agreement
-        reports = [reading.value for reading in self._readings.values()]
+        reports = [reading.message for reading in self._readings.values()]
         operated = self._operated.stands or any(report.operated for report in reports)
         stage = (
             agreement.phase,

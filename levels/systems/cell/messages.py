@@ -9,10 +9,10 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Annotated
 
+import numpy as np
 from pydantic import StringConstraints
 
-from rack.backplane.message import Field, MessageType, command, status
-from rack.levels.fields import by_joint, flag, number, real, short_count
+from rack.backplane.message import Command, Message, Status, field
 from rack.levels.messages import OPERATED, Error
 from rack.levels.operator import MAX_JOINTS, Goal
 
@@ -65,96 +65,90 @@ class Phase(IntEnum):
     OVER = 5
 
 
-ACTION_FIELDS = (
-    Field("action", "u1", OrderAction, "what to do"),
-    Field("object", f"S{OBJECT_BYTES}", "ASCII", "object of a transfer"),
-    Field("goal", "u1", Goal, "form of a goto's goal: joints, pose or direction"),
-    real("position", "m", "where a transfer takes the object's origin, or a goto the tool", 3),
-    flag("turned", "1: a transfer turns the object to `yaw`; 0: any turn"),
-    real("yaw", "rad", "turn of the object's x axis about the vertical"),
-    real("lift", "m", "height of a transfer's straight motions"),
-    real("quaternion", "1", "of the tool, for goal pose", 4),
-    real("direction", "1", "of the tool's z axis, for goal direction", 3),
-    flag("count", "joints that follow"),
-    real("joints", "rad", "joint positions, for goal joints", MAX_JOINTS),
-    real("by", "s", "simulated time by which it must be done; 0: any time"),
-)
-"""An action; `by` is the time of the rack that wrote the message."""
+class CellAction(Message):
+    """An action, as in `[[task.action]]`; `by` is the time of the rack that wrote the message."""
 
-CELL_ORDER = command(
-    "cell_order",
-    1,
-    number("program", "checksum of the program that the order is of"),
-    Field("what", "u1", OrderVerb, "ask, do, cancel: all of the order `id`; end"),
-    flag("hold", "1: the arm rests on its path while it does an order"),
-    Field(
-        "reason",
-        "S120",
-        "ASCII",
-        "with `hold` why; with END why the program failed, empty: it is done",
-    ),
-    *ACTION_FIELDS,
-)
+    action: OrderAction = field(doc="what to do")
+    object: str = field(f"S{OBJECT_BYTES}", doc="object of a transfer")
+    goal: Goal = field(doc="form of a goto's goal: joints, pose or direction")
+    position: np.ndarray = field(
+        unit="m", doc="where a transfer takes the object's origin, or a goto the tool", shape=3
+    )
+    turned: bool = field(doc="1: a transfer turns the object to `yaw`; 0: any turn")
+    yaw: float = field(unit="rad", doc="turn of the object's x axis about the vertical")
+    lift: float = field(unit="m", doc="height of a transfer's straight motions")
+    quaternion: np.ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
+    direction: np.ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
+    count: int = field("u1", unit="1", doc="joints that follow")
+    joints: np.ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
+    by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
 
-CELL_REPORT = status(
-    "cell_report",
-    1,
-    number("program", "as in the order that is echoed"),
-    Field(
-        "response",
-        "u1",
-        Response,
-        "the answer to it; `reason`: of a refusal or failure, else of waiting",
-    ),
-    real(
-        "earliest",
-        "s",
-        "earliest end, simulated time of the rack that gave the order; 0: not known",
-    ),
-    real(
-        "until",
-        "s",
-        "in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time",
-    ),
-    short_count("moves_done", "elemental moves of the order done"),
-    short_count("moves", "elemental moves of the order; 0 before it begins"),
-    flag("halted", "1: moves were withdrawn, the arm is held until it begins another order"),
-    OPERATED,
-    errors=Error,
-)
 
-CELL_REQUEST = MessageType(
-    "cell_request",
-    1,
-    (
-        number("id", "serial of the plan wanted; 0: none yet"),
-        number("program", "as in the order that it serves"),
-        number("order", "that order"),
-        real("begin", "s", "simulated time at which it must be possible to begin; 0: at once"),
-        real(
-            "ahead",
-            "s",
-            "simulated time of the rack that gave the order, in which `by` is, less that here",
-        ),
-        number("revision", "of the world model then"),
-        by_joint("start", "rad", "where the arm rested then"),
-        *ACTION_FIELDS,
-    ),
-)
-"""From an ordered task level's executor to its planner."""
+class OrderHead(Command):
+    """What is said of an order, without its action."""
 
-CELL_PROGRESS = MessageType(
-    "cell_progress",
-    2,
-    (
-        Field("phase", "u1", Phase, "of the present step"),
-        short_count("step", "steps done"),
-        short_count("attempt", "times that the present step was asked for before"),
-        Field("error", "u2", Error, "why the program ends early; 0: it does not"),
-        Field("reason", "S120", "ASCII", "the error, readable"),
-        real("ending", "s", "simulated time since when the arms are ended; 0: not yet"),
-        real("begun", "s", "simulated time from which `by` counts; 0: not yet"),
-        short_count("moves", "elemental moves of the steps done"),
-    ),
-)
-"""A coordinator's memory, from which it continues after a restart of its board."""
+    program: int = field("u4", unit="1", doc="checksum of the program that the order is of")
+    what: OrderVerb = field(doc="ask, do, cancel: all of the order `id`; end")
+    hold: bool = field(doc="1: the arm rests on its path while it does an order")
+    reason: str = field(doc="with `hold` why; with END why the program failed, empty: it is done")
+
+
+class CellOrder(OrderHead, CellAction, version=1):
+    """From a coordinator to the task level of another rack."""
+
+
+class CellReport(Status, version=1):
+    """From a task level to the rack that orders its actions."""
+
+    error: Error = field("u2", doc="error code of the level; 0: none")
+    program: int = field("u4", unit="1", doc="as in the order that is echoed")
+    response: Response = field(
+        doc="the answer to it; `reason`: of a refusal or failure, else of waiting"
+    )
+    earliest: float = field(
+        unit="s", doc="earliest end, simulated time of the rack that gave the order; 0: not known"
+    )
+    until: float = field(
+        unit="s",
+        doc="in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time",
+    )
+    moves_done: int = field("u2", unit="1", doc="elemental moves of the order done")
+    moves: int = field("u2", unit="1", doc="elemental moves of the order; 0 before it begins")
+    halted: bool = field(
+        doc="1: moves were withdrawn, the arm is held until it begins another order"
+    )
+    operated: bool = OPERATED
+
+
+class RequestHead(Message):
+    """For what a plan is wanted, without the action."""
+
+    id: int = field("u4", unit="1", doc="serial of the plan wanted; 0: none yet")
+    program: int = field("u4", unit="1", doc="as in the order that it serves")
+    order: int = field("u4", unit="1", doc="that order")
+    begin: float = field(
+        unit="s", doc="simulated time at which it must be possible to begin; 0: at once"
+    )
+    ahead: float = field(
+        unit="s",
+        doc=("simulated time of the rack that gave the order, in which `by` is, less that here"),
+    )
+    revision: int = field("u4", unit="1", doc="of the world model then")
+    start: np.ndarray = field(unit="rad", doc="where the arm rested then", shape="joints")
+
+
+class CellRequest(RequestHead, CellAction, version=1):
+    """From an ordered task level's executor to its planner."""
+
+
+class CellProgress(Message, version=2):
+    """A coordinator's memory, from which it continues after a restart of its board."""
+
+    phase: Phase = field(doc="of the present step")
+    step: int = field("u2", unit="1", doc="steps done")
+    attempt: int = field("u2", unit="1", doc="times that the present step was asked for before")
+    error: Error = field("u2", doc="why the program ends early; 0: it does not")
+    reason: str = field(doc="the error, readable")
+    ending: float = field(unit="s", doc="simulated time since when the arms are ended; 0: not yet")
+    begun: float = field(unit="s", doc="simulated time from which `by` counts; 0: not yet")
+    moves: int = field("u2", unit="1", doc="elemental moves of the steps done")

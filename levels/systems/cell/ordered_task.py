@@ -11,18 +11,18 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import StringConstraints, ValidationError
 
-from rack.backplane.message import Message, MessageType, State, fill_counts
+from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.rack_name import RACK_NAME
 from rack.levels.errors import ProgramError, Refused
-from rack.levels.level import Input, LevelContext, MadePorts, Ports, Reading
-from rack.levels.messages import TASK_PLAN, WORLD_MODEL, Error
-from rack.levels.peer import PEER, peer_port
+from rack.levels.level import Input, LevelContext, MadePorts, Output, Reading
+from rack.levels.messages import Error, TaskPlan, WorldState
+from rack.levels.peer import PeerPresence, peer_port
 from rack.levels.systems.cell.actions import copy_action, read_action
 from rack.levels.systems.cell.agreement import TakenOrder
 from rack.levels.systems.cell.messages import (
-    CELL_ORDER,
-    CELL_REPORT,
-    CELL_REQUEST,
+    CellOrder,
+    CellReport,
+    CellRequest,
     MailboxName,
     Response,
 )
@@ -57,14 +57,12 @@ class OrderedTaskExecutor(TaskExecutor):
     says so, or when that stays away for `stalled_s`.
     """
 
-    inputs = {
-        **TaskExecutor.inputs,
-        "world": Input(WORLD_MODEL, "world.model"),
-        "last_request": Input(CELL_REQUEST, "own.request"),
-        "last_report": Input(CELL_REPORT, "own.report"),
-    }
+    world = Input(WorldState, "world.model")
+    last_request = Input(CellRequest, "own.request")
+    last_report = Input(CellReport, "own.report")
     # The report last: what it says has begun is in the status.
-    outputs = {**TaskExecutor.outputs, "request": CELL_REQUEST, "report": CELL_REPORT}
+    request = Output(CellRequest)
+    report = Output(CellReport)
     params = OrderedTaskParams
     program = None
 
@@ -85,55 +83,55 @@ class OrderedTaskExecutor(TaskExecutor):
         self._held = ""  # why the coordinator holds the arm
         self._waits = ""  # why an order cannot be planned yet
         self._is_end_reported = False
-        self._nothing = Message(TASK_PLAN.dtype(context.sizes))  # the plan of no order
+        self._nothing = TaskPlan.zeros(context.sizes)  # the plan of no order
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the mailboxes of the orders and, over the network, of the other rack's time."""
         try:
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
             return MadePorts(is_whole=False)
-        ports = {"order": Input(CELL_ORDER, table.orders)}
+        ports: dict[str, Input[Any]] = {"order": Input(CellOrder, table.orders)}
         if table.coordinator:
-            ports["peer"] = Input(PEER, f"lan.{peer_port(table.coordinator)}")
+            ports["peer"] = Input(PeerPresence, f"lan.{peer_port(table.coordinator)}")
         return MadePorts(ports)
 
     def _first_actions(self) -> tuple[AnyAction, ...]:
         return ()
 
-    def _recall(self, read: Ports, write: Ports) -> None:
-        super()._recall(read, write)
-        last = read.last_status.value
+    def _recall(self) -> None:
+        super()._recall()
+        last = self.last_status.message
         self._orders_begun = last.actions
         self._orders_done = last.action
         self._moves = last.moves_done, last.moves
-        if not read.last_report.is_there:
+        if not self.last_report.is_there:
             return
-        report: Message = read.last_report.value
-        write.report.copy_from(report)
-        write.request.copy_from(read.last_request.value)
+        report: Message = self.last_report.message
+        self.report.copy_from(report)
+        self.request.copy_from(self.last_request.message)
         self._taken = TakenOrder(report)
         self._halted = bool(report.halted)
         self._is_end_reported = self._taken.response is Response.ENDED
         if self._taken.is_under_way and report.moves:
-            self._begun = write.request.id
-            self._take_action(write.request)
+            self._begun = self.request.id
+            self._take_action(self.request)
 
-    def _plan_to_follow(self, read: Ports, write: Ports, tick: int) -> Message:
+    def _plan_to_follow(self, tick: int) -> Message:
         """Follow the orders; return the plan of the one under way."""
-        self._listen(read.order)
+        self._listen(self.ports["order"])
         self._waits = ""
         taken = self._taken
-        request = write.request
-        plan = read.plan.value
+        request = self.request
+        plan = self.plan.message
         if taken.is_asked:
-            self._answer_order(read, request, tick)
+            self._answer_order(request, tick)
         elif taken.is_under_way and not self._begun:
-            self._begin(read, request)
-        write.status.echo = plan.id if plan.id == request.id else 0
+            self._begin(request)
+        self.status.echo = plan.id if plan.id == request.id else 0
         # Report the earliest end, and how long a promise holds, in the coordinator's time.
-        report = write.report
+        report = self.report
         response = self._taken.response
         report.earliest = 0.0
         report.until = 0.0
@@ -141,13 +139,13 @@ class OrderedTaskExecutor(TaskExecutor):
             report.earliest = plan.earliest
         if response is Response.POSSIBLE and request.by:
             report.until = request.begin + request.ahead + request.by - plan.earliest
-        below = read.status.value
-        write.report.operated = below.operated or self._orders.stands
+        below = self.below.message
+        self.report.operated = below.operated or self._orders.stands
         return plan if self._begun and self._begun == plan.id else self._nothing
 
-    def _listen(self, reading: Reading) -> None:
+    def _listen(self, reading: Reading[Any]) -> None:
         """Take up what the coordinator says, or note why it says nothing."""
-        order: Message = reading.value
+        order: Message = reading.message
         self._held = self._absent = ""
         if not reading.is_there:
             self._absent = f"no orders from {self._source} yet"
@@ -163,9 +161,9 @@ class OrderedTaskExecutor(TaskExecutor):
                 self._reason = self._taken.reason
             self._absent = ""
 
-    def _answer_order(self, read: Ports, request: Message, tick: int) -> None:
+    def _answer_order(self, request: Message, tick: int) -> None:
         """Answer when the order is planned; have it planned as soon as the arm rests."""
-        plan = read.plan.value
+        plan = self.plan.message
         taken = self._taken
         if (request.program, request.order) == (taken.program, taken.order):
             if plan.id == request.id and not plan.error:
@@ -173,12 +171,12 @@ class OrderedTaskExecutor(TaskExecutor):
             elif plan.id == request.id:
                 taken.fail(Error(plan.error), plan.reason)
             return
-        self._waits = self._not_ready(read)
+        self._waits = self._not_ready()
         if self._waits:
             return
-        order = read.order.value
+        order = self.ports["order"].message
         # The coordinator's simulated time less that here.
-        ahead_s = float(read.peer.value.ahead) if self._table.coordinator else 0.0
+        ahead_s = float(self.ports["peer"].message.ahead) if self._table.coordinator else 0.0
         now_s = tick * self.context.tick_s
         try:
             action = read_action(order, self.context)
@@ -194,38 +192,38 @@ class OrderedTaskExecutor(TaskExecutor):
         request.ahead = ahead_s
         copy_action(order, request)
         planned_s = (self.context.within_cycles + 1) * self.context.period_s
-        self._request(read, request, now_s + planned_s + self._table.decision)
+        self._request(request, now_s + planned_s + self._table.decision)
 
-    def _request(self, read: Ports, request: Message, begin_s: float) -> None:
+    def _request(self, request: Message, begin_s: float) -> None:
         """Have the action in `request` planned, to begin at `begin_s`."""
         request.id += 1
         request.begin = begin_s
-        request.revision = read.world.value.revision
-        request.start = read.status.value.start
+        request.revision = self.world.message.revision
+        request.start = self.below.message.start
 
-    def _not_ready(self, read: Ports) -> str:
+    def _not_ready(self) -> str:
         """Return why nothing can be planned now; empty: it can."""
-        if self._orders.stands or not read.status.value.resting:
+        if self._orders.stands or not self.below.message.resting:
             return "the arm does not rest yet"
-        if not read.world.value.revision:
+        if not self.world.message.revision:
             return "the world model knows nothing yet"
-        if read.order.value.by and self._table.coordinator:
-            peer = read.peer
-            if not (peer.is_there and peer.value.uncertainty >= 0.0):
+        if self.ports["order"].message.by and self._table.coordinator:
+            peer = self.ports["peer"]
+            if not (peer.is_there and peer.message.uncertainty >= 0.0):
                 return f"the clock of {self._source} has not been compared yet"
         return ""
 
-    def _begin(self, read: Ports, request: Message) -> None:
+    def _begin(self, request: Message) -> None:
         """Begin with the plan that was promised; have it planned anew if the world has changed
         since."""
         if not self._actions:
             self._take_action(request)
-        strays = float(np.abs(read.status.value.start - request.start).max()) > MAX_STRAY_RAD
-        if request.begin and (strays or read.world.value.revision != request.revision):
-            self._waits = self._not_ready(read)
+        strays = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
+        if request.begin and (strays or self.world.message.revision != request.revision):
+            self._waits = self._not_ready()
             if not self._waits:
-                self._request(read, request, 0.0)
-        elif read.plan.value.id == request.id:
+                self._request(request, 0.0)
+        elif self.plan.message.id == request.id:
             self._begun = request.id
             self._done = 0
             self._halted = False
@@ -256,26 +254,26 @@ class OrderedTaskExecutor(TaskExecutor):
         until = super()._shown_until(plan)
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
-    def _reason_to_wait(self, below: Reading) -> str:
+    def _reason_to_wait(self, below: Reading[Any]) -> str:
         waits = super()._reason_to_wait(below)
         if self._orders.stands:
             return waits
         return self._absent or self._held or waits or self._waits
 
-    def _check_progress(self, plan: Message, read: Ports, waits: str, tick: int) -> None:
+    def _check_progress(self, plan: Message, waits: str, tick: int) -> None:
         # While the coordinator holds the arm, it also says for how long.
         if self._held:
             self._moved_at = tick
         else:
-            super()._check_progress(plan, read, waits, tick)
+            super()._check_progress(plan, waits, tick)
 
     def _stage(self) -> tuple[int, ...]:
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
-    def _report(self, plan: Message, waits: str, write: Ports) -> None:
-        report = write.report
-        status = write.status
-        echo = write.status.echo
+    def _report(self, plan: Message, waits: str) -> None:
+        report = self.report
+        status = self.status
+        echo = self.status.echo
         self._settle(plan)
         taken = self._taken
         if self._begun:
@@ -284,7 +282,7 @@ class OrderedTaskExecutor(TaskExecutor):
         elif (report.program, report.echo) != (taken.program, taken.order):
             report.moves_done = 0
             report.moves = 0
-        super()._report(plan, waits, write)
+        super()._report(plan, waits)
         status.echo = echo
         fill_counts(status.record[["action", "actions"]], (self._orders_done, self._orders_begun))
         status.moves_done, status.moves = self._moves
@@ -318,11 +316,11 @@ class OrderedTaskExecutor(TaskExecutor):
             taken.answer(Response.DONE)
             self._orders_done += 1
 
-    def _answer(self, below: Message, write: Ports) -> None:
-        super()._answer(below, write)
+    def _answer(self, below: Message) -> None:
+        super()._answer(below)
         is_held = self._taken.is_under_way and (self._absent or self._held)
         if not self._detour.move and (self._halted or self._rests or is_held):
-            write.command.hold = 1
+            self.command.hold = True
 
     def _state(self, plan: Message) -> State:
         if self._error:
@@ -336,7 +334,7 @@ class OrderedTaskExecutor(TaskExecutor):
 class OrderedTaskPlanner(TaskPlanner):
     """Plans what its executor requests: the action of an order, to begin later or at once."""
 
-    inputs = {**TaskPlanner.inputs, "request": Input(CELL_REQUEST, "own.request")}
+    request = Input(CellRequest, "own.request")
     params = OrderedTaskParams
     program = None
 
@@ -348,9 +346,9 @@ class OrderedTaskPlanner(TaskPlanner):
     def _first_program(self) -> TaskConfig:
         return TaskConfig()
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return whether a request is not answered yet, and the world is known and at rest."""
-        request: Message = read.request.value
+        request: Message = self.request.message
         if request.id not in (0, self._id):
             # Whoever requests it has found that it suits the arm.
             action = read_action(request, self.context)
@@ -359,7 +357,7 @@ class OrderedTaskPlanner(TaskPlanner):
             self._plan = None
             self._begin_s = request.begin
             self._ahead_s = request.ahead
-        return super().wanted(read, tick)
+        return super().wanted(tick)
 
     def _reason(self, refused: Refused) -> str:
         """Return why the order is refused; it is one action, without a number."""
@@ -368,9 +366,9 @@ class OrderedTaskPlanner(TaskPlanner):
     def _visible_s(self, tick: int) -> float:
         return max(super()._visible_s(tick), self._begin_s + self.context.period_s)
 
-    def _promise(self, moves: Sequence[Rehearsed], visible_s: float, write: Message) -> None:
-        super()._promise(moves, visible_s, write)
+    def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
+        super()._promise(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
-        write.earliest = (
+        self.output.earliest = (
             finish_times(unhurried, visible_s, self.context, self._needs)[-1] + self._ahead_s
         )

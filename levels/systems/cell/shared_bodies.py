@@ -21,9 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Field, Message, MessageType
+from rack.backplane.message import Message, field
 from rack.levels.algebra import Array
-from rack.levels.fields import flag, number
 
 MOST_SHARED = 4
 """Bodies that one rack shares, at most: the message has the same layout in every rack."""
@@ -32,34 +31,33 @@ MOST_CLAIMS = (1 << 32) - 1
 FARTHEST_M = 1e3
 """From the origin: the simulation gives up bodies that are farther away than it can count."""
 
-SHARED_BODY = MessageType(
-    "shared_body",
-    1,
-    (
-        Field("name", f"S{NAME_BYTES}", "ASCII", "body, by its name in the model; empty: none"),
-        number("claim", "number of the claim that stands, as far as this rack knows; 0: none yet"),
-        Field(
-            "owner",
-            f"S{NAME_BYTES}",
-            "ASCII",
-            "rack whose claim that is: its simulation moves the body",
-        ),
-        flag("touched", "1: the gripper of this rack touches it"),
-        Field(
-            "position", "f8", "m", "body origin in this rack's simulation", (3,), (0.0, FARTHEST_M)
-        ),
-        Field("quaternion", "f8", "1", "body orientation, likewise", (4,), (0.999, 1.001)),
-    ),
-)
 
-SHARED_BODIES = MessageType(
-    "shared_bodies",
-    1,
-    (
-        Field("rack", f"S{NAME_BYTES}", "ASCII", "rack that writes this"),
-        Field("bodies", SHARED_BODY, "", "the bodies that it shares", (MOST_SHARED,)),
-    ),
-)
+class SharedBodyEntry(Message, version=1, message="shared_body"):
+    """One body that several racks share."""
+
+    name: str = field(f"S{NAME_BYTES}", doc="body, by its name in the model; empty: none")
+    claim: int = field(
+        "u4",
+        unit="1",
+        doc="number of the claim that stands, as far as this rack knows; 0: none yet",
+    )
+    owner: str = field(
+        f"S{NAME_BYTES}", doc="rack whose claim that is: its simulation moves the body"
+    )
+    touched: bool = field(doc="1: the gripper of this rack touches it")
+    position: np.ndarray = field(
+        unit="m", doc="body origin in this rack's simulation", shape=3, length=(0.0, FARTHEST_M)
+    )
+    quaternion: np.ndarray = field(
+        unit="1", doc="body orientation, likewise", shape=4, length=(0.999, 1.001)
+    )
+
+
+class SharedBodies(Message, version=1):
+    """The bodies that a rack shares with others."""
+
+    rack: str = field(f"S{NAME_BYTES}", doc="rack that writes this")
+    bodies: np.ndarray = field(SharedBodyEntry, doc="the bodies that it shares", shape=MOST_SHARED)
 
 
 class Claim(NamedTuple):
@@ -114,7 +112,7 @@ class SharedBody:
             self.is_touched = bool(told["touched"])
 
     def show(self, record: np.void, pose: Array) -> None:
-        """Fill a `SHARED_BODY`; `pose` (7,) is that of the own simulation."""
+        """Fill a `SharedBodyEntry`; `pose` (7,) is that of the own simulation."""
         record["name"] = self.name
         record["touched"] = self.is_touched
         record["claim"] = self.claim.number

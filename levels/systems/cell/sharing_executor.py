@@ -8,18 +8,18 @@ from typing import cast
 from pydantic import Field, field_validator
 
 from rack.levels.arm.arm import find_arm
-from rack.levels.level import Input, LevelContext, Misfits, Output, Ports
+from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output
 from rack.levels.servo.control import ServoParams
 from rack.levels.servo.executor import ServoExecutor
 from rack.levels.systems.cell.shared_bodies import (
     MOST_SHARED,
     NAME_BYTES,
-    SHARED_BODIES,
+    SharedBodies,
     SharedBody,
 )
 from rack.levels.systems.cell.sharing_arm import SharingArm
 
-SHARED = Output(SHARED_BODIES, cycles=8)
+SHARED = Output(SharedBodies, cycles=8)
 """At 400 Hz 50 Hz: the fastest exchange between racks."""
 
 
@@ -49,12 +49,9 @@ class SharingServoExecutor(ServoExecutor):
     After a restart of its board it continues from its own last message.
     """
 
-    inputs = {
-        **ServoExecutor.inputs,
-        "others": Input(SHARED_BODIES, "lan.shared", many=True),
-        "last": Input(SHARED_BODIES, "own.shared"),
-    }
-    outputs = {**ServoExecutor.outputs, "shared": SHARED}
+    others = Inputs(SharedBodies, "lan.shared")
+    last = Input(SharedBodies, "own.shared")
+    shared = SHARED
     params = SharingServoParams
     arm: SharingArm
 
@@ -89,28 +86,28 @@ class SharingServoExecutor(ServoExecutor):
                 yield "params.shared", name, why
         yield from super().misfits(context, above, below)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Do the cycle of a servo level, and show the shared objects when it is due."""
-        if not self._started and read.last.is_there:
+        if not self._started and self.last.is_there:
             for body in self._shared.values():
-                body.recall(read.last.value)
-        super().process(read, write, tick)
+                body.recall(self.last.message)
+        super().process(tick)
         if SHARED.is_due(tick, self.context.every, self.context.phase):
-            write.shared.rack = self.context.rack
+            self.shared.rack = self.context.rack
             for slot, (row, body) in enumerate(self._shared.items()):
-                body.show(write.shared.bodies[slot], self.arm.pose(row))
+                body.show(self.shared.bodies[slot], self.arm.pose(row))
 
     def started(self) -> None:
         """Keep the grip, and the copies where the restored state has them."""
         super().started()
         self._keep()
 
-    def take_messages(self, read: Ports) -> None:
+    def take_messages(self) -> None:
         """Take over what is new, of other racks too."""
-        super().take_messages(read)
+        super().take_messages()
         for row, body in self._shared.items():
-            for other in read.others.values():
-                if other.is_new and (pose := body.hear(other.value)) is not None:
+            for other in self.others.values():
+                if other.is_new and (pose := body.hear(other.message)) is not None:
                     self.arm.place(row, pose)
             body.touch(self.arm.is_touched(row))
         self._keep()

@@ -8,14 +8,14 @@ import numpy as np
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
-from rack.levels.level import Finding, Input, LevelContext, Ports
+from rack.levels.level import Finding, Input, LevelContext, Output
 from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Cause, Reaction
 from rack.levels.systems.force.contact import HALVES, WristLevel
 from rack.levels.systems.force.contact_wrench import ContactWrench
-from rack.levels.systems.force.messages import WRENCH
+from rack.levels.systems.force.messages import Wrench
 from rack.levels.systems.joint_boards import ArmExecutor
 from rack.levels.tables import read_params
 
@@ -48,8 +48,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     is 2.6 N; their velocities would make 10 N of noise.)
     """
 
-    inputs = {**ArmExecutor.inputs, "felt": Input(WRENCH, "own.wrench")}
-    outputs = {**ArmExecutor.outputs, "wrench": WRENCH}
+    felt = Input(Wrench, "own.wrench")
+    wrench = Output(Wrench)
     params = ForceArmParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -72,12 +72,12 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
                 f"params.arm: class '{type(self.arm).__name__}' gives no sample of a wrist sensor"
             )
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
-        if self._since is None and read.felt.is_there:
-            self._exceeded = read.felt.value.exceeded
-        super().process(read, write, tick)
-        wrench = write.wrench
+        if self._since is None and self.felt.is_there:
+            self._exceeded = self.felt.message.exceeded
+        super().process(tick)
+        wrench = self.wrench
         contact = self.contact
         wrench.tick = tick
         wrench.saturated = contact.saturated

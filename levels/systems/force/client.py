@@ -25,9 +25,9 @@ from pydantic import ValidationError
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
-from rack.levels.level import Input, LevelContext, Misfits, Program
+from rack.levels.level import Input, LevelContext, Misfits, Output, Program
 from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
-from rack.levels.systems.force.messages import SERVER_REQUEST, SERVER_STATUS, Mode
+from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
 from rack.levels.systems.trajectory.messages import MotionKind
 from rack.levels.tables import Finite, Positive, RobotConfig, SceneConfig, Table, Vector
@@ -168,6 +168,12 @@ class ForceMotions(Motions):
         """End compliance and guards; done when the arm rests where it is."""
         return self._request(kind=MotionKind.COMPLY)
 
+    @property
+    def _status(self) -> ServerStatus:
+        """The newest status of the server."""
+        status: ServerStatus = self._bus.read("motion").message
+        return status
+
     def wrench(self) -> Mapping[str, float]:
         """Return the wrench of the tool on the surroundings, N, N m, by axis of the task frame."""
         values = self._status.wrench
@@ -213,8 +219,8 @@ class ForceMotions(Motions):
 class ForceClient(CommandEnvironment):
     """Runs a script that commands forces and motions by name; a prompt offers the same names."""
 
-    inputs = {"motion": Input(SERVER_STATUS, "below.motion")}
-    outputs = {"requests": SERVER_REQUEST}
+    motion = Input(ServerStatus, "below.motion")
+    requests = Output(ServerRequest)
     program = ForceProgram
 
     def motions(self, bus: Bus) -> Motions:

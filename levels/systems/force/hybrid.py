@@ -3,12 +3,14 @@ that servo joints."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array, Mask, norm
-from rack.levels.level import Input, LevelContext, Output, Ports, Reading
+from rack.levels.level import Input, Inputs, LevelContext, Output, Reading
 from rack.levels.operator import ABOVE_LOST
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
@@ -17,8 +19,8 @@ from rack.levels.servo import curves, reference
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.force.contact import AXIS_NAMES, HALVES, WristLevel
 from rack.levels.systems.force.hybrid_law import ForceTask, HybridGains, HybridLaw, turned
-from rack.levels.systems.force.messages import AXES, COMPLIANCE, FORCE_STATUS, WRENCH
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.force.messages import AXES, Compliance, ForceStatus, Wrench
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.tables import read_params
 
@@ -46,50 +48,50 @@ class ComplianceWatch:
         self.rests = False  # the motion must end
         self.reason = ""  # why, or why the force wanted is another; empty: all is as commanded
 
-    def recall(self, last: Reading) -> None:
-        """Continue after a restart from the last `FORCE_STATUS`: a guard strikes once."""
+    def recall(self, last: Reading[Any]) -> None:
+        """Continue after a restart from the last `ForceStatus`: a guard strikes once."""
         if last.is_there:
-            self.struck = last.value.struck
-            self.axis = last.value.axis
+            self.struck = last.message.struck
+            self.axis = last.message.axis
 
-    def look(self, read: Ports, tick: int) -> None:
+    def look(
+        self,
+        compliance: Reading[Compliance],
+        wrench: Reading[Wrench],
+        above_is_lost: bool,
+        tick: int,
+    ) -> None:
         """Judge the commands and the wrench of this cycle."""
-        compliance = read.compliance.value
-        wrench = read.wrench
+        wanted = compliance.message
         self.task = None
         self.rests = False
         self.reason = ""
-        self.sensed = wrench.value.tick if wrench.is_there else -1
-        reason = objection(compliance) if compliance.active else ""
-        rotation = (
-            rotation_of(compliance.frame) if compliance.frame.any() and not reason else np.eye(3)
-        )
-        self.felt = turned(rotation.T, wrench.value.wrench)
+        self.sensed = wrench.message.tick if wrench.is_there else -1
+        reason = objection(wanted) if wanted.active else ""
+        rotation = rotation_of(wanted.frame) if wanted.frame.any() and not reason else np.eye(3)
+        self.felt = turned(rotation.T, wrench.message.wrench)
         if reason:
             self._rest(reason)
-        elif compliance.active:
-            self._follow(read, rotation, tick)
-
-    def _follow(self, read: Ports, rotation: Array, tick: int) -> None:
-        """Do what the command says, as far as the contact is known and the level above is there."""
-        blind = self._blind(read.wrench, tick)
-        if blind or read.command.is_lost or read.compliance.is_lost:
-            self._rest(blind or ABOVE_LOST)
-        self._take(read.compliance.value, rotation)
-        if not blind:
-            self._guard(read.compliance.value)
+        elif wanted.active:
+            # Do what the command says, as far as the contact is known and the level above is there.
+            blind = self._blind(wrench, tick)
+            if blind or above_is_lost or compliance.is_lost:
+                self._rest(blind or ABOVE_LOST)
+            self._take(wanted, rotation)
+            if not blind:
+                self._guard(wanted)
 
     def _rest(self, reason: str) -> None:
         self.rests = True
         self.reason = reason
 
-    def _blind(self, wrench: Reading, tick: int) -> str:
+    def _blind(self, wrench: Reading[Any], tick: int) -> str:
         """Return why the contact is not known; empty: it is."""
         if not wrench.is_there or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"
         if tick - self.sensed > self._oldest:
             return f"wrench is stale, {tick - self.sensed} ticks: waiting for the board of the arm"
-        return "the wrist sensor is at the end of its range" if wrench.value.saturated else ""
+        return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
 
     def _take(self, compliance: Message, rotation: Array) -> None:
         """Take over the axes of force; those forces are not sought while the motion must end."""
@@ -159,18 +161,14 @@ class HybridExecutor(WristLevel):
     the distance that force has left.
     """
 
-    inputs = {
-        "command": Input(JOINT_REFERENCE, "above.command"),
-        "compliance": Input(COMPLIANCE, "above.compliance"),
-        "wrench": Input(WRENCH, "arm.wrench"),
-        "statuses": Input(JOINT_STATUS, "below.status", many=True),
-        "last_force": Input(FORCE_STATUS, "own.force"),
-    }
-    outputs = {
-        "command": JOINT_REFERENCE,
-        "status": Output(JOINT_STATUS, rests_on="statuses"),
-        "force": Output(FORCE_STATUS, rests_on="wrench"),
-    }
+    above = Input(JointReference, "above.command")
+    compliance = Input(Compliance, "above.compliance")
+    wrench = Input(Wrench, "arm.wrench")
+    statuses = Inputs(JointStatus, "below.status")
+    last_force = Input(ForceStatus, "own.force")
+    command = Output(JointReference, rests_on=above)
+    status = Output(JointStatus, rests_on=statuses)
+    force = Output(ForceStatus, rests_on=wrench)
     params = HybridGains
     preloads = (curves, dynamics, reference)
 
@@ -188,38 +186,38 @@ class HybridExecutor(WristLevel):
         self._still = np.zeros(len(cell.home))
         self._tick: int | None = None  # of the last cycle
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Follow references and forces; report."""
         if self._tick is None:
-            self._watch.recall(read.last_force)
+            self._watch.recall(self.last_force)
             self._tick = tick - self.context.every
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
-        if self._boards.update(read.statuses):
+        if self._boards.update(self.statuses):
             self._begin(self._boards.position, tick)
-        if read.command.is_new:
-            self._reference.take(read.command.value)
-        self._watch.look(read, tick)
-        write.command.id = tick // self.context.every + 1
+        if self.above.is_new:
+            self._reference.take(self.above.message)
+        self._watch.look(self.compliance, self.wrench, self.above.is_lost, tick)
+        self.command.id = tick // self.context.every + 1
         for name in PASSED:
-            setattr(write.command, name, getattr(read.command.value, name))
+            setattr(self.command, name, getattr(self.above.message, name))
         if self._boards.in_step:
-            self._move(write.command, tick, passed_s)
+            self._move(self.command, tick, passed_s)
         else:
-            write.command.due = 0
+            self.command.due = 0
             self._moving[:] = 0.0
-        self._report(read, write.status)
-        force = write.force
+        self._report(self.status)
+        force = self.force
         watch = self._watch
-        force.echo = read.compliance.value.id
-        force.operator = read.compliance.value.operator
+        force.echo = self.compliance.message.id
+        force.operator = self.compliance.message.operator
         force.sensed = watch.sensed
         force.wrench = watch.felt
         force.offset = self._law.offset
         force.struck = watch.struck
         force.axis = watch.axis
-        force.wanted = 0.0 if watch.task is None else watch.task.wanted
-        force.selected = 0 if watch.task is None else watch.task.selected
+        force.wanted = np.zeros(AXES) if watch.task is None else watch.task.wanted
+        force.selected = np.zeros(AXES) if watch.task is None else watch.task.selected
         resting = State.IDLE if watch.task is None else State.EXECUTING
         force.state = State.HOLDING if watch.reason else resting
         force.reason = watch.reason
@@ -245,19 +243,19 @@ class HybridExecutor(WristLevel):
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
             self._begin(self._target, tick)
 
-    def _report(self, read: Ports, status: Message) -> None:
+    def _report(self, status: Message) -> None:
         """Show the boards below as one, whose set points are those of this level."""
-        values = [reading.value for reading in read.statuses.values()]
+        values = [reading.message for reading in self.statuses.values()]
         status.position = values[0].position
         status.torque = sum(v.torque for v in values)
         status.driven = np.any([v.driven for v in values], axis=0)
         status.target = self._target
         status.target_velocity = self._moving
-        status.echo = read.command.value.id
+        status.echo = self.above.message.id
         status.operator = max(v.operator for v in values)
         status.holding = self._reference.holding
         status.stopped = not self._boards.in_step
-        status.due = read.command.value.due
+        status.due = self.above.message.due
         worst = max(values, key=lambda value: value.error)
         kept = self._watch.reason if self._boards.in_step else self._boards.awaited
         status.error = worst.error

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.level import Input, LevelContext, Output, Ports
+from rack.levels.level import Input, LevelContext, Output
 from rack.levels.messages import Error
 from rack.levels.systems.force.contact import (
     AXIS_NAMES,
@@ -19,12 +19,12 @@ from rack.levels.systems.force.contact import (
     misfit,
 )
 from rack.levels.systems.force.messages import (
-    COMPLIANCE,
-    FORCE_STATUS,
-    SERVER_REQUEST,
-    SERVER_STATE,
-    SERVER_STATUS,
+    Compliance,
+    ForceStatus,
     Mode,
+    ServerRequest,
+    ServerState,
+    ServerStatus,
 )
 from rack.levels.systems.trajectory import TrajectoryExecutor
 from rack.levels.systems.trajectory.boards import JointBoards
@@ -59,7 +59,7 @@ class ServerParams(TrajectoryParams):
 
 
 class ServerWork(RequestWork):
-    """Begins and ends compliance, and judges contacts: see `SERVER_REQUEST`.
+    """Begins and ends compliance, and judges contacts: see `ServerRequest`.
 
     Motion begins anew from where the arm is when axes cease to be of force, or are others: the
     boards below come to rest and hold, and fall into step again.
@@ -73,7 +73,7 @@ class ServerWork(RequestWork):
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         super().__init__(agenda, motion, tools)
         self.contact = Contact()
-        # FORCE_STATUS that answers the contact in force; None: none does yet.
+        # ForceStatus that answers the contact in force; None: none does yet.
         self.force: Message | None = None
         self.guarded = 0  # newest request that a guard has ended
         self.axis = -1  # of that guard
@@ -204,20 +204,14 @@ class ForceServer(WristLevel, TrajectoryExecutor):
     CANCEL.
     """
 
-    inputs = {
-        **TrajectoryExecutor.inputs,
-        "requests": Input(SERVER_REQUEST, "above.requests"),
-        "force": Input(FORCE_STATUS, "below.force"),
-        "last_status": Input(SERVER_STATUS, "own.status"),
-        "last_state": Input(SERVER_STATE, "own.state"),
-        "last_compliance": Input(COMPLIANCE, "own.compliance"),
-    }
-    outputs = {
-        **TrajectoryExecutor.outputs,
-        "status": Output(SERVER_STATUS, rests_on="boards"),
-        "state": SERVER_STATE,
-        "compliance": COMPLIANCE,
-    }
+    requests = Input(ServerRequest, "above.requests")
+    force = Input(ForceStatus, "below.force")
+    last_status = Input(ServerStatus, "own.status")
+    last_state = Input(ServerState, "own.state")
+    last_compliance = Input(Compliance, "own.compliance")
+    status = Output(ServerStatus, rests_on=TrajectoryExecutor.boards)
+    state = Output(ServerState)
+    compliance = Output(Compliance)
     params = ServerParams
     work = ServerWork
     _work: ServerWork
@@ -235,15 +229,15 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         self._since = 0  # tick since when
         self._sensed = np.array(context.robot.home)  # (joints,), rad
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Take requests, look at client and contact, go on with the motion."""
         self._now = tick
-        if self._heard < 0 or read.requests.is_new:
+        if self._heard < 0 or self.requests.is_new:
             self._heard = tick
-        super().process(read, write, tick)
-        self._work.contact.fill(write.compliance)
-        write.compliance.operator = write.command.operator
-        self._show(write.status)
+        super().process(tick)
+        self._work.contact.fill(self.compliance)
+        self.compliance.operator = self.command.operator
+        self._show(self.status)
 
     @property
     def mode(self) -> Mode:
@@ -252,27 +246,27 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             return self._without
         return Mode.FORCE if self._work.contact.complies else Mode.MOTION
 
-    def _recall(self, read: Ports) -> None:
-        super()._recall(read)
-        if read.last_compliance.is_there and read.last_status.is_there:
-            self._work.contact.recall(read.last_compliance.value)
-            status = read.last_status.value
+    def _recall(self) -> None:
+        super()._recall()
+        if self.last_compliance.is_there and self.last_status.is_there:
+            self._work.contact.recall(self.last_compliance.message)
+            status = self.last_status.message
             self._work.guarded = status.guarded
             self._work.axis = status.axis
             self._without = Mode(status.mode)
             self._since = self._now
 
-    def _follow_boards(self, read: Ports) -> None:
-        super()._follow_boards(read)
-        for below in read.boards.values():
+    def _follow_boards(self) -> None:
+        super()._follow_boards()
+        for below in self.boards.values():
             if below.is_there:
-                self._sensed = below.value.position
+                self._sensed = below.message.position
         # Take over the newest contact; a guard that was struck ends the request under way.
-        status = read.force.value
+        status = self.force.message
         work = self._work
         answers = (
-            read.force.is_there
-            and not read.force.is_lost
+            self.force.is_there
+            and not self.force.is_lost
             and status.echo == work.contact.id
             and status.sensed >= 0
         )

@@ -4,6 +4,7 @@ them."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +15,24 @@ from rack.levels.algebra import Array
 from rack.levels.arm import substeps
 from rack.levels.arm.above import CommandsAbove
 from rack.levels.faults import TendonStep
-from rack.levels.level import Executor, Fault, Finding, Input, LevelContext, Misfits, Ports, Reading
-from rack.levels.messages import ARM_STATE, Error
-from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.level import (
+    Executor,
+    Fault,
+    Finding,
+    Input,
+    Inputs,
+    LevelContext,
+    Misfits,
+    Output,
+    Reading,
+)
+from rack.levels.messages import ArmState, Error
+from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
 from rack.levels.servo.driver import SCENES
-from rack.levels.systems.hand.messages import HAND_STATUS, TENSION_COMMAND
+from rack.levels.systems.hand.messages import HandStatus, TensionCommand
 from rack.levels.systems.hand.simulated import HandSample, SimulatedHand
 from rack.levels.tables import Table
 
@@ -40,12 +51,12 @@ class HandExecutor(Executor):
     when all boards above have seen it, with what these want then.
     """
 
-    inputs = {
-        "tensions": Input(TENSION_COMMAND, "above.command", many=True),
-        "before": Input(ARM_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"status": HAND_STATUS, "state": ARM_STATE, "scene": SCENES}
+    tensions = Inputs(TensionCommand, "above.command")
+    before = Input(ArmState, "own.state")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(HandStatus)
+    state = Output(ArmState)
+    scene = SCENES
     commands = HOLDABLE
     params = Table
     faults = (TendonStep,)
@@ -58,7 +69,7 @@ class HandExecutor(Executor):
         self.hand = SimulatedHand(
             cell, context.scene, context.clock_ns, context.every, context.seed
         )
-        self.tensions = Tensions(context, cell.hand, cell.patience)
+        self.wanted_tensions = Tensions(context, cell.hand, cell.patience)
         self.orders = Orders(self.commands)
         self._started = False  # the first cycle has begun
         # Tick of the first status that said so; None: the valves are open.
@@ -106,37 +117,37 @@ class HandExecutor(Executor):
                 self._torn[place] = True
         self.hand.tear(torn)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
         hand = self.hand
         # Advance the hand to tick. A restarted board first restores it.
         if not self._started:
             self._started = True
-            if read.before.is_there:
-                self.hand.restore(read.before.value)
+            if self.before.is_there:
+                self.hand.restore(self.before.message)
                 self._opened = True
             self._closed_at = tick
         self.hand.step(tick - self.hand.tick)
         if self.hand.braked and self._closed_at is None:  # no tensions came in time
             self._closed_at = tick
-        self.orders.take(read.operator)
+        self.orders.take(self.operator)
         sample = hand.sense()
         self.findings += self._slack.look(sample.tension, hand.wanted)
         self.acted |= self._torn
-        self._drive(read, tick)
-        self._report(write.status, sample, tick)
-        self.orders.report(write.status, self.tensions.rests_on)
-        hand.save(write.state)
+        self._drive(tick)
+        self._report(self.status, sample, tick)
+        self.orders.report(self.status, self.wanted_tensions.rests_on)
+        hand.save(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
-            hand.look(write.scene)
+            hand.look(self.scene)
 
-    def _drive(self, read: Ports, tick: int) -> None:
+    def _drive(self, tick: int) -> None:
         """Give the valves the tensions of the boards above, or close them and say why."""
         since = self._closed_at if self._opened else 0
-        self._waiting = self.tensions.missing(read.tensions, tick, since or 0)
+        self._waiting = self.wanted_tensions.missing(self.tensions, tick, since or 0)
         if not self._waiting:
-            self.tensions.join(read.tensions)
-            found, self._waiting = self.tensions.check()
+            self.wanted_tensions.join(self.tensions)
+            found, self._waiting = self.wanted_tensions.check()
             if found is not None:
                 self.hand.refuse(found)
         held = self.orders.holds
@@ -153,7 +164,7 @@ class HandExecutor(Executor):
         else:
             self._closed_at = None
             self._opened = True
-            self.hand.pull(self.tensions.tension)
+            self.hand.pull(self.wanted_tensions.tension)
 
     def _report(self, status: Message, sample: HandSample, tick: int) -> None:
         """Fill the status."""
@@ -226,7 +237,7 @@ kept them."""
 
 
 class Tensions(CommandsAbove):
-    """Joins the `TENSION_COMMAND`s of the boards above, each for the joints that it drives."""
+    """Joins the `TensionCommand`s of the boards above, each for the joints that it drives."""
 
     def __init__(self, context: LevelContext, hand: Hand, patience: MotorPatience) -> None:
         # A tension takes a cycle of its board, and one of the board that gave that the torque.
@@ -238,11 +249,11 @@ class Tensions(CommandsAbove):
         self.tension = np.zeros((2, len(hand.most)))  # N
         self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
 
-    def join(self, tensions: Mapping[str, Reading]) -> None:
+    def join(self, tensions: Mapping[str, Reading[Any]]) -> None:
         """Set `tension` and `rests_on`, while nothing is `missing`."""
         self.rests_on = 0
         for board in self.oldest:
-            value = tensions[board].value
+            value = tensions[board].message
             self.rests_on = max(self.rests_on, value.operator)
             np.copyto(self.tension, value.tension, where=value.driven != 0)
 

@@ -11,9 +11,9 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Ports, Reading
-from rack.levels.messages import WORLD_MODEL, Error
-from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
+from rack.levels.messages import Error, WorldState
+from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import cell_of
 from rack.levels.systems.hand.grasp_program import (
@@ -29,11 +29,11 @@ from rack.levels.systems.hand.grasp_steps import WORKS, FingersBelow, Grasp, Gra
 from rack.levels.systems.hand.grip import HandGrip
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import (
-    FINGER_STATUS,
-    GRASP_PLAN,
-    GRASP_STATUS,
-    GRASP_TARGET,
+    FingerStatus,
     GraspKind,
+    GraspPlan,
+    GraspStatus,
+    GraspTarget,
 )
 from rack.levels.tables import read_params
 
@@ -52,18 +52,14 @@ class GraspExecutor(Executor):
     the newest plan. After a restart it continues from its own last messages.
     """
 
-    inputs = {
-        "fingers": Input(FINGER_STATUS, "below.status", many=True),
-        "world": Input(WORLD_MODEL, "world.model"),
-        "plan": Input(GRASP_PLAN, "above.plan", many=True, optional=True),
-        "last_command": Input(GRASP_TARGET, "own.command"),
-        "last_status": Input(GRASP_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {
-        "command": Output(GRASP_TARGET, rests_on="fingers"),
-        "status": Output(GRASP_STATUS, rests_on="fingers"),
-    }
+    fingers = Inputs(FingerStatus, "below.status")
+    world = Input(WorldState, "world.model")
+    plan = Inputs(GraspPlan, "above.plan", optional=True)
+    last_command = Input(GraspTarget, "own.command")
+    last_status = Input(GraspStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(GraspTarget, rests_on=fingers)
+    status = Output(GraspStatus, rests_on=fingers)
     commands = HOLDABLE
     params = GraspParams
     program = GraspProgram
@@ -86,7 +82,7 @@ class GraspExecutor(Executor):
             postures={name: self._posture(given) for name, given in self._program.posture.items()},
             period_s=context.period_s,
             fingers=FingersBelow(context, kinematics.joints),
-            target=Message(GRASP_TARGET.dtype(context.sizes)),
+            target=GraspTarget.zeros(context.sizes),
             grip=HandGrip(params, np.full(len(names), False), self._opposing, context.period_s),
             touching=np.full(len(names), False),
         )
@@ -95,7 +91,7 @@ class GraspExecutor(Executor):
         self._passed_s = 0.0  # since the step under way began, without waiting
         self._waited_s = 0.0  # in a row, other than for an operator
         self._failed = Refused(Error.NONE, "")
-        self._plan = Message(GRASP_PLAN.dtype(context.sizes))  # in use; id 0: none
+        self._plan = GraspPlan.zeros(context.sizes)  # in use; id 0: none
         self._started = False  # the first cycle has begun
 
     @classmethod
@@ -122,24 +118,24 @@ class GraspExecutor(Executor):
         if not above and any(isinstance(step, CloseStep) and not step.points for step in steps):
             yield "above", [], "a step 'close' without points needs a planner of grasps there"
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Look at fingers and object, go on with the step under way, write what is wanted,
         report."""
         grasp = self._grasp
-        self._orders.take(read.operator)
-        grasp.fingers.look(read.fingers)
-        if read.world.value.revision:
+        self._orders.take(self.operator)
+        grasp.fingers.look(self.fingers)
+        if self.world.message.revision:
             # Find the object in the world model.
             close = self._closing()
             if close is not None:
                 row = self._row(close)
                 self._grasp.object = self._from_world @ Pose(
-                    read.world.value.position[row], read.world.value.quaternion[row]
+                    self.world.message.position[row], self.world.message.quaternion[row]
                 )
         if not self._started:
             self._started = True
-            self._recall(read)
-        waits = self._waits(read)
+            self._recall()
+        waits = self._waits()
         # Fail when something has kept the program for too long.
         is_over = self._done == len(self._program.step) or self._orders.holds
         self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
@@ -148,13 +144,13 @@ class GraspExecutor(Executor):
                 Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}"
             )
         if not waits and not self._failed.code and self._done < len(self._program.step):
-            self._go_on(read)
+            self._go_on()
         if waits or self._failed.code:
             grasp.target.velocity = grasp.target.tip_velocity = 0.0
         grasp.target.id += 1
         grasp.target.operator = self._orders.basis
-        write.command.copy_from(grasp.target)
-        self._report(write.status, waits)
+        self.command.copy_from(grasp.target)
+        self._report(self.status, waits)
 
     def _row(self, close: CloseStep) -> int:
         return self.context.scene.objects.index(close.object)
@@ -175,33 +171,33 @@ class GraspExecutor(Executor):
         steps = self._program.step[: self._done + 1]
         return next((step for step in reversed(steps) if isinstance(step, CloseStep)), None)
 
-    def _waits(self, read: Ports) -> str:
+    def _waits(self) -> str:
         """Return why the step under way does not go on; empty: it does."""
         if self._grasp.fingers.awaited:
             return self._grasp.fingers.awaited
         if self._orders.holds:
             self._orders.done()
             return self._orders.keeps(self.context.board)
-        if read.world.is_lost or (self._closing() is not None and self._grasp.object is None):
+        if self.world.is_lost or (self._closing() is not None and self._grasp.object is None):
             return NO_WORLD
-        if read.plan and not self._newest(read.plan).id and self._awaits_plan():
-            return NO_PLAN.format(", ".join(read.plan))
+        if self.plan and not self._newest(self.plan).id and self._awaits_plan():
+            return NO_PLAN.format(", ".join(self.plan))
         return ""
 
     @staticmethod
-    def _newest(plans: Mapping[str, Reading]) -> Message:
-        return max((reading.value for reading in plans.values()), key=lambda plan: plan.id)
+    def _newest(plans: Mapping[str, Reading[GraspPlan]]) -> GraspPlan:
+        return max((reading.message for reading in plans.values()), key=lambda plan: plan.id)
 
     def _awaits_plan(self) -> bool:
         """Return whether the step under way is to be planned: a CLOSE, or a PRESHAPE before it."""
         kinds = [type(step) for step in self._program.step[self._done : self._done + 2]]
         return kinds[:1] == [CloseStep] or kinds == [PreshapeStep, CloseStep]
 
-    def _go_on(self, read: Ports) -> None:
+    def _go_on(self) -> None:
         """Begin the step under way, or go on with it."""
         if self._work is None:
-            if read.plan and self._awaits_plan() and not self._passed_s:
-                self._plan.copy_from(self._newest(read.plan))
+            if self.plan and self._awaits_plan() and not self._passed_s:
+                self._plan.copy_from(self._newest(self.plan))
             self._begin()
         assert self._work is not None
         try:
@@ -259,17 +255,17 @@ class GraspExecutor(Executor):
             return step.model_copy(update={"posture": PLANNED})
         return step
 
-    def _recall(self, read: Ports) -> None:
+    def _recall(self) -> None:
         """Continue after a restart, from the level's own last messages."""
-        if not (read.last_status.is_there and read.last_command.is_there):
+        if not (self.last_status.is_there and self.last_command.is_there):
             return
-        status = read.last_status.value
+        status = self.last_status.message
         grasp = self._grasp
-        grasp.target.copy_from(read.last_command.value)
+        grasp.target.copy_from(self.last_command.message)
         self._done = status.step
         self._passed_s = status.passed
-        if status.plan and read.plan:
-            self._plan.copy_from(self._newest(read.plan))
+        if status.plan and self.plan:
+            self._plan.copy_from(self._newest(self.plan))
         for index in range(min(self._done + 1, len(self._program.step))):
             step = self._prepared(index)
             if isinstance(step, CloseStep):

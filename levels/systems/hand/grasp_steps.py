@@ -54,12 +54,12 @@ class FingersBelow:
         self.error = Error.NONE  # of the hand
         self.rests_on = 0  # newest command of an operator that all boards rest on
 
-    def look(self, statuses: Mapping[str, Reading]) -> None:
+    def look(self, statuses: Mapping[str, Reading[Any]]) -> None:
         """Read the statuses of all boards."""
         self.awaited = ""
         self.error = Error.NONE
         for board, reading in statuses.items():
-            status = reading.value
+            status = reading.message
             if reading.is_lost or not reading.is_there:
                 self.awaited = f"no status from '{board}': waiting for its board"
                 continue
@@ -72,7 +72,7 @@ class FingersBelow:
                 self.target[own] = status.target[own]
                 self.tip[finger] = status.tip[finger]
                 self.force[finger] = status.force[finger]
-        self.rests_on = min(reading.value.operator for reading in statuses.values())
+        self.rests_on = min(reading.message.operator for reading in statuses.values())
 
 
 class GraspParams(GripGains):

@@ -9,13 +9,20 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Mask
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
-from rack.levels.operator import BELOW_LOST, HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Reading
+from rack.levels.operator import (
+    BELOW_LOST,
+    HOLDABLE,
+    OperatorCommand,
+    Orders,
+    RelayedCommand,
+)
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.hand import Hand
@@ -30,13 +37,13 @@ from rack.levels.systems.hand.laws import (
     TendonLaw,
 )
 from rack.levels.systems.hand.messages import (
-    FINGER_STATUS,
-    FINGER_TARGET,
-    GRASP_TARGET,
-    HAND_STATUS,
-    LOOP_STATUS,
-    TENDON_TORQUE,
-    TENSION_COMMAND,
+    FingerStatus,
+    FingerTarget,
+    GraspTarget,
+    HandStatus,
+    LoopStatus,
+    TendonTorque,
+    TensionCommand,
 )
 from rack.levels.tables import read_params
 
@@ -50,21 +57,28 @@ class HandLoop(Executor):
 
     Without a fresh command it keeps what was commanded last, at rest: what the hand holds, it goes
     on holding. So it does on an operator's hold. A command that is not finite is not taken. A
-    subclass has the ports "command", "hand", "operator" and, unless the hand is below it, "below".
+    subclass has the ports "above", "command", "status", "hand", "operator" and, unless the hand is
+    below it, "below".
     """
 
     commands = HOLDABLE
+    above: Reading[RelayedCommand]
+    below: Reading[LoopStatus]
+    hand: Reading[HandStatus]
+    operator: Reading[OperatorCommand]
+    command: RelayedCommand
+    status: LoopStatus | FingerStatus
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.cell = cell_of(context)
         assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
-        self.hand: Hand = self.cell.hand
+        self.hand_model: Hand = self.cell.hand
         self.orders = Orders(self.commands)
-        command = self.inputs["command"].type
-        self.command = Message(command.dtype(context.sizes))  # that is followed
+        command = self.inputs["above"].message
+        self.followed = command.zeros(context.sizes)  # that is followed
         # Names of its fields that must be finite.
-        self._numbers = [field.name for field in command.fields if field.kind == "f8"]
+        self._numbers = [field.name for field in command.message_type.fields if field.kind == "f8"]
         self.commanded = False  # there was one
         # (joints,) or (fingers,), as in the status: those of this board.
         self.driven: Mask
@@ -90,21 +104,21 @@ class HandLoop(Executor):
                 yield place, [], "it needs a board there"
 
     @abstractmethod
-    def meet(self, read: Ports, hand: Message) -> None:
-        """Begin with the first `HAND_STATUS`, or continue from the level's own last messages."""
+    def meet(self, hand: Message) -> None:
+        """Begin with the first `HandStatus`, or continue from the level's own last messages."""
 
     @abstractmethod
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
-        """Write the level's command for `self.command`, and what its status says of fingers or
+    def follow(self, hand: Message, tick: int) -> None:
+        """Write the level's command for `self.followed`, and what its status says of fingers or
         joints."""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Follow the newest command, and report."""
-        hand: Reading = read.hand
-        self.orders.take(read.operator)
+        hand: Reading[Any] = self.hand
+        self.orders.take(self.operator)
         if not self._met:
             if not hand.is_there:
-                status = write.status
+                status = self.status
                 status.driven = self.driven
                 status.sensed = -1
                 status.holding = True
@@ -112,17 +126,17 @@ class HandLoop(Executor):
                 status.reason = NO_HAND_YET
                 return
             self._met = True
-            self.meet(read, hand.value)
-        self._take(read.command, tick)
-        kept = self._kept(read, tick)
-        self.follow(hand.value, write, tick)
-        write.command.id += 1
-        write.command.operator = self.orders.rests_on(self.command.operator)
-        self._report(read, write.status, kept)
-        self.orders.report(write.status, self.command.operator)
+            self.meet(hand.message)
+        self._take(self.above, tick)
+        kept = self._kept(tick)
+        self.follow(hand.message, tick)
+        self.command.id += 1
+        self.command.operator = self.orders.rests_on(self.followed.operator)
+        self._report(self.status, kept)
+        self.orders.report(self.status, self.followed.operator)
 
     def age_s(self, hand: Message, tick: int) -> float:
-        """Return how old the sample of a `HAND_STATUS` is when what this cycle commands acts, s."""
+        """Return how old the sample of a `HandStatus` is when what this cycle commands acts, s."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )
@@ -132,50 +146,50 @@ class HandLoop(Executor):
         the level above."""
         return min(tick - self._taken, self._period) * self.context.tick_s
 
-    def _take(self, command: Reading, tick: int) -> None:
+    def _take(self, command: Reading[Any], tick: int) -> None:
         """Follow what is new, unless an operator holds the loop."""
         released = self._held
         self._held = self.orders.holds
         if self._held:
             for name in self._numbers:
                 if name.endswith("velocity"):  # what is commanded is kept at rest
-                    setattr(self.command, name, 0.0)
+                    setattr(self.followed, name, 0.0)
             self.orders.done()
         elif command.is_new or (released and command.is_there):
             wrong = [
                 name
                 for name in self._numbers
-                if not np.isfinite(getattr(command.value, name)).all()
+                if not np.isfinite(getattr(command.message, name)).all()
             ]
             self._rejected = (
                 f"rejected: {wrong[0]} commanded by '{self._above}' is not finite" if wrong else ""
             )
             if not wrong:
-                self.command.copy_from(command.value)
+                self.followed.copy_from(command.message)
                 self.commanded = True
                 self._taken = tick
 
-    def _kept(self, read: Ports, tick: int) -> str:
+    def _kept(self, tick: int) -> str:
         """Return why the hand does not follow the level above; empty: it does."""
-        hand = read.hand.value
-        if read.hand.is_lost or tick - hand.tick > self._oldest:
+        hand = self.hand.message
+        if self.hand.is_lost or tick - hand.tick > self._oldest:
             return HAND_LOST
         if hand.stopped:
             return f"hand: {hand.reason}"
         if "below" in self.inputs:
-            below = read.below
+            below = self.below
             if below.is_lost or not below.is_there:
                 return BELOW_LOST
-            if below.value.stopped:
-                return str(below.value.reason)
+            if below.message.stopped:
+                return str(below.message.reason)
         return self.orders.keeps(self.context.board)
 
-    def _report(self, read: Ports, status: Message, kept: str) -> None:
+    def _report(self, status: Message, kept: str) -> None:
         """Fill the status."""
-        hand = read.hand.value
-        lost = self.commanded and read.command.is_lost
+        hand = self.hand.message
+        lost = self.commanded and self.above.is_lost
         status.sensed = hand.tick
-        status.echo = self.command.id
+        status.echo = self.followed.id
         note = kept or self._rejected
         if lost and not note:
             note = f"no command from '{self._above}': its last one is kept"
@@ -198,32 +212,31 @@ class FingertipLoop(HandLoop):
     A restarted board continues from the targets that it gave last.
     """
 
-    inputs = {
-        "command": Input(GRASP_TARGET, "above.command"),
-        "hand": Input(HAND_STATUS, "hand.status"),
-        "below": Input(LOOP_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-        "last": Input(FINGER_TARGET, "own.command"),
-    }
-    outputs = {"command": FINGER_TARGET, "status": FINGER_STATUS}
+    above = Input(GraspTarget, "above.command")
+    hand = Input(HandStatus, "hand.status")
+    below = Input(LoopStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    last = Input(FingerTarget, "own.command")
+    command = Output(FingerTarget, rests_on=above)
+    status = Output(FingerStatus)
     params = FingertipGains
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self.driven = np.full(len(self.hand.names), True)
-        kinematics = FingerKinematics(self.cell, self.hand)
+        self.driven = np.full(len(self.hand_model.names), True)
+        kinematics = FingerKinematics(self.cell, self.hand_model)
         gains = read_params(FingertipGains, context.params)
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Begin where the joints are, or with the last targets."""
-        last = read.last.value
-        begin = last if read.last.is_there and last.active else hand
+        last = self.last.message
+        begin = last if self.last.is_there and last.active else hand
         self._law.start(begin.position)
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the targets of the joints."""
-        follow_grasp(self, self._law, hand, write.command, write.status, tick)
+        follow_grasp(self, self._law, hand, self.command, self.status, tick)
 
 
 class JointLoop(HandLoop):
@@ -233,13 +246,12 @@ class JointLoop(HandLoop):
     See `JointLaw`.
     """
 
-    inputs = {
-        "command": Input(FINGER_TARGET, "above.command"),
-        "hand": Input(HAND_STATUS, "hand.status"),
-        "below": Input(LOOP_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": TENDON_TORQUE, "status": LOOP_STATUS}
+    above = Input(FingerTarget, "above.command")
+    hand = Input(HandStatus, "hand.status")
+    below = Input(LoopStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TendonTorque, rests_on=above)
+    status = Output(LoopStatus)
     params = JointGains
     preloads = (dynamics, laws)
 
@@ -248,18 +260,18 @@ class JointLoop(HandLoop):
         self.driven = np.full(len(context.robot.joints), True)
         self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Hold the joints where they are, until there are targets."""
-        self.command.position = hand.position
-        self.command.stiff = 1.0
+        self.followed.position = hand.position
+        self.followed.stiff = 1.0
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the torques for the newest targets."""
         self._law.torques(
-            hand, self.command, self.age_s(hand, tick), self.ahead_s(tick), write.command.torque
+            hand, self.followed, self.age_s(hand, tick), self.ahead_s(tick), self.command.torque
         )
-        write.command.sampled = hand.tick
-        write.status.clipped = self._law.clipped
+        self.command.sampled = hand.tick
+        self.status.clipped = self._law.clipped
 
 
 class TendonLoop(HandLoop):
@@ -269,12 +281,11 @@ class TendonLoop(HandLoop):
     notices a joint loop that is gone, too.
     """
 
-    inputs = {
-        "command": Input(TENDON_TORQUE, "above.command"),
-        "hand": Input(HAND_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": TENSION_COMMAND, "status": LOOP_STATUS}
+    above = Input(TendonTorque, "above.command")
+    hand = Input(HandStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TensionCommand, rests_on=above)
+    status = Output(LoopStatus)
     params = TendonGains
     preloads = (laws,)
 
@@ -282,20 +293,20 @@ class TendonLoop(HandLoop):
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
         gains = read_params(TendonGains, context.params)
-        self._law = TendonLaw(self.hand, self.driven, gains, context)
+        self._law = TendonLaw(self.hand_model, self.driven, gains, context)
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Begin with the tensions that are there."""
         self._law.start(hand)
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the tensions for the newest torques."""
-        command = write.command
+        command = self.command
         command.driven = self.driven
-        command.sampled = min(hand.tick, self.command.sampled) if self.commanded else -1
+        command.sampled = min(hand.tick, self.followed.sampled) if self.commanded else -1
         if command.sampled >= 0:
-            self._law.tensions(hand, self.command.torque, command.tension)
-        write.status.clipped = self._law.clipped
+            self._law.tensions(hand, self.followed.torque, command.tension)
+        self.status.clipped = self._law.clipped
 
 
 class FingerParams(FingertipGains, JointGains, TendonGains):
@@ -313,19 +324,18 @@ class FingerExecutor(HandLoop):
     loop.
     """
 
-    inputs = {
-        "command": Input(GRASP_TARGET, "above.command"),
-        "hand": Input(HAND_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": TENSION_COMMAND, "status": FINGER_STATUS}
+    above = Input(GraspTarget, "above.command")
+    hand = Input(HandStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TensionCommand, rests_on=above)
+    status = Output(FingerStatus)
     params = FingerParams
     preloads = (dynamics, laws)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         params = read_params(FingerParams, context.params)
-        hand = self.hand
+        hand = self.hand_model
         finger = hand.names.index(params.finger)
         self.driven = np.arange(len(hand.names)) == finger
         self._joints = hand.fingers[finger]
@@ -334,7 +344,7 @@ class FingerExecutor(HandLoop):
         )
         self._servo = JointLaw(self.cell, self._joints, params)
         self._tendons = TendonLaw(hand, self._joints, params, context)
-        self._target = Message(FINGER_TARGET.dtype(context.sizes))
+        self._target = FingerTarget.zeros(context.sizes)
         self._torque = np.zeros(len(self._joints))
 
     @classmethod
@@ -349,31 +359,31 @@ class FingerExecutor(HandLoop):
         if hand is not None and name not in (names := [finger.name for finger in hand.finger]):
             yield "params.finger", name, f"the hand has no such finger; fingers: {', '.join(names)}"
 
-    def meet(self, read: Ports, hand: Message) -> None:
+    def meet(self, hand: Message) -> None:
         """Hold the joints where they are."""
         self._tip.start(hand.position)
         self._tendons.start(hand)
         self._target.position = hand.position
         self._target.stiff = 1.0
 
-    def follow(self, hand: Message, write: Ports, tick: int) -> None:
+    def follow(self, hand: Message, tick: int) -> None:
         """Write the tensions of the finger's tendons."""
-        follow_grasp(self, self._tip, hand, self._target, write.status, tick)
+        follow_grasp(self, self._tip, hand, self._target, self.status, tick)
         self._servo.torques(hand, self._target, self.age_s(hand, tick), 0.0, self._torque)
-        self._tendons.tensions(hand, self._torque, write.command.tension)
-        write.command.driven = self._joints
-        write.command.sampled = hand.tick
+        self._tendons.tensions(hand, self._torque, self.command.tension)
+        self.command.driven = self._joints
+        self.command.sampled = hand.tick
 
 
 def follow_grasp(
     loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int
 ) -> None:
-    """Fill a `FINGER_TARGET` for the `GRASP_TARGET` that a loop follows, and the
-    `FINGER_STATUS`."""
+    """Fill a `FingerTarget` for the `GraspTarget` that a loop follows, and the
+    `FingerStatus`."""
     status.tip = law.sense(hand.position)
-    target.active = loop.command.active
-    if loop.command.active:
-        law.targets(loop.command, loop.ahead_s(tick), target)
+    target.active = loop.followed.active
+    if loop.followed.active:
+        law.targets(loop.followed, loop.ahead_s(tick), target)
     status.position = hand.position
     status.target = law.wanted
     status.force[loop.driven] = hand.force[loop.driven]

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Field, command, status
+import numpy as np
+
+from rack.backplane.message import field
 from rack.backplane.words import Demand
-from rack.levels.fields import by_joint, flag, number, real, row, short_count, tick
-from rack.levels.operator import ANSWER, RESTS_ON
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 FLEXOR = 0
 EXTENSOR = 1
@@ -42,153 +43,186 @@ class GraspKind(IntEnum):
     RELEASE = 6  # tips let go and withdraw
 
 
-MOTION = (
-    by_joint("position", "rad", "joint positions"),
-    by_joint("velocity", "rad/s", "joint velocities"),
-)
-DRIVEN = flag("driven", "1: the joint is one of this board's", "joints")
-SENSED = tick("sensed", "tick of the hand's status that it rests on; -1: none yet")
+DRIVEN = field("u1", unit="1", doc="1: the joint is one of this board's", shape="joints")
+SENSED = field(unit="tick", doc="tick of the hand's status that it rests on; -1: none yet")
 
-TENSION_COMMAND = command(
-    "tension_command",
-    1,
-    RESTS_ON,
-    tick("sampled", "tick of the hand's status that it rests on; -1: none yet, so no tension"),
-    real("tension", "N", "of the tendons of the board's own joints", 2, "joints"),
-    DRIVEN,
-)
-"""From the boards of tendon loops to the board of the hand."""
 
-HAND_STATUS = status(
-    "hand_status",
-    1,
-    *ANSWER,
-    tick("tick", "tick at which the hand was sensed"),
-    *MOTION,
-    by_joint("torque", "N m", "of the tendons on the joints"),
-    real("tension", "N", "of the tendons, as sensed", 2, "joints"),
-    real("wanted", "N", "tensions commanded of the valves", 2, "joints"),
-    real("force", "N", "of the surroundings on the fingertips, as sensed", "fingers", 3),
-    flag("holding", "1: no fresh tensions: the valves are closed"),
-    flag("stopped", "1: tensions are not followed: a demand, an operator, or a lost board"),
-    Field("demand", "u1", Demand, "stop that the rack's safety demands in this cycle"),
-    number("clipped", "cycles in which a tension was cut to its limits"),
-    number("touches", "unintended contacts, counted at every substep"),
-    number("violations", "substeps in which a tendon drove a joint beyond a limit"),
-    number("pushed", "substeps in which a blow pushed a joint beyond a limit"),
-)
-"""From the board of the hand: 16 angles and 32 tensions of the Utah/MIT hand."""
+class TensionCommand(RelayedCommand, version=1):
+    """From the boards of tendon loops to the board of the hand."""
 
-TENDON_TORQUE = command(
-    "tendon_torque",
-    1,
-    RESTS_ON,
-    tick("sampled", "tick of the hand's status that it rests on; -1: none yet"),
-    by_joint("torque", "N m", "of the joints"),
-)
-"""From the joint loop to the tendon loop."""
+    sampled: int = field(
+        unit="tick", doc="tick of the hand's status that it rests on; -1: none yet, so no tension"
+    )
+    tension: np.ndarray = field(
+        unit="N", doc="of the tendons of the board's own joints", shape=(2, "joints")
+    )
+    driven: np.ndarray = DRIVEN
 
-FINGER_TARGET = command(
-    "finger_target",
-    1,
-    RESTS_ON,
-    flag("active", "0: no target yet, hold"),
-    *MOTION,
-    by_joint(
-        "stiff", "1", "part of the joint loop's stiffness that acts, 0 to 1; its damping acts"
-    ),
-    by_joint("torque", "N m", "in addition: of the forces of tips"),
-    real(
-        "spring",
-        "N m/rad",
-        "in addition: stiffness of tips, by joint and joint",
-        "joints",
-        "joints",
-    ),
-)
-"""From the fingertip loop to the joint loop."""
 
-GRASP_TARGET = command(
-    "grasp_target",
-    1,
-    RESTS_ON,
-    flag("active", "0: no target yet, hold"),
-    Field("mode", "u1", FingerMode, "how each finger is controlled", ("fingers",)),
-    by_joint("position", "rad", "joint positions, for JOINTS"),
-    by_joint("velocity", "rad/s", "joint velocities, for JOINTS"),
-    real("tip", "m", "points of the tips, for POINT and FORCE", "fingers", 3),
-    real("tip_velocity", "m/s", "their velocities", "fingers", 3),
-    real("stiffness", "N/m", "of each tip about its point, for FORCE", "fingers"),
-    real("force", "N", "of each tip on the surroundings, at its point, for FORCE", "fingers", 3),
-)
-"""From the grasp loop to the fingertip loop, or to the boards of fingers."""
+class HandStatus(AnsweringStatus, version=1):
+    """From the board of the hand: 16 angles and 32 tensions of the Utah/MIT hand."""
 
-LOOP_STATUS = status(
-    "loop_status",
-    1,
-    *ANSWER,
-    DRIVEN,
-    SENSED,
-    number("clipped", "cycles in which a torque was cut to what tendons can give"),
-    flag("holding", "1: no fresh command from above: what was commanded last is kept"),
-    flag(
-        "stopped",
-        "1: commands are not followed: the hand is stopped, or an operator holds the loop",
-    ),
-)
-"""From the tendon loop to the joint loop, and from that to the fingertip loop."""
+    tick: int = field(unit="tick", doc="tick at which the hand was sensed")
+    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
+    torque: np.ndarray = field(unit="N m", doc="of the tendons on the joints", shape="joints")
+    tension: np.ndarray = field(unit="N", doc="of the tendons, as sensed", shape=(2, "joints"))
+    wanted: np.ndarray = field(
+        unit="N", doc="tensions commanded of the valves", shape=(2, "joints")
+    )
+    force: np.ndarray = field(
+        unit="N", doc="of the surroundings on the fingertips, as sensed", shape=("fingers", 3)
+    )
+    holding: bool = field(doc="1: no fresh tensions: the valves are closed")
+    stopped: bool = field(
+        doc="1: tensions are not followed: a demand, an operator, or a lost board"
+    )
+    demand: Demand = field(doc="stop that the rack's safety demands in this cycle")
+    clipped: int = field("u4", unit="1", doc="cycles in which a tension was cut to its limits")
+    touches: int = field("u4", unit="1", doc="unintended contacts, counted at every substep")
+    violations: int = field(
+        "u4", unit="1", doc="substeps in which a tendon drove a joint beyond a limit"
+    )
+    pushed: int = field(
+        "u4", unit="1", doc="substeps in which a blow pushed a joint beyond a limit"
+    )
 
-FINGER_STATUS = status(
-    "finger_status",
-    1,
-    *ANSWER,
-    flag("driven", "1: the finger is one of this board's", "fingers"),
-    SENSED,
-    by_joint("position", "rad", "joint positions, from the hand's status"),
-    by_joint("target", "rad", "joint positions wanted"),
-    real("tip", "m", "points of the tips", "fingers", 3),
-    real("force", "N", "of the surroundings on the tips", "fingers", 3),
-    flag("holding", "1: no fresh target: the fingers stay"),
-    flag(
-        "stopped", "1: targets are not followed: the hand is stopped, or an operator holds a loop"
-    ),
-)
-"""From the fingertip loop, or from a board that runs all loops of a finger, to the grasp loop."""
 
-GRASP_STATUS = status(
-    "grasp_status",
-    1,
-    *ANSWER,
-    short_count("step", "steps of the program that are done"),
-    short_count("steps", "steps of the program"),
-    Field("kind", "u1", GraspKind, "of the step under way"),
-    real("passed", "s", "time for which that step is under way"),
-    row("object", "row of the object grasped, in the world model; -1: none"),
-    flag("touching", "1: the finger touches the object", "fingers"),
-    real("grip", "N", "internal force of the finger that opposes the others; they share it"),
-    real("load", "N", "that the grasp makes up for: weight and pull", 3),
-    real("anchor", "m", "where the object is to be", 3),
-    real("moved", "m", "distance of the object from there"),
-    real("farthest", "m", "largest such distance since the object was gripped"),
-    number("plan", "id of the grasp plan in use; 0: none"),
-)
-"""From the grasp loop. Points and forces are in the frame of the palm."""
+class TendonTorque(RelayedCommand, version=1):
+    """From the joint loop to the tendon loop."""
 
-GRASP_PLAN = command(
-    "grasp_plan",
-    1,
-    RESTS_ON,
-    row("object", "row of the object in the world model"),
-    tick("sensed", "tick of the world model that it rests on"),
-    by_joint("posture", "rad", "joint positions from which the fingers close"),
-    real(
-        "contact", "m", "of each tip, on the object's surface, in the object's frame", "fingers", 3
-    ),
-    real("normal", "1", "direction of each tip's force there, in the object's frame", "fingers", 3),
-    real("grip", "N", "force of each finger; the opposing one bears their sum"),
-)
-"""From a planner, on a board or on the host side, to the grasp loop: where the fingers take hold of
-an object, and from which posture they close. The newest with an `id` above 0 counts."""
+    sampled: int = field(
+        unit="tick", doc="tick of the hand's status that it rests on; -1: none yet"
+    )
+    torque: np.ndarray = field(unit="N m", doc="of the joints", shape="joints")
 
-STREAMED_DOWN = (TENSION_COMMAND.name, TENDON_TORQUE.name, FINGER_TARGET.name, GRASP_TARGET.name)
+
+class FingerTarget(RelayedCommand, version=1):
+    """From the fingertip loop to the joint loop."""
+
+    active: bool = field(doc="0: no target yet, hold")
+    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
+    stiff: np.ndarray = field(
+        unit="1",
+        doc="part of the joint loop's stiffness that acts, 0 to 1; its damping acts",
+        shape="joints",
+    )
+    torque: np.ndarray = field(unit="N m", doc="in addition: of the forces of tips", shape="joints")
+    spring: np.ndarray = field(
+        unit="N m/rad",
+        doc="in addition: stiffness of tips, by joint and joint",
+        shape=("joints", "joints"),
+    )
+
+
+class GraspTarget(RelayedCommand, version=1):
+    """From the grasp loop to the fingertip loop, or to the boards of fingers."""
+
+    active: bool = field(doc="0: no target yet, hold")
+    mode: np.ndarray = field(
+        "u1", unit=FingerMode, doc="how each finger is controlled", shape="fingers"
+    )
+    position: np.ndarray = field(unit="rad", doc="joint positions, for JOINTS", shape="joints")
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities, for JOINTS", shape="joints")
+    tip: np.ndarray = field(
+        unit="m", doc="points of the tips, for POINT and FORCE", shape=("fingers", 3)
+    )
+    tip_velocity: np.ndarray = field(unit="m/s", doc="their velocities", shape=("fingers", 3))
+    stiffness: np.ndarray = field(
+        unit="N/m", doc="of each tip about its point, for FORCE", shape="fingers"
+    )
+    force: np.ndarray = field(
+        unit="N",
+        doc="of each tip on the surroundings, at its point, for FORCE",
+        shape=("fingers", 3),
+    )
+
+
+class LoopStatus(AnsweringStatus, version=1):
+    """From the tendon loop to the joint loop, and from that to the fingertip loop."""
+
+    driven: np.ndarray = DRIVEN
+    sensed: int = SENSED
+    clipped: int = field(
+        "u4", unit="1", doc="cycles in which a torque was cut to what tendons can give"
+    )
+    holding: bool = field(doc="1: no fresh command from above: what was commanded last is kept")
+    stopped: bool = field(
+        doc="1: commands are not followed: the hand is stopped, or an operator holds the loop"
+    )
+
+
+class FingerStatus(AnsweringStatus, version=1):
+    """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp
+    loop."""
+
+    driven: np.ndarray = field(
+        "u1", unit="1", doc="1: the finger is one of this board's", shape="fingers"
+    )
+    sensed: int = SENSED
+    position: np.ndarray = field(
+        unit="rad", doc="joint positions, from the hand's status", shape="joints"
+    )
+    target: np.ndarray = field(unit="rad", doc="joint positions wanted", shape="joints")
+    tip: np.ndarray = field(unit="m", doc="points of the tips", shape=("fingers", 3))
+    force: np.ndarray = field(unit="N", doc="of the surroundings on the tips", shape=("fingers", 3))
+    holding: bool = field(doc="1: no fresh target: the fingers stay")
+    stopped: bool = field(
+        doc="1: targets are not followed: the hand is stopped, or an operator holds a loop"
+    )
+
+
+class GraspStatus(AnsweringStatus, version=1):
+    """From the grasp loop. Points and forces are in the frame of the palm."""
+
+    step: int = field("u2", unit="1", doc="steps of the program that are done")
+    steps: int = field("u2", unit="1", doc="steps of the program")
+    kind: GraspKind = field(doc="of the step under way")
+    passed: float = field(unit="s", doc="time for which that step is under way")
+    object: int = field(
+        "i2", unit="1", doc="row of the object grasped, in the world model; -1: none"
+    )
+    touching: np.ndarray = field(
+        "u1", unit="1", doc="1: the finger touches the object", shape="fingers"
+    )
+    grip: float = field(
+        unit="N", doc="internal force of the finger that opposes the others; they share it"
+    )
+    load: np.ndarray = field(unit="N", doc="that the grasp makes up for: weight and pull", shape=3)
+    anchor: np.ndarray = field(unit="m", doc="where the object is to be", shape=3)
+    moved: float = field(unit="m", doc="distance of the object from there")
+    farthest: float = field(unit="m", doc="largest such distance since the object was gripped")
+    plan: int = field("u4", unit="1", doc="id of the grasp plan in use; 0: none")
+
+
+class GraspPlan(RelayedCommand, version=1):
+    """From a planner, on a board or on the host side, to the grasp loop: where the fingers take
+    hold of
+    an object, and from which posture they close. The newest with an `id` above 0 counts."""
+
+    object: int = field("i2", unit="1", doc="row of the object in the world model")
+    sensed: int = field(unit="tick", doc="tick of the world model that it rests on")
+    posture: np.ndarray = field(
+        unit="rad", doc="joint positions from which the fingers close", shape="joints"
+    )
+    contact: np.ndarray = field(
+        unit="m",
+        doc="of each tip, on the object's surface, in the object's frame",
+        shape=("fingers", 3),
+    )
+    normal: np.ndarray = field(
+        unit="1",
+        doc="direction of each tip's force there, in the object's frame",
+        shape=("fingers", 3),
+    )
+    grip: float = field(unit="N", doc="force of each finger; the opposing one bears their sum")
+
+
+STREAMED_DOWN = (
+    TensionCommand.message_type.name,
+    TendonTorque.message_type.name,
+    FingerTarget.message_type.name,
+    GraspTarget.message_type.name,
+)
 """Names of commands that change in every cycle."""

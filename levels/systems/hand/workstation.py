@@ -28,11 +28,11 @@ from rack.backplane.words import Block
 from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input, LevelContext
-from rack.levels.messages import WORLD_MODEL
+from rack.levels.level import Input, LevelContext, Output
+from rack.levels.messages import WorldState
 from rack.levels.robot.cell import Cell, cell_of
 from rack.levels.systems.hand.kinematics import FingerKinematics
-from rack.levels.systems.hand.messages import GRASP_PLAN, GRASP_STATUS, GraspKind
+from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
 from rack.levels.tables import NotNegative, Positive, Table, read_params
 
 LINES = 72
@@ -218,11 +218,9 @@ class WorkstationParams(Table):
 class Workstation(HostProgram):
     """Plans a grasp of one object, and plans again if the object moves before it is held."""
 
-    inputs = {
-        "world": Input(WORLD_MODEL, "below.world"),
-        "grasp": Input(GRASP_STATUS, "below.grasp"),
-    }
-    outputs = {"plan": GRASP_PLAN}
+    world = Input(WorldState, "below.world")
+    grasp = Input(GraspStatus, "below.grasp")
+    plan = Output(GraspPlan)
     params = WorkstationParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -241,15 +239,15 @@ class Workstation(HostProgram):
         """Plan until the run is over."""
         while not bus.is_over:
             bus.wait(self._params.every_s)
-            self.plan(bus)
+            self.plan_grasp(bus)
 
-    def plan(self, bus: Bus) -> PlannedGrasp | None:
+    def plan_grasp(self, bus: Bus) -> PlannedGrasp | None:
         """Plan and send a grasp if one is wanted; return the newest, None without one."""
         world = bus.read("world")
         status = bus.read("grasp")
-        if not (world.is_there and status.is_there) or status.value.kind > GraspKind.PRESHAPE:
+        if not (world.is_there and status.is_there) or status.message.kind > GraspKind.PRESHAPE:
             return self._planned
-        model: Message = world.value
+        model: Message = world.message
         position = model.position[self._row]
         if norm(position - self._at) < MOVED_M:
             return self._planned
@@ -271,7 +269,7 @@ class Workstation(HostProgram):
     def names(self, bus: Bus) -> Mapping[str, Any]:
         """Return the functions that a prompt offers."""
         return {
-            "plan": lambda: self.plan(bus),
+            "plan": lambda: self.plan_grasp(bus),
             "boards": lambda: self.boards(bus),
         }
 

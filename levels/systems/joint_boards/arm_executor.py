@@ -4,7 +4,7 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,9 +12,9 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.arm.above import CommandsAbove
-from rack.levels.level import Input, LevelContext, Misfits, Ports, Reading
-from rack.levels.messages import ARM_STATE
-from rack.levels.operator import DRIVES, HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output, Reading
+from rack.levels.messages import ArmState
+from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload, Terms
 from rack.levels.servo.control import ArmParams
@@ -22,19 +22,19 @@ from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver, Course, numbers
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
-from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_TORQUE
+from rack.levels.systems.joint_boards.messages import ArmStatus, JointTorque
 from rack.levels.tables import read_params
 
 HELD = "held by the operator; `resume` releases it"
 
 
 class JointTorques(CommandsAbove):
-    """Adds up the `JOINT_TORQUE`s of the boards above; each is 0 for the joints of other boards."""
+    """Adds up the `JointTorque`s of the boards above; each is 0 for the joints of other boards."""
 
     def __init__(self, context: LevelContext, cell: Cell) -> None:
         super().__init__(context, cell.patience, 1, "torque", "braked")
         joints = len(cell.home)
-        # The fields of a `JOINT_TORQUE` from `torque` to `payload_offset`.
+        # The fields of a `JointTorque` from `torque` to `payload_offset`.
         self._sum = np.zeros(3 * joints + 5)
         self.torque = self._sum[:joints]  # (joints,), N m
         # Where the boards want the joints; accelerations are not known.
@@ -52,12 +52,12 @@ class JointTorques(CommandsAbove):
         """The mass in the gripper, as the boards know it."""
         return Payload(float(self._sum[-4]), self._sum[-3:])
 
-    def add_up(self, commands: Mapping[str, Reading]) -> None:
+    def add_up(self, commands: Mapping[str, Reading[Any]]) -> None:
         """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""
         self.rests_on = 0
         self._sum[:] = 0.0
         for board in self.oldest:
-            value = commands[board].value
+            value = commands[board].message
             self.rests_on = max(self.rests_on, value.operator)
             self._sum += numbers(value, "torque", "payload_offset")
         joints = len(self.torque)
@@ -74,12 +74,12 @@ class ArmExecutor(ArmDriver):
     where it is. See `ArmDriver`.
     """
 
-    inputs = {
-        "torques": Input(JOINT_TORQUE, "above.command", many=True),
-        "before": Input(ARM_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"status": ARM_STATUS, "state": ARM_STATE, "scene": SCENES}
+    joint_torques = Inputs(JointTorque, "above.command")
+    before = Input(ArmState, "own.state")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(ArmStatus)
+    state = Output(ArmState)
+    scene = SCENES
     commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
     params: ClassVar[type[ArmParams]] = ArmParams
 
@@ -95,7 +95,7 @@ class ArmExecutor(ArmDriver):
         self._rest_by: int | None = None
         # Tick of the first status that said so; None: not braked, or not yet said.
         self._braked_at: int | None = None
-        self._torques: Mapping[str, Reading] = {}
+        self._torques: Mapping[str, Reading[Any]] = {}
         self._waiting = ""  # why the boards above do not drive the arm
 
     @classmethod
@@ -122,15 +122,15 @@ class ArmExecutor(ArmDriver):
                 must = "the arm has no gripper"
             yield "above", list(wanted), f"{must}; {_by(grips)}"
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Advance the arm to `tick`, sense, drive or brake, report."""
-        write.status.tick = tick
-        super().process(read, write, tick)
+        self.status.tick = tick
+        super().process(tick)
 
-    def take_messages(self, read: Ports) -> None:
+    def take_messages(self) -> None:
         """Take over what is new."""
-        self._torques = read.torques
-        self.orders.take(read.operator, self._judge)
+        self._torques = self.joint_torques
+        self.orders.take(self.operator, self._judge)
 
     def _judge(self, command: Message) -> None:
         """Obey what leaves the command in force as it is, or refuse it."""

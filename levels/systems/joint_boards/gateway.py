@@ -5,16 +5,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from pydantic import Field
 
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
-from rack.levels.messages import TASK_STATUS
-from rack.levels.peer import PEER, Presence
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Output, Reading
+from rack.levels.messages import TaskStatus
+from rack.levels.peer import PeerPresence, Presence
 from rack.levels.servo.reference import MAX_AHEAD_S
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.tables import NotNegative, Positive, Table, read_params
 
 LEAD_CYCLES = 2
@@ -43,11 +43,10 @@ class JointGateway(Executor):
     references come again, they join them. Upwards the boards below appear as one.
     """
 
-    inputs = {
-        "command": Input(JOINT_REFERENCE, "above.command"),
-        "statuses": Input(JOINT_STATUS, "below.status", many=True),
-    }
-    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_STATUS, rests_on="statuses")}
+    above = Input(JointReference, "above.command")
+    statuses = Inputs(JointStatus, "below.status")
+    command = Output(JointReference, rests_on=above)
+    status = Output(JointStatus, rests_on=statuses)
     params: ClassVar[type[GatewayParams]] = GatewayParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -63,31 +62,31 @@ class JointGateway(Executor):
         self._above = ", ".join(context.above)
         self._down: Link = deque()
         self._up: Link = deque()
-        self._newest = Message(JOINT_REFERENCE.dtype(context.sizes))  # reference that came
-        self._merged = Message(JOINT_STATUS.dtype(context.sizes))  # of the boards below, as one
+        self._newest = JointReference.zeros(context.sizes)  # reference that came
+        self._merged = JointStatus.zeros(context.sizes)  # of the boards below, as one
         self._due = 0  # tick at which the last reference given is due; 0: none is followed
         self._frozen = False  # too many are missing
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Hand references down, and statuses up."""
-        self._take(read.command, tick)
+        self._take(self.above, tick)
         newest = self._newest
         due = newest.due + self.latency if newest.due else 0
         if not due or due > max(self._due, tick):
-            write.command.raw[:] = newest.raw
-            self._due = write.command.due = due
+            self.command.raw[:] = newest.raw
+            self._due = self.command.due = due
             self._frozen = False
         elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
-            self._extrapolate(write.command)
+            self._extrapolate(self.command)
         # Put the status of the boards below on the link; show the one that has passed it.
-        self._merge(read.statuses)
+        self._merge(self.statuses)
         self._up.append((tick + self._delay, bytes(self._merged.raw)))
-        take_arrived(self._up, write.status, tick)
+        take_arrived(self._up, self.status, tick)
 
-    def _take(self, command: Reading, tick: int) -> None:
+    def _take(self, command: Reading[Any], tick: int) -> None:
         """Put what is new on the link; take what has passed it."""
         if command.is_new:
-            self._down.append((tick + self._delay, bytes(command.value.raw)))
+            self._down.append((tick + self._delay, bytes(command.message.raw)))
         take_arrived(self._down, self._newest, tick)
 
     def _extrapolate(self, command: Message) -> None:
@@ -106,9 +105,9 @@ class JointGateway(Executor):
         command.velocity[:] = newest.velocity
         command.acceleration[:] = 0.0
 
-    def _merge(self, statuses: Mapping[str, Reading]) -> None:
+    def _merge(self, statuses: Mapping[str, Reading[Any]]) -> None:
         merged = self._merged
-        values = [reading.value for reading in statuses.values()]
+        values = [reading.message for reading in statuses.values()]
         merged.position[:] = values[0].position
         for name in ("target", "target_velocity", "torque", "driven"):
             field = getattr(merged, name)
@@ -162,20 +161,14 @@ class NetworkGatewayParams(GatewayParams):
 class NetworkGateway(JointGateway):
     """Follows references of another rack, due later by `delay`, within which they must have come.
 
-    They are due at ticks of that rack, whose time next to ours its `PEER` shows. The board is DONE,
-    or in ERROR, when the program of that rack is: then it may end the run.
-    """
+    They are due at ticks of that rack, whose time next to ours its `PeerPresence` shows. The board
+    is DONE, or in ERROR, when the program of that rack is: then it may end the run."""
 
-    inputs = {
-        "command": Input(JOINT_REFERENCE, "lan.reference"),
-        "program": Input(TASK_STATUS, "lan.program"),
-        "peer": Input(PEER, "lan.peer"),
-        "statuses": JointGateway.inputs["statuses"],
-    }
-    outputs = {
-        "command": JOINT_REFERENCE,
-        "status": Output(JOINT_STATUS, cycles=STATUS_CYCLES, rests_on="statuses"),
-    }
+    above = Input(JointReference, "lan.reference")
+    task = Input(TaskStatus, "lan.program")
+    peer = Input(PeerPresence, "lan.peer")
+    command = Output(JointReference, rests_on=above)
+    status = Output(JointStatus, cycles=STATUS_CYCLES, rests_on=JointGateway.statuses)
     params = NetworkGatewayParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -188,29 +181,29 @@ class NetworkGateway(JointGateway):
         # interpolate to it.
         self._ahead = self._period + LEAD_CYCLES * context.every
         self._above = "lan"
-        self._arrived = Message(JOINT_REFERENCE.dtype(context.sizes))
+        self._arrived = JointReference.zeros(context.sizes)
         self._refused = ""  # why the newest reference was not taken
         self._their_s = 0.0  # simulated time there less that here
         self._program: Message
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Hand references down, and statuses up."""
-        peer: Message = read.peer.value
+        peer: Message = self.peer.message
         self._follow(peer.ahead)
-        super().process(read, write, tick)
+        super().process(tick)
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
             # Its references would not be followed, and its motion would begin without the arm.
-            write.status.stopped = True
+            self.status.stopped = True
             is_lost = peer.presence == Presence.LOST
-            write.status.reason = LOST if is_lost else NOT_COMPARED
+            self.status.reason = LOST if is_lost else NOT_COMPARED
         elif self._refused:
-            write.status.state = State.HOLDING
-            write.status.reason = self._refused
-        program: Message = read.program.value
+            self.status.state = State.HOLDING
+            self.status.reason = self._refused
+        program: Message = self.task.message
         if program.state in (State.DONE, State.ERROR):
-            write.status.state = program.state
-            write.status.error = program.error
-            write.status.reason = program.reason
+            self.status.state = program.state
+            self.status.error = program.error
+            self.status.reason = program.reason
 
     def _follow(self, ahead_s: float) -> None:
         """Take over the other rack's time while no reference is followed; later only approach it:
@@ -222,11 +215,11 @@ class NetworkGateway(JointGateway):
             step_s = self.context.tick_s / STATUS_CYCLES
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
-    def _take(self, command: Reading, tick: int) -> None:
+    def _take(self, command: Reading[Any], tick: int) -> None:
         """Hand on what is new when the boards below need it, at ticks of this rack."""
         if command.is_new:
             arrived = self._arrived
-            arrived.copy_from(command.value)
+            arrived.copy_from(command.message)
             arrived.operator = 0  # of the other rack's operators, whose numbers mean nothing here
             self._refused = ""
             if arrived.due:

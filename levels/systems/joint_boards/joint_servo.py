@@ -11,9 +11,9 @@ import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports
+from rack.levels.level import Executor, Input, LevelContext, Misfits, Output
 from rack.levels.messages import Error
-from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.operator import Goal, Operation, OperatorCommand
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.servo import curves, reference
@@ -27,10 +27,10 @@ from rack.levels.servo.reference import Reference
 from rack.levels.systems.joint_boards import joint_control
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads, servo_joints
 from rack.levels.systems.joint_boards.messages import (
-    ARM_STATUS,
-    JOINT_REFERENCE,
-    JOINT_STATUS,
-    JOINT_TORQUE,
+    ArmStatus,
+    JointReference,
+    JointStatus,
+    JointTorque,
 )
 from rack.levels.tables import read_params, set_live
 
@@ -55,12 +55,11 @@ class JointServo(Executor):
     `stopped`, they come to rest.
     """
 
-    inputs = {
-        "command": Input(JOINT_REFERENCE, "above.command"),
-        "status": Input(ARM_STATUS, "below.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": JOINT_TORQUE, "status": JOINT_STATUS}
+    above = Input(JointReference, "above.command")
+    below = Input(ArmStatus, "below.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(JointTorque, rests_on=above)
+    status = Output(JointStatus, rests_on=below)
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
@@ -87,7 +86,7 @@ class JointServo(Executor):
         self.loads = JointLoads(cell)
         self._servo = partial(servo_joints.load(), constants, self.loads.table)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
-        self.operator = OperatorControl(
+        self.operator_control = OperatorControl(
             self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey
         )
         # What the law sets for its modifications.
@@ -131,17 +130,17 @@ class JointServo(Executor):
             yield "params.joints", [], "it drives no joint, and not the gripper"
         yield from misfits_of(context)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Interpolate, and compute the torques that act from the next cycle on."""
-        arm: Message = read.status.value
-        if not self._met and not self._meet(read.status.is_there, arm, write):
+        arm: Message = self.below.message
+        if not self._met and not self._meet(self.below.is_there, arm):
             return
-        self._take_messages(read, write)
+        self._take_messages()
         sampled = arm.tick
         every = self.context.every
         reference = self.reference
-        operator = self.operator
-        away = read.status.is_lost or tick - sampled > self._oldest
+        operator = self.operator_control
+        away = self.below.is_lost or tick - sampled > self._oldest
         stopped = away or bool(arm.stopped)
         if away or (stopped and arm.braked):
             reference.start(arm.position, arm.velocity, tick)
@@ -164,14 +163,14 @@ class JointServo(Executor):
         self._servo(*times, self._sample, wanted.table, *self._shown_numbers)
         if self._modified.exists:
             self._modify(times, wanted, tick)
-        torque = write.command
+        torque = self.command
         torque.sampled = sampled
         torque.id += 1
         if self._grip is not None:
             torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
         torque.operator = operator.orders.rests_on(self._rests_on)
-        self._report(write.status, arm, away, stopped)
-        operator.orders.report(write.status, self._rests_on)
+        self._report(self.status, arm, away, stopped)
+        operator.orders.report(self.status, self._rests_on)
 
     def _obey(self, command: Message) -> str:
         """Modify the law, or set a live parameter; return why not, empty: it is done."""
@@ -200,10 +199,10 @@ class JointServo(Executor):
         np.copyto(given[:joints], modified, where=self._driven)
         np.copyto(shown[3 * joints :], modified, where=self._driven)
 
-    def _meet(self, is_there: bool, arm: Message, write: Ports) -> bool:
+    def _meet(self, is_there: bool, arm: Message) -> bool:
         """Begin with the first status of the arm; return whether there is one."""
-        status = write.status
-        torque = write.command
+        status = self.status
+        torque = self.command
         self._met = is_there
         if not is_there:
             torque.sampled = -1
@@ -220,12 +219,12 @@ class JointServo(Executor):
         )
         return True
 
-    def _take_messages(self, read: Ports, write: Ports) -> None:
+    def _take_messages(self) -> None:
         """Take over what is new."""
-        if read.operator.is_new:
-            self.operator.take(read.operator, read.status.value.position)
-        if read.command.is_new:
-            command: Message = read.command.value
+        if self.operator.is_new:
+            self.operator_control.take(self.operator, self.below.message.position)
+        if self.above.is_new:
+            command: Message = self.above.message
             self._command = command.id
             self._rests_on = command.operator
             self._refused = ""
@@ -238,12 +237,12 @@ class JointServo(Executor):
             self._offered = command
             if self._grip is not None:
                 self._grip.take(command)
-                write.command.payload_mass = command.payload_mass
-                write.command.payload_offset = command.payload_offset
+                self.command.payload_mass = command.payload_mass
+                self.command.payload_offset = command.payload_offset
 
     def _report(self, status: Message, arm: Message, away: bool, stopped: bool) -> None:
         """Fill what the law has not set in the status."""
-        operator = self.operator
+        operator = self.operator_control
         holding = self.reference.holding
         kept = operator.reason
         error = Error.NONE

@@ -6,7 +6,7 @@ sizes as in `rack.levels.messages`.
 A level of your own that servoes joints
 - names them in its parameter `joints` (without one: all), and says with `gripper = true` that it
   drives the gripper.
-- writes a `JOINT_TORQUE` in every cycle, for the moment when it acts: a cycle after the release.
+- writes a `JointTorque` in every cycle, for the moment when it acts: a cycle after the release.
   `sampled` shows the arm which of its statuses the torque rests on; one that is too old brakes it.
 - wants its joints where they are while the arm says `braked`: only then is it released. While it
   only says `stopped`, brings them to rest and holds them; an arm that still moves after the time
@@ -18,72 +18,106 @@ begins again where they hold the arm.
 
 from __future__ import annotations
 
-from rack.backplane.message import command, status
-from rack.levels.fields import by_joint, flag, real, tick
-from rack.levels.messages import DRIVEN_ARM, JOINT_SET_POINT, SERVO_STATUS
-from rack.levels.operator import ANSWER, RESTS_ON
+import numpy as np
 
-JOINT_REFERENCE = command(
-    "joint_reference",
-    1,
-    RESTS_ON,
-    tick("due", "tick at which the arm should be there; 0: no set point, hold"),
-    by_joint("position", "rad", "joint positions"),
-    by_joint("velocity", "rad/s", "joint velocities"),
-    by_joint("acceleration", "rad/s2", "joint accelerations"),
-    by_joint("inertia", "kg m2", "diagonal of the joint-space inertia there"),
-    by_joint("load", "N m", "torques of gravity and motion there, without acceleration"),
-    real("opening", "m", "gripper joint position to go to"),
-    real("force", "N", "largest gripper force"),
-    real("payload_mass", "kg", "mass in the gripper, which `inertia` and `load` include"),
-    real("payload_offset", "m", "its centre, in the frame of the tool", 3),
-)
-"""From the trajectory level to all boards that servo joints; these interpolate between its set
-points."""
+from rack.backplane.message import field
+from rack.levels.messages import DrivenArm, JointCommand, ServoStatus
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
-JOINT_TORQUE = command(
-    "joint_torque",
-    1,
-    RESTS_ON,
-    tick("sampled", "tick of the arm's status that it rests on; -1: none yet, so no torque"),
-    by_joint("torque", "N m", "of the board's own joints; others 0"),
-    by_joint(
-        "target", "rad", "where the board wants its own joints when the torque acts; others 0"
-    ),
-    by_joint("target_velocity", "rad/s", "likewise"),
-    real("grip_force", "N", "of the gripper, from the board that drives it; others 0"),
-    real("payload_mass", "kg", "mass in the gripper, from the board that drives it; others 0"),
-    real("payload_offset", "m", "its centre, in the frame of the tool", 3),
-)
-"""From a board that servoes joints to the board of the arm, which adds them up; id rises with every
-cycle."""
 
-JOINT_STATUS = status(
-    "joint_status",
-    1,
-    *ANSWER,
-    by_joint("position", "rad", "joint positions, from the arm's status"),
-    by_joint("target", "rad", "set point of the board's own joints in this cycle; others 0"),
-    by_joint("target_velocity", "rad/s", "likewise"),
-    by_joint("torque", "N m", "of the board's own joints; others 0"),
-    flag("driven", "1: the joint is one of this board's", "joints"),
-    flag("holding", "1: no fresh set point, the joints ramp to rest and stay"),
-    flag("stopped", "1: set points are not followed: an operator, or the arm is braked"),
-    tick("due", "newest set point taken over; 0: none"),
-)
-"""From a board that servoes joints to the trajectory level."""
+class JointReference(RelayedCommand, version=1):
+    """From the trajectory level to all boards that servo joints; these interpolate between its set
+    points."""
 
-ARM_STATUS = status(
-    "arm_status",
-    2,
-    *ANSWER,
-    tick("tick", "tick at which the arm was sensed"),
-    *DRIVEN_ARM,
-)
-"""From the board of the arm to those that servo joints; a servo level's status without set points
-of its own."""
+    due: int = field(
+        unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
+    )
+    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
+    acceleration: np.ndarray = field(unit="rad/s2", doc="joint accelerations", shape="joints")
+    inertia: np.ndarray = field(
+        unit="kg m2", doc="diagonal of the joint-space inertia there", shape="joints"
+    )
+    load: np.ndarray = field(
+        unit="N m", doc="torques of gravity and motion there, without acceleration", shape="joints"
+    )
+    opening: float = field(unit="m", doc="gripper joint position to go to")
+    force: float = field(unit="N", doc="largest gripper force")
+    payload_mass: float = field(
+        unit="kg", doc="mass in the gripper, which `inertia` and `load` include"
+    )
+    payload_offset: np.ndarray = field(
+        unit="m", doc="its centre, in the frame of the tool", shape=3
+    )
 
-DRIVING = (SERVO_STATUS.name, ARM_STATUS.name)
+
+class JointTorque(RelayedCommand, version=1):
+    """From a board that servoes joints to the board of the arm, which adds them up; id rises with
+    every
+    cycle."""
+
+    sampled: int = field(
+        unit="tick", doc="tick of the arm's status that it rests on; -1: none yet, so no torque"
+    )
+    torque: np.ndarray = field(
+        unit="N m", doc="of the board's own joints; others 0", shape="joints"
+    )
+    target: np.ndarray = field(
+        unit="rad",
+        doc="where the board wants its own joints when the torque acts; others 0",
+        shape="joints",
+    )
+    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
+    grip_force: float = field(
+        unit="N", doc="of the gripper, from the board that drives it; others 0"
+    )
+    payload_mass: float = field(
+        unit="kg", doc="mass in the gripper, from the board that drives it; others 0"
+    )
+    payload_offset: np.ndarray = field(
+        unit="m", doc="its centre, in the frame of the tool", shape=3
+    )
+
+
+class JointStatus(AnsweringStatus, version=1):
+    """From a board that servoes joints to the trajectory level."""
+
+    position: np.ndarray = field(
+        unit="rad", doc="joint positions, from the arm's status", shape="joints"
+    )
+    target: np.ndarray = field(
+        unit="rad",
+        doc="set point of the board's own joints in this cycle; others 0",
+        shape="joints",
+    )
+    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
+    torque: np.ndarray = field(
+        unit="N m", doc="of the board's own joints; others 0", shape="joints"
+    )
+    driven: np.ndarray = field(
+        "u1", unit="1", doc="1: the joint is one of this board's", shape="joints"
+    )
+    holding: bool = field(doc="1: no fresh set point, the joints ramp to rest and stay")
+    stopped: bool = field(doc="1: set points are not followed: an operator, or the arm is braked")
+    due: int = field(unit="tick", doc="newest set point taken over; 0: none")
+
+
+class SensedStatus(AnsweringStatus):
+    """Status with the tick at which an arm was sensed."""
+
+    tick: int = field(unit="tick", doc="tick at which the arm was sensed")
+
+
+class ArmStatus(SensedStatus, DrivenArm, version=2):
+    """From the board of the arm to those that servo joints; a servo level's status without set
+    points of its own."""
+
+
+DRIVING = (ServoStatus.message_type.name, ArmStatus.message_type.name)
 """Names of the statuses of levels that drive an arm."""
-STREAMED = (JOINT_SET_POINT.name, JOINT_REFERENCE.name, JOINT_TORQUE.name)
+STREAMED = (
+    JointCommand.message_type.name,
+    JointReference.message_type.name,
+    JointTorque.message_type.name,
+)
 """Names of commands that change in every cycle."""

@@ -11,10 +11,9 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints
 
-from rack.backplane import message
-from rack.backplane.message import Message, State, command, status
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, Goal, Operation, Orders
+from rack.backplane.message import Command, Message, State, Status, field
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Output
+from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand, Orders
 from rack.levels.systems.joint_boards.joint_servo import JointServo
 from rack.levels.tables import Table, read_params
 
@@ -23,19 +22,22 @@ MOST_NAMES = 8
 """Names that one message holds, and the length of each with a space."""
 ANSWER_CYCLES = 20
 """Cycles of a joint's board from answer to answer: at 1 kHz as often as a network permits."""
-MODIFICATIONS = command(
-    "modifications",
-    1,
-    message.Field(
-        "wanted",
-        f"S{MOST_NAMES * NAME_BYTES}",
-        "ASCII",
-        "those that are to be in, as in elbow.pd, by spaces",
-    ),
-)
-MODIFIED = status("modified", 1)
-"""A board's answer: which message it has obeyed, or why it could not."""
-MODIFIER_STATUS = status("modifier_status", 1, *ANSWER)
+
+
+class Modifications(Command, version=1):
+    """The control modifications that are to be in force."""
+
+    wanted: str = field(
+        f"S{MOST_NAMES * NAME_BYTES}", doc="those that are to be in, as in elbow.pd, by spaces"
+    )
+
+
+class ModifiedAnswer(Status, version=1, message="modified"):
+    """A board's answer: which message it has obeyed, or why it could not."""
+
+
+class ModifierStatus(AnsweringStatus, version=1):
+    """Status of the board that puts in modifications."""
 
 
 BoardAndName = Annotated[
@@ -57,11 +59,10 @@ class ModificationSender(Executor):
     A restarted board gets all of its operator's commands again, in order, and comes to the same.
     """
 
-    inputs = {
-        "modified": Input(MODIFIED, "lan.modified", many=True),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": MODIFICATIONS, "status": MODIFIER_STATUS}
+    modified = Inputs(ModifiedAnswer, "lan.modified")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(Modifications)
+    status = Output(ModifierStatus)
     commands = {Operation.MODIFY: (Goal.ON, Goal.OFF)}
     params = SenderParams
 
@@ -78,16 +79,16 @@ class ModificationSender(Executor):
         found = params.get("known")
         return tuple(map(str, found)) if isinstance(found, Sequence) else ()
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Send what is to be in, and report whether it is."""
-        self._orders.take(read.operator, judge=self._obey)
-        write.command.id = self._orders.serial
-        write.command.wanted = " ".join(sorted(self._wanted))
-        answers = read.modified.values()
-        status = write.status
-        reasons = [answer.value.reason for answer in answers if answer.value.error]
-        silent = [box for box, answer in read.modified.items() if answer.is_lost]
-        if not reasons and all(answer.value.echo == self._orders.serial for answer in answers):
+        self._orders.take(self.operator, judge=self._obey)
+        self.command.id = self._orders.serial
+        self.command.wanted = " ".join(sorted(self._wanted))
+        answers = self.modified.values()
+        status = self.status
+        reasons = [answer.message.reason for answer in answers if answer.message.error]
+        silent = [box for box, answer in self.modified.items() if answer.is_lost]
+        if not reasons and all(answer.message.echo == self._orders.serial for answer in answers):
             for serial in self._pending:
                 self._orders.drives_done(serial)
             self._pending.clear()
@@ -112,20 +113,20 @@ class ModificationSender(Executor):
 class ModifiedFromAfar(JointServo):
     """Servoes joints by a law that another rack, and an operator here, may modify."""
 
-    inputs = {**JointServo.inputs, "asked": Input(MODIFICATIONS, "lan.modifications")}
-    outputs = {**JointServo.outputs, "modified": Output(MODIFIED, cycles=ANSWER_CYCLES)}
+    asked = Input(Modifications, "lan.modifications")
+    modified = Output(ModifiedAnswer, cycles=ANSWER_CYCLES)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._asked: set[str] = set()  # own modifications that are to be in
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Modify the law as asked, and go on."""
-        if read.asked.is_new:
+        if self.asked.is_new:
             own = f"{self.context.board}."
             wanted = {
                 name.removeprefix(own)
-                for name in read.asked.value.wanted.split()
+                for name in self.asked.message.wanted.split()
                 if name.startswith(own)
             }
             refused = {
@@ -135,7 +136,7 @@ class ModifiedFromAfar(JointServo):
             }
             # Those refused are asked for in every message, and each answer says so.
             self._asked = wanted.difference(refused)
-            write.modified.echo = read.asked.value.id
-            write.modified.error = len(refused)
-            write.modified.reason = "; ".join(refused.values())
-        super().process(read, write, tick)
+            self.modified.echo = self.asked.message.id
+            self.modified.error = len(refused)
+            self.modified.reason = "; ".join(refused.values())
+        super().process(tick)

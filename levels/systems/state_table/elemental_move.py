@@ -12,25 +12,24 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Message, status
+from rack.backplane.message import Message, field
 from rack.levels.algebra import Array, norm
-from rack.levels.fields import flag, number, row
-from rack.levels.level import Input, LevelContext, Ports
-from rack.levels.messages import WORLD_MODEL
-from rack.levels.operator import OPERATOR_COMMAND
+from rack.levels.level import Input, Inputs, LevelContext, Output
+from rack.levels.messages import WorldState
+from rack.levels.operator import OperatorCommand
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pointing, yaw_of
 from rack.levels.robot.cell import cell_of
 from rack.levels.systems.state_table.level import (
     BELOW,
-    STATUS_HEAD,
-    WORD_COMMAND,
     YES_NO,
     StateTableExecutor,
+    TableCommand,
+    TableStatus,
     answer_of,
     vocabulary,
 )
-from rack.levels.systems.state_table.primitive import JOINT_MOVE, JOINT_MOVE_STATUS
+from rack.levels.systems.state_table.primitive import JointMove, JointMoveStatus
 from rack.levels.systems.state_table.table import Lexicon, Name, Place
 from rack.levels.tables import Finite, NotNegative, Positive, SceneConfig, Table
 
@@ -39,15 +38,15 @@ HOME = "home"
 """The pose in which the arm starts."""
 STILL_M_S = 0.005
 """An object slower than this rests."""
-MOVE_TABLE_STATUS = status(
-    "move_table_status",
-    1,
-    *STATUS_HEAD,
-    number("sent", "serial of the newest command sent down; 0: none"),
-    flag("reached", "1: the newest pose has joint positions"),
-    row("put", "row of the object put down last; -1: none"),
-    flag("resting", "1: the arm rests"),
-)
+
+
+class MoveTableStatus(TableStatus, version=1):
+    """Status of the elemental move level of state tables."""
+
+    sent: int = field("u4", unit="1", doc="serial of the newest command sent down; 0: none")
+    reached: bool = field(doc="1: the newest pose has joint positions")
+    put: int = field("i2", unit="1", doc="row of the object put down last; -1: none")
+    resting: bool = field(doc="1: the arm rests")
 
 
 class TaughtPoseConfig(Table):
@@ -75,15 +74,14 @@ class MovePlanConfig(Table):
 class MoveTable(StateTableExecutor):
     """Picks an object, puts it down at a place, goes home, pose by pose as its table says."""
 
-    inputs = {
-        "command": Input(WORD_COMMAND, "above.command", many=True, optional=True),
-        "status": Input(JOINT_MOVE_STATUS, "below.status"),
-        "world": Input(WORLD_MODEL, "world.model"),
-        "last_command": Input(JOINT_MOVE, "own.command"),
-        "last_status": Input(MOVE_TABLE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": JOINT_MOVE, "status": MOVE_TABLE_STATUS}
+    above = Inputs(TableCommand, "above.command", optional=True)
+    below = Input(JointMoveStatus, "below.status")
+    world = Input(WorldState, "world.model")
+    last_command = Input(JointMove, "own.command")
+    last_status = Input(MoveTableStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(JointMove, rests_on=above)
+    status = Output(MoveTableStatus, rests_on=below)
     vocabulary = vocabulary(
         conditions={
             "below": BELOW,
@@ -122,7 +120,7 @@ class MoveTable(StateTableExecutor):
         self._cell = cell_of(context)
         self._ik = InverseKinematics(self._cell, context.seed)
         # The newest command sent down: it aims at a place, unless `object` is a row.
-        self._command = Message(JOINT_MOVE.dtype(context.sizes))
+        self._command = JointMove.zeros(context.sizes)
         self._command.joints = self._cell.home
         self._command.speed = 1.0
         self._command.object = -1
@@ -134,30 +132,30 @@ class MoveTable(StateTableExecutor):
         """Return objects, places and poses."""
         return {"object": scene.objects, "place": tuple(plan.place), "pose": (*plan.pose, HOME)}
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue with the command sent down last."""
-        super().recall(read, write)
-        if read.last_status.is_there and read.last_command.is_there:
-            last = read.last_status.value
-            self._command.copy_from(read.last_command.value)
+        super().recall()
+        if self.last_status.is_there and self.last_command.is_there:
+            last = self.last_status.message
+            self._command.copy_from(self.last_command.message)
             self._command.id = last.sent
             self._reached = bool(last.reached)
             self._put = last.put
 
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return where the level below, the object and the gripper are."""
-        self._below = read.status.value
-        self._world = read.world.value
+        self._below = self.below.message
+        self._world = self.world.message
         self.detail = self._below.reason
         self.resting = not self._below.moving
-        is_seen = not read.world.is_lost and self._world.revision > 0
+        is_seen = not self.world.is_lost and self._world.revision > 0
         target = "moving"
         is_elsewhere = False
         if is_seen:
             target = self._target(self._command.object)
             is_elsewhere = self._put >= 0 and not self._is_at(self._put)
         return {
-            "below": answer_of(read.status, self._command.id),
+            "below": answer_of(self.below, self._command.id),
             "world": ("unseen", "seen")[is_seen],
             "target": target,
             "support": ("there", "elsewhere")[is_elsewhere],
@@ -236,11 +234,11 @@ class MoveTable(StateTableExecutor):
         self._command.speed = speed
         self._command.joints = joints
 
-    def give(self, write: Ports, tick: int) -> None:
+    def give(self, tick: int) -> None:
         """Write the command, and what a restarted board needs."""
-        shown = write.status
+        shown = self.status
         self._command.hold = self.holds
-        write.command.copy_from(self._command)
+        self.command.copy_from(self._command)
         shown.sent = self._command.id
         shown.reached = self._reached
         shown.resting = self.resting

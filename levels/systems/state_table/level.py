@@ -15,19 +15,18 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Field, Message, State, command, status
-from rack.levels.fields import flag, number, short_count
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Ports, Reading
+from rack.backplane.message import Message, State, field
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
-    ANSWER,
     HELD_FROM_ABOVE,
-    OPERATOR_COMMAND,
-    RESTS_ON,
+    AnsweringStatus,
     Commands,
     Operation,
+    OperatorCommand,
     Orders,
+    RelayedCommand,
     answered,
 )
 from rack.levels.systems.state_table.checks import flaws
@@ -53,30 +52,34 @@ from rack.levels.systems.state_table.table import (
 )
 from rack.levels.tables import SceneConfig, Table, read_params
 
-COMMAND_HEAD = (
-    RESTS_ON,
-    flag("hold", "1: come to rest and stay, whatever is under way"),
-    Field(
-        "words", f"S{PHRASE_BYTES}", "ASCII", "the command with its parameters, as in 'pick block1'"
-    ),
-)
-"""First fields of every command to a level of this kind."""
-STATUS_HEAD = (
-    *ANSWER,
-    Field("table", f"S{NAME_BYTES}", "ASCII", "state table in force"),
-    number("checksum", "CRC-32 of its file"),
-    Field("in_state", f"S{NAME_BYTES}", "ASCII", "state after this cycle"),
-    short_count("row", "row that fired in this cycle, from 1; 0: none"),
-    Field("fired", f"S{ROW_NAME_BYTES}", "ASCII", "its name"),
-    Field("words", f"S{PHRASE_BYTES}", "ASCII", "command in force; empty: none"),
-    number(
-        "ordered", "serial of an operator's command, if it is in force; 0: it is the level above's"
-    ),
-    number("done", "newest command of the level above that is done; 0: none"),
-)
-"""First fields of the status of every level of this kind: with them a restarted board goes on."""
-WORD_COMMAND = command("word_command", 1, *COMMAND_HEAD)
-TABLE_STATUS = status("table_status", 1, *STATUS_HEAD)
+
+class TableCommand(RelayedCommand, version=1, message="word_command"):
+    """First fields of every command to a level of this kind."""
+
+    hold: bool = field(doc="1: come to rest and stay, whatever is under way")
+    words: str = field(
+        f"S{PHRASE_BYTES}", doc="the command with its parameters, as in 'pick block1'"
+    )
+
+
+class TableStatus(AnsweringStatus, version=1):
+    """First fields of the status of every level of this kind: with them a restarted board goes
+    on."""
+
+    table: str = field(f"S{NAME_BYTES}", doc="state table in force")
+    checksum: int = field("u4", unit="1", doc="CRC-32 of its file")
+    in_state: str = field(f"S{NAME_BYTES}", doc="state after this cycle")
+    row: int = field("u2", unit="1", doc="row that fired in this cycle, from 1; 0: none")
+    fired: str = field(f"S{ROW_NAME_BYTES}", doc="its name")
+    words: str = field(f"S{PHRASE_BYTES}", doc="command in force; empty: none")
+    ordered: int = field(
+        "u4",
+        unit="1",
+        doc="serial of an operator's command, if it is in force; 0: it is the level above's",
+    )
+    done: int = field("u4", unit="1", doc="newest command of the level above that is done; 0: none")
+
+
 YES_NO = ("no", "yes")
 UNKNOWN = "unknown"
 """A command whose words the level does not know."""
@@ -125,12 +128,12 @@ class StateTableExecutor(Executor):
     each action."""
 
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
-    inputs = {
-        "command": Input(WORD_COMMAND, "above.command", many=True, optional=True),
-        "last_status": Input(TABLE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"status": TABLE_STATUS}
+    above = Inputs(TableCommand, "above.command", optional=True)
+    last_status = Input(TableStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    status = Output(TableStatus)
+    command: RelayedCommand
+    """What it tells the level below, if there is one."""
     params = StateTableParams
     vocabulary: ClassVar[Vocabulary]
 
@@ -236,13 +239,13 @@ class StateTableExecutor(Executor):
             self.state = self.table.start
             self._since = None
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Do one cycle: read, let one row fire, write."""
         if not self._started:
             self._started = True
-            self.recall(read, write)
-        self._preprocess(read)
-        values = self.look(read, tick)
+            self.recall()
+        self._preprocess()
+        values = self.look(tick)
         self._since = tick if self._since is None else self._since
         values[LATE] = YES_NO[(tick - self._since) * self.context.tick_s > self.table.patience_s]
         if self.vocabulary.commands:
@@ -258,15 +261,15 @@ class StateTableExecutor(Executor):
         if row.next not in (SAME, self.state):
             self.state = row.next
             self._since = tick
-        self.give(write, tick)
-        self._report(write, number, row)
+        self.give(tick)
+        self._report(number, row)
 
     @abstractmethod
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return the value of each of the level's own conditions in this cycle."""
 
-    def give(self, write: Ports, tick: int) -> None:
-        """Fill what the level writes, other than the fields of `STATUS_HEAD`."""
+    def give(self, tick: int) -> None:
+        """Fill what the level writes, other than the fields of `TableStatus`."""
 
     def do_take(self) -> None:
         """Let the newest command be the one in force."""
@@ -282,13 +285,13 @@ class StateTableExecutor(Executor):
         """Whether an operator, or the level above, holds this one; or its board is lost."""
         return bool(self._kept)
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue from the last messages in the level's own mailboxes, after a restart of its
         board."""
-        if not read.last_status.is_there:
+        if not self.last_status.is_there:
             return
-        last = read.last_status.value
-        write.status.copy_from(last)
+        last = self.last_status.message
+        self.status.copy_from(last)
         self.state = last.in_state
         table = last.table if last.table in self.tables else self.table_name
         self.use(table)
@@ -296,15 +299,15 @@ class StateTableExecutor(Executor):
         self._done = last.done
         self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)
 
-    def _preprocess(self, read: Ports) -> None:
+    def _preprocess(self) -> None:
         """Take up what the operator and the level above command."""
         orders = self.orders
-        orders.take(read.operator, self._judge)
+        orders.take(self.operator, self._judge)
         self._kept = ""
         self._rests_on = orders.rests_on(0)
-        above: Reading | None = None
-        if "command" in self.inputs:
-            above = next(iter(read.command.values()), None)
+        above: Reading[Any] | None = None
+        if "above" in self.inputs:
+            above = next(iter(self.above.values()), None)
         if above is not None:
             self._hear(above)
         elif orders.standing is not Operation.DO:
@@ -312,9 +315,9 @@ class StateTableExecutor(Executor):
         if orders.holds:
             self._kept = orders.keeps(self.context.board)
 
-    def _hear(self, above: Reading) -> None:
+    def _hear(self, above: Reading[Any]) -> None:
         """Take up what the level above commands, unless an operator commands instead."""
-        command: Message = above.value
+        command: Message = above.message
         self._rests_on = self.orders.rests_on(command.operator)
         if self.orders.standing is Operation.DO:
             return
@@ -346,9 +349,9 @@ class StateTableExecutor(Executor):
             else:
                 self._newest = WordCommand(True, order.id, order.name)
 
-    def _report(self, write: Ports, number: int, row: RowConfig) -> None:
-        """Fill the fields of `STATUS_HEAD`, and the operator's in the command."""
-        shown: Message = write.status
+    def _report(self, number: int, row: RowConfig) -> None:
+        """Fill the fields of `TableStatus`, and the operator's in the command."""
+        shown: Message = self.status
         orders = self.orders
         state = STATES[row.status]
         reason = row.reason
@@ -384,14 +387,14 @@ class StateTableExecutor(Executor):
         elif is_done:
             orders.done()
         if "command" in self.outputs:
-            write.command.operator = self._rests_on
+            self.command.operator = self._rests_on
         orders.report(shown, self._rests_on)
 
 
-def answer_of(reading: Reading, serial: int) -> str:
+def answer_of(reading: Reading[Any], serial: int) -> str:
     """Return the value of `BELOW` for a status and the serial of the newest command sent down."""
     if reading.is_lost:
         return "lost"
-    if not reading.is_there or reading.value.echo != serial or not serial:
+    if not reading.is_there or reading.message.echo != serial or not serial:
         return "waiting"
-    return {State.DONE: "done", State.ERROR: "error"}.get(reading.value.state, "executing")
+    return {State.DONE: "done", State.ERROR: "error"}.get(reading.message.state, "executing")

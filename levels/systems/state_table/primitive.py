@@ -9,23 +9,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message, command, status
+from rack.backplane.message import Message, field
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
-from rack.levels.fields import by_joint, flag, real, row
-from rack.levels.level import Input, LevelContext, Output, Ports
-from rack.levels.operator import OPERATOR_COMMAND
+from rack.levels.level import Input, Inputs, LevelContext, Output
+from rack.levels.operator import OperatorCommand
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo import curves
 from rack.levels.servo.curves import Curve, Passage, Ramp
-from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import ArmStatus, JointReference, JointStatus
 from rack.levels.systems.state_table.level import (
-    COMMAND_HEAD,
     OPERATIONS,
-    STATUS_HEAD,
     YES_NO,
     StateTableExecutor,
+    TableCommand,
+    TableStatus,
     vocabulary,
 )
 from rack.levels.tables import Positive, Table
@@ -44,27 +43,30 @@ GRIP_STILL_M_S = 0.002
 GRIP_MARGIN_M = 0.001
 """A gripper this near to open or closed is; closed in between it holds something."""
 
-JOINT_MOVE = command(
-    "joint_move",
-    1,
-    *COMMAND_HEAD,
-    by_joint("joints", "rad", "where a motion ends"),
-    real("speed", "1", "part of the joints' limits"),
-    row("object", "row of the object concerned in the world model; -1: none"),
-    real("aim", "m", "where the object, or the place, was for this command", 3),
-    real("yaw", "rad", "how it was turned about the vertical"),
-)
-JOINT_MOVE_STATUS = status(
-    "joint_move_status",
-    1,
-    *STATUS_HEAD,
-    by_joint("position", "rad", "joint positions commanded last"),
-    by_joint("end", "rad", "where the newest motion ends"),
-    flag("moving", "1: they still change"),
-    flag("closed", "1: the gripper is commanded to close"),
-    flag("held", "1: it holds something"),
-    row("object", "row of the object that it holds; -1: none"),
-)
+
+class JointMove(TableCommand, version=1):
+    """From the elemental move level of state tables to its primitive level."""
+
+    joints: np.ndarray = field(unit="rad", doc="where a motion ends", shape="joints")
+    speed: float = field(unit="1", doc="part of the joints' limits")
+    object: int = field(
+        "i2", unit="1", doc="row of the object concerned in the world model; -1: none"
+    )
+    aim: np.ndarray = field(
+        unit="m", doc="where the object, or the place, was for this command", shape=3
+    )
+    yaw: float = field(unit="rad", doc="how it was turned about the vertical")
+
+
+class JointMoveStatus(TableStatus, version=1):
+    """Status of the primitive level of state tables."""
+
+    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
+    end: np.ndarray = field(unit="rad", doc="where the newest motion ends", shape="joints")
+    moving: bool = field(doc="1: they still change")
+    closed: bool = field(doc="1: the gripper is commanded to close")
+    held: bool = field(doc="1: it holds something")
+    object: int = field("i2", unit="1", doc="row of the object that it holds; -1: none")
 
 
 class PrimitivePlanConfig(Table):
@@ -77,15 +79,14 @@ class PrimitivePlanConfig(Table):
 class PrimitiveTable(StateTableExecutor):
     """Moves the joints along straight lines and works the gripper, as its table says."""
 
-    inputs = {
-        "command": Input(JOINT_MOVE, "above.command", many=True, optional=True),
-        "statuses": Input(JOINT_STATUS, "below.status", many=True),
-        "arm": Input(ARM_STATUS, "arm.status"),
-        "last_command": Input(JOINT_REFERENCE, "own.command"),
-        "last_status": Input(JOINT_MOVE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": JOINT_REFERENCE, "status": Output(JOINT_MOVE_STATUS, rests_on="statuses")}
+    above = Inputs(JointMove, "above.command", optional=True)
+    statuses = Inputs(JointStatus, "below.status")
+    arm = Input(ArmStatus, "arm.status")
+    last_command = Input(JointReference, "own.command")
+    last_status = Input(JointMoveStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(JointReference, rests_on=above)
+    status = Output(JointMoveStatus, rests_on=statuses)
     commands = OPERATIONS
     preloads = (curves,)
     vocabulary = vocabulary(
@@ -128,26 +129,26 @@ class PrimitiveTable(StateTableExecutor):
         self._due = 0  # tick at which the set point of this cycle is due
         self._grips = 0  # cycles until the gripper's motion must show
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue with the gripper as it is; the arm's motion begins anew from where the boards
         below hold it."""
-        super().recall(read, write)
-        if read.last_status.is_there:
-            last = read.last_status.value
+        super().recall()
+        if self.last_status.is_there:
+            last = self.last_status.message
             self._closed = bool(last.closed)
             self._held = bool(last.held)
             self._object = last.object
             self._point[0] = last.position
             self._end[:] = last.end
-            write.command.copy_from(read.last_command.value)
+            self.command.copy_from(self.last_command.message)
 
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return whether the arm follows and has arrived, and what the gripper does."""
-        for reading in read.command.values():
-            self._goal = reading.value.joints
-            self._speed = reading.value.speed
-            self._target = reading.value.object
-        position = self._follow(read)
+        for reading in self.above.values():
+            self._goal = reading.message.joints
+            self._speed = reading.message.speed
+            self._target = reading.message.object
+        position = self._follow()
         self._due = tick + LEAD_CYCLES * self.context.every
         if self._curve is not None and self._passed_s >= self._curve.ends_s:
             self._point[0] = self._curve.table[curves.REST]
@@ -163,14 +164,14 @@ class PrimitiveTable(StateTableExecutor):
             arm = "arrived" if there else "resting"
         return {
             "arm": arm,
-            "gripper": self._grip(read.arm.value),
+            "gripper": self._grip(self.arm.message),
             "hold": YES_NO[self.holds],
         }
 
-    def _follow(self, read: Ports) -> Array:
+    def _follow(self) -> Array:
         """Find out whether the boards below follow; return the joint positions, rad."""
-        readings = list(read.statuses.values())
-        statuses: list[Message] = [reading.value for reading in readings]
+        readings = list(self.statuses.values())
+        statuses: list[Message] = [reading.message for reading in readings]
         position: Array = statuses[0].position
         gone = any(reading.is_lost or not reading.is_there for reading in readings)
         stopped = gone or any(below.stopped for below in statuses)
@@ -243,10 +244,10 @@ class PrimitiveTable(StateTableExecutor):
         self._grips = GRIP_CYCLES
         self._object = self._target
 
-    def give(self, write: Ports, tick: int) -> None:
+    def give(self, tick: int) -> None:
         """Write the set point, with inertia and load there, and what a restarted board needs."""
-        command = write.command
-        shown = write.status
+        command = self.command
+        shown = self.status
         if self._curve is not None:
             self._point[:] = self._curve.at(self._passed_s).table
         command.id = tick // self.context.every + 1

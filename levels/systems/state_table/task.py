@@ -8,18 +8,17 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Message, status
-from rack.levels.fields import number, short_count
-from rack.levels.level import Input, LevelContext, Misfits, Ports
-from rack.levels.operator import OPERATOR_COMMAND, Operation
-from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS, MoveTable
+from rack.backplane.message import field
+from rack.levels.level import Input, LevelContext, Misfits, Output
+from rack.levels.operator import Operation, OperatorCommand
+from rack.levels.systems.state_table.elemental_move import MoveTable, MoveTableStatus
 from rack.levels.systems.state_table.level import (
     BELOW,
     OPERATIONS,
-    STATUS_HEAD,
-    WORD_COMMAND,
     StateTableExecutor,
     StateTableParams,
+    TableCommand,
+    TableStatus,
     answer_of,
     vocabulary,
 )
@@ -28,16 +27,16 @@ from rack.levels.tables import SceneConfig, Table, read_params
 
 COMMANDS_A_STEP = 2
 """Commands for the level below in one step: one to pick, one to place."""
-TASK_TABLE_STATUS = status(
-    "task_table_status",
-    1,
-    *STATUS_HEAD,
-    short_count("action", "steps done"),
-    short_count("actions", "steps of the plan"),
-    short_count("moves_done", "commands done by the level below"),
-    short_count("moves", "commands of the plan"),
-    number("sent", "serial of the newest command sent down; 0: none"),
-)
+
+
+class TaskTableStatus(TableStatus, version=1):
+    """Status of the task level of state tables."""
+
+    action: int = field("u2", unit="1", doc="steps done")
+    actions: int = field("u2", unit="1", doc="steps of the plan")
+    moves_done: int = field("u2", unit="1", doc="commands done by the level below")
+    moves: int = field("u2", unit="1", doc="commands of the plan")
+    sent: int = field("u4", unit="1", doc="serial of the newest command sent down; 0: none")
 
 
 class StepConfig(Table):
@@ -60,13 +59,13 @@ class TaskTable(StateTableExecutor):
     """Sends the commands of its steps to the level below, one after the other, as its table
     says."""
 
-    inputs = {
-        "status": Input(MOVE_TABLE_STATUS, "below.status"),
-        "last_command": Input(WORD_COMMAND, "own.command"),
-        "last_status": Input(TASK_TABLE_STATUS, "own.status"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {"command": WORD_COMMAND, "status": TASK_TABLE_STATUS}
+    above = None
+    below = Input(MoveTableStatus, "below.status")
+    last_command = Input(TableCommand, "own.command")
+    last_status = Input(TaskTableStatus, "own.status")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(TableCommand)
+    status = Output(TaskTableStatus, rests_on=below)
     commands = OPERATIONS
     vocabulary = vocabulary(
         conditions={
@@ -85,7 +84,7 @@ class TaskTable(StateTableExecutor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._step = 0  # steps done
-        self._command = Message(WORD_COMMAND.dtype({}))  # the newest command sent down
+        self._command = TableCommand.zeros({})  # the newest command sent down
 
     @classmethod
     def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
@@ -118,21 +117,21 @@ class TaskTable(StateTableExecutor):
                         )
                         yield f"params.tables.{name}", path.name, why
 
-    def recall(self, read: Ports, write: Ports) -> None:
+    def recall(self) -> None:
         """Continue with the step under way."""
-        super().recall(read, write)
-        if read.last_status.is_there and read.last_command.is_there:
-            self._step = read.last_status.value.action
-            self._command.copy_from(read.last_command.value)
-            self._command.id = read.last_status.value.sent
+        super().recall()
+        if self.last_status.is_there and self.last_command.is_there:
+            self._step = self.last_status.message.action
+            self._command.copy_from(self.last_command.message)
+            self._command.id = self.last_status.message.sent
 
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         """Return where the level below is, and whether a step is left."""
-        self.detail = read.status.value.reason
-        self.resting = bool(read.status.value.resting)
+        self.detail = self.below.message.reason
+        self.resting = bool(self.below.message.resting)
         is_left = self._step < len(self.table.plan.step)
         return {
-            "below": answer_of(read.status, self._command.id),
+            "below": answer_of(self.below, self._command.id),
             "step": ("none", "more")[is_left],
         }
 
@@ -148,11 +147,11 @@ class TaskTable(StateTableExecutor):
         """Go on to the next step."""
         self._step += 1
 
-    def give(self, write: Ports, tick: int) -> None:
+    def give(self, tick: int) -> None:
         """Write the command, and the progress."""
         self._command.hold = self.holds
-        write.command.copy_from(self._command)
-        shown = write.status
+        self.command.copy_from(self._command)
+        shown = self.status
         steps = len(self.table.plan.step)
         shown.action = min(self._step, steps)
         shown.actions = steps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,7 @@ class JointBoards:
         self._silent: dict[str, int] = {}  # consecutive cycles without a new status, by board
         self.awaited = "no board servoes a joint"  # what a level out of step waits for
 
-    def update(self, statuses: Mapping[str, Reading]) -> bool:
+    def update(self, statuses: Mapping[str, Reading[Any]]) -> bool:
         """Read all statuses; return True in the cycle in which the boards get into step."""
         self._cycles += 1
         for board, reading in statuses.items():
@@ -60,10 +61,10 @@ class JointBoards:
         self.in_step = False
         self.awaited = why
 
-    def _kept(self, statuses: Mapping[str, Reading]) -> str:
+    def _kept(self, statuses: Mapping[str, Reading[Any]]) -> str:
         """Return the board that does not follow, and why; empty: all do, or could."""
         for board, reading in statuses.items():
-            status = reading.value
+            status = reading.message
             silent = self._silent[board]
             if silent > MAX_SILENT_CYCLES or not reading.is_there:
                 return f"{board}: no status for {silent} cycles"
@@ -73,11 +74,11 @@ class JointBoards:
                 return f"{board}: it holds"
         return ""
 
-    def _hold(self, statuses: Mapping[str, Reading]) -> bool:
+    def _hold(self, statuses: Mapping[str, Reading[Any]]) -> bool:
         """Return whether all boards hold all joints at rest; take over where."""
         driven = np.zeros(len(self._joints), dtype=bool)
         for board, reading in statuses.items():
-            status = reading.value
+            status = reading.message
             mine = status.driven.astype(bool)
             # Written so that NaN does not count as rest, nor as a place.
             resting = (np.abs(status.target_velocity[mine]) <= MAX_REST_RAD_S).all()

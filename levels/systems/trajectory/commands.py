@@ -20,14 +20,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input, LevelContext
+from rack.levels.level import Input, LevelContext, Output
 from rack.levels.systems.trajectory.messages import (
-    MOTION_REQUEST,
-    MOTION_STATUS,
     MotionKind,
+    MotionRequest,
+    MotionStatus,
     RequestEnd,
 )
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, Table, read_params
@@ -145,9 +144,10 @@ class Motions:
         return [round(float(x), 4) for x in self._status.tool]
 
     @property
-    def _status(self) -> Message:
-        """The newest `MOTION_STATUS`, or that of the level in its place."""
-        return self._bus.read("motion").value
+    def _status(self) -> MotionStatus:
+        """The newest `MotionStatus`, or that of the level in its place."""
+        status: MotionStatus = self._bus.read("motion").message
+        return status
 
     def _request(self, **fields: Any) -> int:
         request = {"body": WORLD, **fields, "id": self._newest + 1}
@@ -189,8 +189,8 @@ class ScriptParams(Table):
 class CommandEnvironment(HostProgram):
     """Runs a script that commands motions by name; a prompt offers the same names."""
 
-    inputs = {"motion": Input(MOTION_STATUS, "below.motion")}
-    outputs = {"requests": MOTION_REQUEST}
+    motion = Input(MotionStatus, "below.motion")
+    requests = Output(MotionRequest)
     params = ScriptParams
 
     def __init__(self, context: LevelContext) -> None:

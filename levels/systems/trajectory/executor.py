@@ -5,27 +5,27 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports, Reading
-from rack.levels.messages import WORLD_MODEL
-from rack.levels.operator import HOLDABLE, OPERATOR_COMMAND, Orders
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Output, Reading
+from rack.levels.messages import WorldState
+from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
 from rack.levels.systems.trajectory.legs import WorldSight
 from rack.levels.systems.trajectory.messages import (
-    MOTION_REQUEST,
-    MOTION_STATE,
-    MOTION_STATUS,
     MotionKind,
+    MotionRequest,
+    MotionState,
+    MotionStatus,
 )
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import Agenda
@@ -49,20 +49,16 @@ class TrajectoryExecutor(Executor):
     continues with the requests in its own last messages.
     """
 
-    inputs = {
-        "requests": Input(MOTION_REQUEST, "above.requests"),
-        "boards": Input(JOINT_STATUS, "below.status", many=True),
-        "world": Input(WORLD_MODEL, "world.model"),
-        "last_command": Input(JOINT_REFERENCE, "own.command"),
-        "last_status": Input(MOTION_STATUS, "own.status"),
-        "last_state": Input(MOTION_STATE, "own.state"),
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-    }
-    outputs = {
-        "command": JOINT_REFERENCE,
-        "status": Output(MOTION_STATUS, rests_on="boards"),
-        "state": MOTION_STATE,
-    }
+    requests = Input(MotionRequest, "above.requests")
+    boards = Inputs(JointStatus, "below.status")
+    world = Input(WorldState, "world.model")
+    last_command = Input(JointReference, "own.command")
+    last_status = Input(MotionStatus, "own.status")
+    last_state = Input(MotionState, "own.state")
+    operator = Input(OperatorCommand, "own.operator")
+    command = Output(JointReference)
+    status = Output(MotionStatus, rests_on=boards)
+    state = Output(MotionState)
     commands = HOLDABLE
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
     preloads = (dynamics,)
@@ -94,24 +90,24 @@ class TrajectoryExecutor(Executor):
         # None before the level has recalled those that it has already.
         return 0 if self._tick is None else self._agenda.room
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Take requests, go on with the motion, write the set point of two cycles later."""
         if self._tick is None:
-            self._recall(read)
+            self._recall()
             self._tick = tick - self.context.every
         cycles = (tick - self._tick) // self.context.every
         self._tick = tick
-        self._orders.take(read.operator)
-        self._sight.look(read.world)
-        cancelled = self._agenda.take(read.requests)
+        self._orders.take(self.operator)
+        self._sight.look(self.world)
+        cancelled = self._agenda.take(self.requests)
         if cycles > HANDOVER_CYCLES and self._boards.in_step:
             # The boards hold by now. Across a network their statuses say so too late.
             self._boards.leave(f"{cycles} cycles missed: the boards hold")
             self._work.interrupt()
-        self._follow_boards(read)
+        self._follow_boards()
         if cancelled:
             self._work.cancel()
-        self._watch(read, cycles)
+        self._watch(cycles)
         hold = self._orders.holds
         # Samples of cycles that were missed are made up, so that no time is lost; beyond a few the
         # boards hold.
@@ -119,35 +115,35 @@ class TrajectoryExecutor(Executor):
             if self._boards.in_step:
                 due = self._due(tick) - late * self.context.every
                 self._work.step(due * self.context.tick_s, hold)
-        self._write_reference(write.command, tick)
-        self._write_status(write.status)
+        self._write_reference(self.command, tick)
+        self._write_status(self.status)
         agenda = self._agenda
-        write.state.passed = self._work.passed_s
+        self.state.passed = self._work.passed_s
         goal = 0 if agenda.goal is None else agenda.goal.id
         newest = (agenda.taken, agenda.done, agenda.begun, goal)
         if newest != self._saved:
             self._saved = newest
-            agenda.save(write.state)
+            agenda.save(self.state)
 
-    def _recall(self, read: Ports) -> None:
+    def _recall(self) -> None:
         """Continue after a restart, from the level's own last messages."""
-        if read.last_state.is_there and read.last_status.is_there:
-            self._agenda.recall(read.last_state.value, read.last_status.value)
-            self._work.recall(read.last_state.value.passed, read.last_status.value.progress)
-        command = read.last_command.value
-        if read.last_command.is_there and command.id:
+        if self.last_state.is_there and self.last_status.is_there:
+            self._agenda.recall(self.last_state.message, self.last_status.message)
+            self._work.recall(self.last_state.message.passed, self.last_status.message.progress)
+        command = self.last_command.message
+        if self.last_command.is_there and command.id:
             self._work.grip = command.opening, command.force
 
-    def _follow_boards(self, read: Ports) -> None:
+    def _follow_boards(self) -> None:
         """Fall out of step with the boards below, or begin anew from where they hold the arm."""
         before = self._boards.in_step
-        if self._boards.update(read.boards):
+        if self._boards.update(self.boards):
             self._work.interrupt()
             self._motion.rest_at(self._boards.position)
         elif before and not self._boards.in_step:
             self._work.interrupt()
 
-    def _watch(self, read: Ports, cycles: int) -> None:
+    def _watch(self, cycles: int) -> None:
         """End the request under way if its guard is struck; `cycles` since the last one."""
         current = self._agenda.current
         leg = self._motion.leg
@@ -155,7 +151,7 @@ class TrajectoryExecutor(Executor):
         steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
         if current is None or current.kind != MotionKind.POSE or not current.touch or not steady:
             self._guard.begin_anew()
-        elif self._guard.is_struck(read.boards, current.touch):
+        elif self._guard.is_struck(self.boards, current.touch):
             self._work.end_guarded()
 
     def _due(self, tick: int) -> int:
@@ -239,10 +235,10 @@ class TouchGuard:
         """Forget the torques so far."""
         self._past.clear()
 
-    def is_struck(self, boards: Mapping[str, Reading], most: float) -> bool:
+    def is_struck(self, boards: Mapping[str, Reading[Any]], most: float) -> bool:
         """Return whether the torque of a joint has changed by more than `most`, N m."""
-        if all(board.is_new and not board.value.holding for board in boards.values()):
-            self._past.append(sum(board.value.torque for board in boards.values()))
+        if all(board.is_new and not board.message.holding for board in boards.values()):
+            self._past.append(sum(board.message.torque for board in boards.values()))
         else:
             self.begin_anew()
         past = np.array(self._past)

@@ -16,7 +16,7 @@ arm cannot. The smoothed frame catches up with a body of constant velocity compl
 from __future__ import annotations
 
 from math import ceil
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -55,10 +55,10 @@ class WorldSight:
         self._tick_s = tick_s
         self._model: Message | None = None
 
-    def look(self, world: Reading) -> None:
+    def look(self, world: Reading[Any]) -> None:
         """Take over the newest model."""
-        if world.is_there and world.value.revision:
-            self._model = world.value
+        if world.is_there and world.message.revision:
+            self._model = world.message
 
     @property
     def knows(self) -> bool:

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Field, MessageType, command, status
-from rack.levels.fields import by_joint, flag, number, real, row, short_count
-from rack.levels.operator import ANSWER, RESTS_ON
+import numpy as np
+
+from rack.backplane.message import Message, field
+from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 HELD = 16
 """Motion requests that a trajectory level takes ahead: a CANCEL is seen at once while no more than
@@ -43,69 +44,74 @@ class RequestEnd(IntEnum):
     GUARDED = 5  # a guard was struck on the way
 
 
-MOTION_REQUEST = command(
-    "motion_request",
-    1,
-    RESTS_ON,
-    Field("kind", "u1", MotionKind, "what to do"),
-    by_joint("joints", "rad", "goal of JOINTS"),
-    real("position", "m", "goal of POSE: tool position, in the frame of `body`", 3),
-    real("quaternion", "1", "goal of POSE: tool orientation, in the frame of `body`", 4),
-    row("body", "row of the body in the world model in whose frame the goal is; -1: the world"),
-    flag("live", "1: the goal follows the body; 0: its frame is copied when the request begins"),
-    real(
-        "acceleration", "s", "half the time of the blend into this request; 0: the level's default"
-    ),
-    real("segment", "s", "time for the request; 0: from the speed limits; too short: stretched"),
-    real("opening", "m", "gripper joint position to go to, for GRIP"),
-    real("force", "N", "largest gripper force, for GRIP"),
-    real(
-        "touch",
-        "N m",
-        "lasting change of any joint's torque at which POSE ends GUARDED; 0: no guard",
-    ),
-)
-"""`id` numbers requests, rising by one from 1 in the order of the queue; one not above those taken
-is a repetition."""
+class MotionRequest(RelayedCommand, version=1):
+    """`id` numbers requests, rising by one from 1 in the order of the queue; one not above those
+    taken
+    is a repetition."""
 
-
-def state_of(name: str, request: MessageType) -> MessageType:
-    """Return the type of what a restarted level needs, with its status, to neither repeat nor lose
-    a request."""
-    return MessageType(
-        name,
-        1,
-        (
-            flag("begun", "1: the first of `requests` is under way"),
-            real("passed", "s", "time that it has stayed or gripped"),
-            Field(
-                "goal",
-                request,
-                "",
-                "the request at whose goal the arm is, or to which it goes; id 0: none",
-            ),
-            short_count("count", "requests that follow"),
-            Field("requests", request, "", "taken and not ended, oldest first", (HELD,)),
-        ),
+    kind: MotionKind = field(doc="what to do")
+    joints: np.ndarray = field(unit="rad", doc="goal of JOINTS", shape="joints")
+    position: np.ndarray = field(
+        unit="m", doc="goal of POSE: tool position, in the frame of `body`", shape=3
+    )
+    quaternion: np.ndarray = field(
+        unit="1", doc="goal of POSE: tool orientation, in the frame of `body`", shape=4
+    )
+    body: int = field(
+        "i2",
+        unit="1",
+        doc="row of the body in the world model in whose frame the goal is; -1: the world",
+    )
+    live: bool = field(
+        doc="1: the goal follows the body; 0: its frame is copied when the request begins"
+    )
+    acceleration: float = field(
+        unit="s", doc="half the time of the blend into this request; 0: the level's default"
+    )
+    segment: float = field(
+        unit="s", doc="time for the request; 0: from the speed limits; too short: stretched"
+    )
+    opening: float = field(unit="m", doc="gripper joint position to go to, for GRIP")
+    force: float = field(unit="N", doc="largest gripper force, for GRIP")
+    touch: float = field(
+        unit="N m",
+        doc="lasting change of any joint's torque at which POSE ends GUARDED; 0: no guard",
     )
 
 
-MOTION_STATE = state_of("motion_state", MOTION_REQUEST)
-"""Of a trajectory level."""
+class MotionState(Message, version=1):
+    """What a restarted trajectory level needs, with its status, to neither repeat nor lose a
+    request."""
 
-MOTION_STATUS = status(
-    "motion_status",
-    1,
-    *ANSWER,
-    number("taken", "newest request taken from the queue; 0: none yet"),
-    number("current", "request under way; 0: none"),
-    number("done", "newest request ended, however; 0: none yet"),
-    Field("ended", "u4", "1", "ids of the last requests ended, newest first; 0: none", (ENDED,)),
-    Field("ends", "u1", RequestEnd, "how they ended", (ENDED,)),
-    real("progress", "1", "part of the current request's time that has passed, 0 to 1"),
-    flag("resting", "1: commanded velocity is zero"),
-    by_joint("position", "rad", "joint positions commanded last"),
-    by_joint("velocity", "rad/s", "joint velocities commanded last"),
-    real("tool", "m", "tool position commanded last", 3),
-    real("astray", "m", "distance of that from a live goal, once reached; 0: there is none"),
-)
+    begun: bool = field(doc="1: the first of `requests` is under way")
+    passed: float = field(unit="s", doc="time that it has stayed or gripped")
+    goal: np.ndarray = field(
+        MotionRequest,
+        doc="the request at whose goal the arm is, or to which it goes; id 0: none",
+    )
+    count: int = field("u2", unit="1", doc="requests that follow")
+    requests: np.ndarray = field(MotionRequest, doc="taken and not ended, oldest first", shape=HELD)
+
+
+class MotionStatus(AnsweringStatus, version=1):
+    """Status of a trajectory level."""
+
+    taken: int = field("u4", unit="1", doc="newest request taken from the queue; 0: none yet")
+    current: int = field("u4", unit="1", doc="request under way; 0: none")
+    done: int = field("u4", unit="1", doc="newest request ended, however; 0: none yet")
+    ended: np.ndarray = field(
+        "u4", unit="1", doc="ids of the last requests ended, newest first; 0: none", shape=ENDED
+    )
+    ends: np.ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
+    progress: float = field(
+        unit="1", doc="part of the current request's time that has passed, 0 to 1"
+    )
+    resting: bool = field(doc="1: commanded velocity is zero")
+    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
+    velocity: np.ndarray = field(
+        unit="rad/s", doc="joint velocities commanded last", shape="joints"
+    )
+    tool: np.ndarray = field(unit="m", doc="tool position commanded last", shape=3)
+    astray: float = field(
+        unit="m", doc="distance of that from a live goal, once reached; 0: there is none"
+    )

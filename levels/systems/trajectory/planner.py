@@ -8,7 +8,7 @@ executor only says how far the program is.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -22,14 +22,14 @@ from rack.levels.level import (
     Misfits,
     Output,
     Planner,
-    Ports,
     Program,
+    QueuedOutput,
 )
-from rack.levels.messages import TASK_STATUS, WORLD_MODEL
+from rack.levels.messages import TaskStatus, WorldState
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.robot.cell import cell_of
-from rack.levels.systems.trajectory.messages import HELD, MOTION_REQUEST, MOTION_STATUS, MotionKind
+from rack.levels.systems.trajectory.messages import HELD, MotionKind, MotionRequest, MotionStatus
 from rack.levels.tables import (
     Finite,
     NotNegative,
@@ -186,8 +186,8 @@ class RequestExecutor(Executor):
     """Reports the program done, or the error that ended it. It obeys no operator: the trajectory
     level does."""
 
-    inputs = {"status": Input(MOTION_STATUS, "below.status")}
-    outputs = {"status": TASK_STATUS}
+    below = Input(MotionStatus, "below.status")
+    status = Output(TaskStatus, rests_on=below)
     params = PlanningParams
     program = MotionProgram
 
@@ -195,10 +195,10 @@ class RequestExecutor(Executor):
         super().__init__(context)
         self._count = len(self.program.read(context.task, context.robot, context.scene).step)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Report the requests done."""
-        below = read.status.value
-        status = write.status
+        below = self.below.message
+        status = self.status
         status.echo = below.echo
         status.operator = below.operator
         status.action = status.moves_done = min(below.done, self._count)
@@ -224,11 +224,9 @@ class RequestPlanner(Planner):
     refuses it, with its reason.
     """
 
-    inputs = {
-        "status": Input(MOTION_STATUS, "below.status"),
-        "world": Input(WORLD_MODEL, "world.model"),
-    }
-    output = Output(MOTION_REQUEST, queued=True)
+    below = Input(MotionStatus, "below.status")
+    world = Input(WorldState, "world.model")
+    output = QueuedOutput(MotionRequest)
     params = PlanningParams
     program = MotionProgram
 
@@ -249,10 +247,10 @@ class RequestPlanner(Planner):
         self._begun = 0  # newest request begun below
         self._begun_at = 0  # tick at which it was seen
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         """Return whether a step may be planned now."""
-        below = read.status.value
-        if not read.status.is_there or below.error:
+        below = self.below.message
+        if not self.below.is_there or below.error:
             return False
         begun = max(below.current, below.done)
         if begun != self._begun:
@@ -263,18 +261,18 @@ class RequestPlanner(Planner):
             self._taken = below.taken
             self._taken_at = tick
         waited_s = (tick - self._taken_at) * self.context.tick_s
-        if below.taken < self._sent and waited_s > PATIENCE_S and not read.status.is_lost:
+        if below.taken < self._sent and waited_s > PATIENCE_S and not self.below.is_lost:
             self._sent = below.taken
             self._taken_at = tick
         return self._may_send(below.done, tick)
 
-    def plan(self, read: Ports, write: Any, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Plan the next steps, and queue their requests."""
         for _ in range(BATCH):
-            if not self._may_send(read.status.value.done, tick):
+            if not self._may_send(self.below.message.done, tick):
                 return
-            self._fill(write, self._sent, read.world.value)
-            if not write.send():
+            self._fill(self.output.message, self._sent, self.world.message)
+            if not self.output.send():
                 return
             self._sent += 1
             self._taken_at = tick

@@ -95,11 +95,11 @@ class Agenda:
         """Requests that may be taken now."""
         return HELD - len(self.held)
 
-    def take(self, requests: Reading) -> bool:
+    def take(self, requests: Reading[Any]) -> bool:
         """Take what is new; return whether the arm must stop: a CANCEL came."""
         cancelled = False
         if requests.is_new:
-            for message in (*requests.earlier, requests.value):
+            for message in (*requests.earlier, requests.message):
                 cancelled |= self._take(copied(message))
         return cancelled
 

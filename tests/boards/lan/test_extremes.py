@@ -37,17 +37,17 @@ from tests.test_brown_network import configs
 pytestmark = pytest.mark.thorough
 
 FOLDER = CONFIGS / "cell"
-ORDER = "rack.levels.systems.cell.messages:CELL_ORDER"
-REPORT = "rack.levels.systems.cell.messages:CELL_REPORT"
-BODIES = "rack.levels.systems.cell.shared_bodies:SHARED_BODIES"
+ORDER = "rack.levels.systems.cell.messages:CellOrder"
+REPORT = "rack.levels.systems.cell.messages:CellReport"
+BODIES = "rack.levels.systems.cell.shared_bodies:SharedBodies"
 JOINT_BOARDS = "rack.levels.systems.joint_boards"
 BROWN = {
-    "rack.levels.messages:TASK_STATUS",
-    "rack.levels.messages:WORLD_MODEL",
-    f"{JOINT_BOARDS}.messages:JOINT_REFERENCE",
-    f"{JOINT_BOARDS}.messages:JOINT_STATUS",
-    f"{JOINT_BOARDS}.modified_from_afar:MODIFICATIONS",
-    f"{JOINT_BOARDS}.modified_from_afar:MODIFIED",
+    "rack.levels.messages:TaskStatus",
+    "rack.levels.messages:WorldState",
+    f"{JOINT_BOARDS}.messages:JointReference",
+    f"{JOINT_BOARDS}.messages:JointStatus",
+    f"{JOINT_BOARDS}.modified_from_afar:Modifications",
+    f"{JOINT_BOARDS}.modified_from_afar:ModifiedAnswer",
 }
 """What the racks of brown send each other: all that they import is tried."""
 POSE = {

@@ -86,10 +86,9 @@ def examine(config: RackConfig) -> None:
     # Only here: a process of the load needs none of them.
     from numpy import isfinite
 
-    from rack.backplane.message import Message
     from rack.levels.arm import SimulatedArm
     from rack.levels.arm.simulation import save_state
-    from rack.levels.messages import ARM_STATE
+    from rack.levels.messages import ArmState
     from rack.levels.robot.cell import build_cell, sizes
 
     if config.robot is None:
@@ -100,7 +99,7 @@ def examine(config: RackConfig) -> None:
             continue
         arm = SimulatedArm(cell, config.scene, config.clock_ns)
         data = cell.start()
-        state = Message(ARM_STATE.dtype(sizes(cell)))
+        state = ArmState.zeros(sizes(cell))
         arm.save(state)
         data.qvel[dof] = FACTOR * limit
         save_state(cell.model, data, state.state)

@@ -21,7 +21,7 @@ from rack.backplane.layout import PROTOCOLS, InterruptSpec, Layout, MailboxSpec,
 from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_reader, open_writer
-from rack.backplane.message import Field, Message, command
+from rack.backplane.message import Command, Message, field
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config.layout import field_specs
 from rack.boards.faults.bounds import counting
@@ -44,13 +44,14 @@ BATCH_S = 0.001
 interruption."""
 CASE_S = 5.0
 """About how long a case takes."""
-MESSAGE = command(
-    "bench",
-    1,
-    Field("position", "f8", "rad", "joint positions", ("joints",)),
-    Field("velocity", "f8", "rad/s", "joint velocities", ("joints",)),
-    Field("torque", "f8", "N m", "joint torques", ("rest",)),
-)
+
+
+class Bench(Command, version=1):
+    """The message whose transport is measured."""
+
+    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
+    torque: np.ndarray = field(unit="N m", doc="joint torques", shape="rest")
 
 
 class Case(NamedTuple):
@@ -102,7 +103,7 @@ def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison
 
 
 def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample]:
-    dtype = MESSAGE.dtype(case.lengths)
+    dtype = Bench.message_type.dtype(case.lengths)
     with ExitStack() as stack:
         transports: dict[str, Transport] = {
             p: stack.enter_context(_mailbox(p, case)) for p in PROTOCOLS
@@ -187,7 +188,8 @@ def _reading(reader: Reader) -> Callable[[int], Message]:
     delay = reader.spec.delay
 
     def take(tick: int) -> Message:
-        return read(tick + delay).value
+        message: Message = read(tick + delay).message
+        return message
 
     return take
 
@@ -211,10 +213,10 @@ def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
         every=1,
         delay=1,
         depth=64,
-        message=MESSAGE.name,
-        version=MESSAGE.version,
-        size=MESSAGE.dtype(case.lengths).itemsize,
-        fields=field_specs(MESSAGE, case.lengths),
+        message=Bench.message_type.name,
+        version=Bench.message_type.version,
+        size=Bench.message_type.dtype(case.lengths).itemsize,
+        fields=field_specs(Bench.message_type, case.lengths),
         interrupt=interrupt,
     )
     return Layout(rack, 2_500_000, tasks, (box,))

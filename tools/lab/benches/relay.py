@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
-from rack.backplane.message import Field, State, status
-from rack.levels.level import Executor, Input, Ports
+from rack.backplane.message import State, Status, field
+from rack.levels.level import Executor, Input, Output
 
-RELAYED = status(
-    "relayed", 1, Field("sent", "i8", "tick", "cycle in which the first board sent this message")
-)
+
+class Relayed(Status, version=1):
+    """A message that is passed on from board to board."""
+
+    sent: int = field(unit="tick", doc="cycle in which the first board sent this message")
 
 
 class Sender(Executor):
     """Sends a message in every cycle."""
 
-    outputs = {"status": RELAYED}
+    status = Output(Relayed)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Send."""
-        write.status.state = State.EXECUTING
-        write.status.sent = tick
+        self.status.state = State.EXECUTING
+        self.status.sent = tick
 
 
 class Relay(Executor):
     """Passes on the message of another board, which the config wires to `message`."""
 
-    inputs = {"message": Input(RELAYED, "own.status")}
-    outputs = {"status": RELAYED}
+    message = Input(Relayed, "own.status")
+    status = Output(Relayed)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Pass it on; -1 while there is none."""
-        write.status.state = State.EXECUTING
-        write.status.sent = read.message.value.sent if read.message.is_there else -1
+        self.status.state = State.EXECUTING
+        self.status.sent = self.message.message.sent if self.message.is_there else -1

@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.backplane.message import state_name
 from rack.boards.config import RackConfig
-from rack.levels.messages import ARM_STATE, SCENE, TASK_STATUS
+from rack.levels.messages import ArmState, Scene, TaskStatus
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.run_report import RunReport
@@ -35,7 +35,7 @@ along."""
 
 def task_outcome(recording: Recording) -> Document | None:
     """Return the last status of the level that reports on the whole task."""
-    mailbox = _mailbox_of(recording, TASK_STATUS.name)
+    mailbox = _mailbox_of(recording, TaskStatus.message_type.name)
     if mailbox is None:
         return None
 
@@ -62,7 +62,7 @@ def objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
 def _drops(recording: Recording, row: int) -> Iterator[Document]:
     """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the
     tool."""
-    mailbox = _mailbox_of(recording, SCENE.name)
+    mailbox = _mailbox_of(recording, Scene.message_type.name)
     if mailbox is None:
         return
     ticks = recording.signal(mailbox, "tick")
@@ -102,7 +102,11 @@ def _counts(recording: Recording, status: str | None) -> Document:
     names = {name: name for name in ("touches", "violations", "pushed")} | {
         "clipped_cycles": "clipped"
     }
-    boxes = [box for box in (status, _mailbox_of(recording, ARM_STATE.name)) if box is not None]
+    boxes = [
+        box
+        for box in (status, _mailbox_of(recording, ArmState.message_type.name))
+        if box is not None
+    ]
     if not boxes:
         return {}
     return {

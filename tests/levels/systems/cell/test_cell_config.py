@@ -30,11 +30,11 @@ connect = ["unix/cell-puma"]
 from = "task.order_puma"
 [adapter.lan.import.puma]
 from = "cell-puma/task.report"
-type = "rack.levels.systems.cell.messages:CELL_REPORT"
+type = "rack.levels.systems.cell.messages:CellReport"
 max_age_ms = 500
 [adapter.lan.import.k1607]
 from = "cell-k1607/task.report"
-type = "rack.levels.systems.cell.messages:CELL_REPORT"
+type = "rack.levels.systems.cell.messages:CellReport"
 max_age_ms = 500
 [[task.step]]
 do = [

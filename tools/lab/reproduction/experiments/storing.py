@@ -8,8 +8,6 @@ import zlib
 from functools import cached_property
 from typing import IO
 
-from rack.backplane.message import Message
-from rack.levels.level import Ports
 from rack.levels.systems.figures import FigureExecutor, FigurePlanner
 
 BLOCK_BYTES = 1 << 20
@@ -37,9 +35,9 @@ class StoringPlanner(FigurePlanner):
 
     storage = Storage()
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Report, then store."""
-        write.made_at = tick
+        self.output.made_at = tick
         self.storage.put()
 
 
@@ -48,7 +46,7 @@ class StoringExecutor(FigureExecutor):
 
     storage = Storage()
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Compute, then store."""
-        super().process(read, write, tick)
+        super().process(tick)
         self.storage.put()
