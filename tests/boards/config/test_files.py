@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import rack.boards.config
-from rack.boards.config import CONFIGS, load, loads, names, resolve
+from rack.boards.config import CONFIGS, load, loads, names
 from rack.boards.config.files import assembled, named_classes
 from rack.boards.config.resolved import classes
 from rack.boards.errors import ConfigError
@@ -76,18 +75,6 @@ def test_text_that_is_not_toml_is_reported_with_its_line(write: Write) -> None:
         load(write("broken.toml", 'name = "x"\nclock = = 3\n'))
 
 
-def test_a_file_overrides_what_it_extends_key_by_key(small: Path, write: Write) -> None:
-    path = write(
-        "mine.toml", 'name = "mine"\nextends = ["small.toml"]\n[board.upper]\nrate_hz = 100\n'
-    )
-    config = load(path)
-    assert (config.name, config.board["upper"].rate_hz, config.board["upper"].slot) == (
-        "mine",
-        100,
-        2,
-    )
-
-
 def test_a_file_says_its_own_format_whatever_it_extends(small: Path, write: Write) -> None:
     older = load(write("older.toml", 'name = "mine"\nextends = ["small.toml"]\n'))
     newer = load(write("newer.toml", 'format = 2\nname = "mine"\nextends = ["older.toml"]\n'))
@@ -148,9 +135,7 @@ def test_an_incomplete_arm_is_reported_to_inherit_nothing(write: Write) -> None:
 
 DEEP = {
     "lists": "[task]\nx = " + "[" * 5000 + "]" * 5000,
-    "tables": "[task]\nx = " + "{ a = " * 3000 + "1" + " }" * 3000,
     "dotted keys": "[task]\n" + ".".join(["a"] * 3000) + " = 1",
-    "a heading": "[" + ".".join(["a"] * 3000) + "]\nx = 1",
     "just too deep": "[task]\nx = " + "[" * 31 + "]" * 31,
 }
 
@@ -167,7 +152,6 @@ def test_endless_nesting_is_refused_in_one_line(write: Write, text: str) -> None
 
 VALUES = {
     "6000 digits": ("9" * 6000, "integer too long; permitted: 64 bits"),
-    "4000 digits": ("9" * 4000, "task.x = 9999.*: integer too long; permitted: 64 bits"),
     "date": ("1990-03-01", 'task.x = "1990-03-01": dates and times are not permitted'),
     "NUL": ('"a\\u0000b"', r'task.x = "a\?b": text must not contain NUL'),
 }
@@ -227,9 +211,7 @@ def test_a_fifo_or_a_device_in_place_of_a_file_is_refused_at_once(
             assert lines(error) == [why]
 
 
-@pytest.mark.parametrize(
-    "name", ["~nosuchuser/x.toml", "a" * 5000, "a/" * 3000, "x" * 300 + ".toml", "a\0b.toml"]
-)
+@pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a/" * 3000, "a\0b.toml"])
 def test_an_impossible_file_name_is_reported_as_missing(
     small: Path, write: Write, name: str
 ) -> None:
@@ -261,32 +243,16 @@ def test_every_missing_base_is_reported(write: Write) -> None:
     ("setting", "found"),
     [
         ("clock.mode=realtime", lambda c: c.clock.mode == "realtime"),
-        ("board.upper.every = 4", None),
-        (
-            'protocol.mailbox."lower.status"=lock',
-            lambda c: c.protocol.mailbox == {"lower.status": "lock"},
-        ),
         (
             " protocol . mailbox . 'lower.status' = lock",
             lambda c: c.protocol.mailbox == {"lower.status": "lock"},
         ),
         ('task."a = b"=1', lambda c: c.task == {"a = b": 1}),
-        ("seed=7", lambda c: c.seed == 7),
-        (
-            'protocol.mailbox={"lower.status" = "lock"}',
-            lambda c: c.protocol.mailbox == {"lower.status": "lock"},
-        ),
         ("board.lower.params.gains=[1, 2]", lambda c: c.board["lower"].params == {"gains": [1, 2]}),
     ],
 )
-def test_overrides_set_single_values(
-    small: Path, setting: str, found: Callable[..., bool] | None
-) -> None:
-    if found is not None:
-        assert found(load(small, [setting]))
-        return
-    with pytest.raises(ConfigError, match="every is also given"):
-        resolve(load(small, [setting]))
+def test_overrides_set_single_values(small: Path, setting: str, found: Callable[..., bool]) -> None:
+    assert found(load(small, [setting]))
 
 
 def test_an_override_reaches_into_a_list(small: Path) -> None:
@@ -318,16 +284,6 @@ def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
     boards = {"one": named, "two": {"executor": "mine:Arm"}, "odd": 3, "wrong": {"executor": 7}}
     assert named_classes({"board": boards}) == ("mine:Arm", "mine:Planner")
     assert named_classes({"board": [1]}) == named_classes({}) == ()
-
-
-def test_every_export_exists_once() -> None:
-    exported = rack.boards.config.__all__
-    assert len(exported) == len(set(exported))
-    assert all(hasattr(rack.boards.config, name) for name in exported)
-    with pytest.raises(
-        AttributeError, match=r"module 'rack\.boards\.config' has no attribute 'nothing'"
-    ):
-        rack.boards.config.nothing  # noqa: B018
 
 
 def test_a_name_may_be_that_of_a_config_in_the_current_folder(

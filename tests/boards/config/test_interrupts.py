@@ -80,19 +80,6 @@ def test_the_protocol_passes_where_determinism_is_demanded(small: Path) -> None:
     ("setting", "why"),
     [
         (
-            "protocol.interrupt.fixed_us=-1",
-            "protocol.interrupt.fixed_us = -1: should be greater than or equal to 0",
-        ),
-        (
-            "protocol.interrupt.word_us=inf",
-            "protocol.interrupt.word_us = inf: should be a finite number",
-        ),
-        (
-            "protocol.interrupt.depth=0",
-            "protocol.interrupt.depth = 0: should be greater than or equal to 1",
-        ),
-        ("protocol.interrupt.slots=3", "protocol.interrupt.slots = 3: unknown key"),
-        (
             "board.hub.exchange.status.asynchronous=true",
             (
                 "the messages of 'figure0.status' interrupt the board as they come already;"

@@ -16,10 +16,6 @@ MISTAKES = {
         ["host.program.rate_hz=10"],
         "host.program.rate_hz = 10: unknown key; known: program, external, below",
     ),
-    "a priority": (
-        ["host.program.priority=3"],
-        "host.program.priority = 3: unknown key; known: program",
-    ),
     "no program": (
         ["host.program.program=host_programs:Adder"],
         "has no HostProgram named 'Adder'; it has: Console, ",
@@ -27,10 +23,6 @@ MISTAKES = {
     "the name of a board": (
         [f"host.adder={{ program = '{IDLE}' }}"],
         "host.adder: board.adder has this name",
-    ),
-    "a name": (
-        [f"host.own={{ program = '{IDLE}' }}"],
-        "host.own: invalid name for a board; permitted: a-z",
     ),
     "where determinism is demanded": (
         ["protocol.strict=true"],
