@@ -15,6 +15,7 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.config.layout import field_specs
 from rack.boards.events import (
     HELD_MS,
+    NO_TORQUE,
     Braking,
     Ending,
     Event,
@@ -97,11 +98,6 @@ def test_the_last_status_of_the_level_that_ends_a_run_is_its_cause(
     write(bus, "upper.status", 5, state=state, moves=moves, reason="so it is")
     assert ending(bus).cause() == cause
     assert ending(bus).final_state() == (state.name.lower(), "so it is")
-
-
-def test_an_error_of_a_level_that_counts_no_moves_is_a_failure(bus: Segment) -> None:
-    write(bus, "lower.status", 5, state=State.ERROR)
-    assert ending(bus, "lower.status").cause() == "task failed"
 
 
 def test_an_error_or_a_hold_of_a_level_without_a_reason_counts_as_any_other(
@@ -223,29 +219,6 @@ def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
     assert str(end) == "object 'block' ended 4 mm from its goal (tolerance 5 mm)"
 
 
-def test_times_of_brakes_are_those_of_their_events() -> None:
-    def event(tick: int, code: str, why: str, value: float = 0.0) -> Event:
-        return Event(0, tick, "reaction", "servo", "", code, subject=why, value=value)
-
-    start = event(10, "brakes_opened", "", 10)
-    events = [
-        start,
-        event(40, "brakes_closed", "sensors"),
-        event(50, "brakes_opened", "sensors", 10),
-        event(90, "brakes_closed", "no torque"),
-    ]
-    assert brakings(events, 100, TICK_MS) == (
-        Braking("sensors", 40, 25.0),
-        Braking("no torque", 90, 25.0),
-    )
-    assert brakings([start], 100, TICK_MS) == ()
-    assert brakings([], 100, TICK_MS) == ()
-    assert braked_text(brakings(events, 120, TICK_MS)) == (
-        "brakes engaged 2 times, 100 ms in all, longest 75 ms at tick 90: sensors (1),"
-        " no torque (1)"
-    )
-
-
 @pytest.mark.parametrize(
     ("cause", "faults", "worked"),
     [
@@ -279,3 +252,29 @@ def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
     # At the machine's start, by CLOCK_MONOTONIC.
     assert heard[2].time_ns < heard[0].time_ns <= heard[1].time_ns <= heard[3].time_ns
     Journal(None).add("launch", "rack", "nobody listens")
+
+
+def test_brakings_are_those_reported_as_over_and_the_one_that_lasts_to_the_end() -> None:
+    def change(tick: int, code: str, why: str, value: int = 0) -> Event:
+        return Event(0, tick, "reaction", "arm", "", code, subject=why, value=value)
+
+    events = [
+        change(2, "brakes_opened", "", 2),  # of the start
+        change(50, "brakes_closed", NO_TORQUE, 7),
+        change(50, "brakes_opened", NO_TORQUE, 3),
+        change(80, "brakes_closed", "sensors"),
+        change(90, "brakes_opened", "sensors", 10),
+        change(150, "brakes_closed", NO_TORQUE, 4),
+    ]
+    found = brakings(events, 200, 2.0)
+    assert found == (
+        Braking(NO_TORQUE, 47, 6.0),
+        Braking("sensors", 80, 20.0),
+        Braking(NO_TORQUE, 150, 100.0),
+    )
+    told = (
+        "brakes engaged 3 times, 126 ms in all, longest 100 ms at tick 150: no torque (2),"
+        " sensors (1)"
+    )
+    assert braked_text(found) == told
+    assert brakings(events[:1], 200, 2.0) == brakings([], 200, 2.0) == ()

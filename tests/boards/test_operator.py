@@ -20,7 +20,7 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.words import Run, System
 from rack.boards import Rack
-from rack.boards.config import load, wire
+from rack.boards.config import wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
@@ -88,12 +88,6 @@ def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(
         (101, "hold", "upper", "upper", 1),
         (203, "resume", "upper", "upper", 2),
     ]
-
-
-@pytest.mark.slow
-def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., RackConfig]) -> None:
-    digests = [run(commanded(setting))[0].digest for setting in (HELD, HELD, "seed=0")]
-    assert digests[0] == digests[1] != digests[2]
 
 
 SET = commands(
@@ -194,20 +188,6 @@ def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., Rack
 
 @pytest.mark.slow
 @pytest.mark.parametrize("board", ["upper", "lower"])
-def test_a_restarted_board_continues_with_its_last_command(
-    commanded: Callable[..., RackConfig], board: str
-) -> None:
-    config = commanded(commands(f"level='{board}', what='hold', tick=50"))
-    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
-    outcome, events, boxes = run(config, 2.0)
-    assert outcome.worked
-    assert [event.board for event in events if event.code == "rejoined"] == [board]
-    last = boxes[f"{board}.status"]["message"][-1]
-    assert (last["order"], last["standing"]) == (1, Operation.HOLD)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("board", ["upper", "lower"])
 def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     commanded: Callable[..., RackConfig], board: str
 ) -> None:
@@ -279,18 +259,6 @@ def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
 
 
 @pytest.mark.slow
-def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackConfig]) -> None:
-    config = commanded(HELD)
-    config = config.model_copy(
-        update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)}
-    )
-    _, events, boxes = run(config)
-    assert [event.board for event in events if event.code == "rejoined"] == ["clock"]
-    assert boxes["upper.operator"]["message"]["id"].tolist() == [1, 2]
-    assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
-
-
-@pytest.mark.slow
 def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., RackConfig]) -> None:
     with Rack(commanded("clock.mode=realtime")) as rack:
         rack.start(20.0)
@@ -331,15 +299,6 @@ def test_a_command_is_issued_only_while_its_client_lives(
         )
 
 
-@pytest.mark.slow
-def test_commands_of_a_program_must_fit_the_rack(commanded: Callable[..., RackConfig]) -> None:
-    with Rack(commanded()) as rack:
-        with pytest.raises(ConfigError, match="what = \"halt\": should be 'hold', 'resume'"):
-            rack.command("lower", "halt")
-        with pytest.raises(ConfigError, match="'lower' does not take goto; it takes: hold, resume"):
-            rack.command("lower", "goto", home=True)
-
-
 def await_giving(rack: Rack, entry: RequestEntry) -> None:
     watch(rack, lambda: entry.stage == RequestStage.GIVEN)
 
@@ -350,88 +309,6 @@ def answered(reading: Reading, serial: int) -> bool:
 
 def watch(rack: Rack, condition: Callable[[], bool]) -> None:
     wait_until(lambda: condition() or not rack.watch(0.001) or condition())
-
-
-MISTAKES = {
-    "no such level": (
-        "level='uper', what='hold'",
-        (
-            'command[0].level = "uper": no level of this name takes commands; levels that do:'
-            " upper, lower"
-        ),
-    ),
-    "not for this level": (
-        "level='lower', what='goto', home=true",
-        (
-            "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume, modify"
-            " on|off"
-        ),
-    ),
-    "no goal": (
-        "level='upper', what='goto'",
-        "command[0].goal: missing; goto of 'upper' takes one of: home",
-    ),
-    "another goal": (
-        "level='upper', what='goto', joints=[1.0]",
-        "command[0].joints: not a goal for goto of 'upper'; permitted: home",
-    ),
-    "two goals": (
-        "level='upper', what='goto', joints=[1.0], home=true",
-        "command[0].goal: several given: joints|home; goto of 'upper' takes one of: home",
-    ),
-    "a goal too much": (
-        "level='upper', what='hold', home=true",
-        "command[0].home: hold takes no goal; remove it",
-    ),
-    "a setting of nothing": (
-        "level='lower', what='modify', on=true",
-        "command[0].name: modify of 'lower' knows: twice",
-    ),
-    "a setting of something unknown": (
-        "level='lower', what='modify', name='thrice', on=true",
-        "command[0].name = \"thrice\": modify of 'lower' knows: twice",
-    ),
-    "a setting to nothing": (
-        "level='lower', what='modify', name='twice'",
-        "command[0].goal: missing; modify of 'lower' takes one of: on|off",
-    ),
-    "a name too much": (
-        "level='lower', what='hold', name='twice'",
-        'command[0].name = "twice": hold takes no name; remove it',
-    ),
-    "two times": (
-        "level='upper', what='hold', tick=3, at=1",
-        "command[0].at = 1.0: tick is also given",
-    ),
-    "unknown key": (
-        "level='upper', what='hold', tik=3",
-        "command[0].tik = 3: unknown key; did you mean 'tick'?",
-    ),
-}
-
-
-@pytest.mark.parametrize(("table", "expected"), MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_of_a_command_name_place_value_and_what_is_permitted(
-    config: MakeConfig, table: str, expected: str
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        wire(config(commands(table), text=COMMANDED))
-    assert any(str(mistake).startswith(expected) for mistake in caught.value.mistakes), str(
-        caught.value
-    )
-
-
-def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
-    robot = load("nasrem").robot
-    assert robot is not None
-    beyond = [*robot.home[:2], 9.0, *robot.home[3:]]
-    with pytest.raises(ConfigError) as caught:
-        wire(load("nasrem", [commands(f"level='servo', what='setpoint', joints={beyond}")]))
-    assert str(caught.value).startswith(
-        "command[0].joints = 9.0: out of range for joint 'j3'; permitted: "
-    )
-    with pytest.raises(ConfigError, match="2 values; permitted: 6, one per joint: j1, j2, "):
-        wire(load("nasrem", [commands("level='servo', what='setpoint', joints=[0.0, 0.0]")]))
 
 
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:

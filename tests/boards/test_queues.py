@@ -17,7 +17,7 @@ from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
-from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
+from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
 
 QUEUES = f"""{CLOCK}
@@ -179,17 +179,6 @@ def settle(rack: Rack, board: str) -> dict[str, int]:
 
 
 @pytest.mark.slow
-def test_a_plan_may_be_a_queue(config: MakeConfig) -> None:
-    digests = set()
-    for _ in range(2):
-        with Rack(config("protocol.depth={ 'wave.plan' = 8 }", text=PLANNING)) as rack:
-            digests.add(rack.run(1.0).digest)
-            found = counts(rack, "wave")
-            assert found["taken"] == found["newest"] > 50
-    assert len(digests) == 1
-
-
-@pytest.mark.slow
 def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> None:
     planner = ("board.lower.executor=queue_levels:Filed", "board.lower.planner=queue_levels:Filing")
     slow = ("board.lower.coupling=tight", "board.lower.rate_hz=50", "board.lower.within_cycles=30")
@@ -205,30 +194,6 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
                 0,
             )
     assert len(digests) == 1
-
-
-@pytest.mark.slow
-def test_a_mailbox_is_a_queue_if_the_config_says_so(config: MakeConfig) -> None:
-    with Rack(config("protocol.mailbox={ 'wave.status' = 'queue' }", text=PLAIN)) as rack:
-        rack.run(0.5)
-        taken = open_observer(rack.segment, "wave.status_taken").peek().value
-        box, position = (
-            rack.segment.layout.mailbox(name) for name in ("wave.status", "wave.status_taken")
-        )
-    assert (box.protocol, box.capacity) == ("queue", 32)
-    assert (position.writer, position.readers, position.every) == ("watch", ("wave",), 8)
-    # At tick 192 the messages of all earlier ticks were visible.
-    assert (taken.taken, taken.unread) == (192, 0)
-
-
-def test_a_queue_keeps_what_a_recorder_may_be_behind(config: MakeConfig) -> None:
-    box = wire(config("protocol.depth={ 'upper.requests' = 5 }", text=QUEUES)).mailbox(
-        "upper.requests"
-    )
-    # 40 ticks and 100 are the least time in which 5 messages can be sent and taken; 800 ticks are 2
-    # s.
-    assert box.depth >= 5 * (800 // 140 + 1)
-    assert box.capacity == 5
 
 
 @pytest.mark.parametrize(

@@ -112,18 +112,6 @@ def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
     ]
 
 
-def test_neighbours_are_the_same_whichever_of_them_names_the_other(jointed: MakeConfig) -> None:
-    both = jointed()
-    # The board of the arm is still above nobody, by what the joints say of it.
-    once = jointed(
-        "board.arm.reads.parts=['joint1.part', 'joint2.part', 'joint3.part']", "board.arm.above=[]"
-    )
-    found = [rack_timing(config, wire(config)) for config in (both, once)]
-    assert found[0].parallel == found[1].parallel
-    assert [chains.text for chains in found[0].parallel] == ["path > joint1 ... joint3 > arm"]
-    assert Supervision(once, wire(once)).must_wait("joint1", ["arm"])
-
-
 def test_information_is_followed_by_what_each_message_rests_on(jointed: MakeConfig) -> None:
     config = jointed()
     layout = wire(config)
@@ -141,8 +129,6 @@ def test_information_is_followed_by_what_each_message_rests_on(jointed: MakeConf
 
 CIRCLES = {
     "through many": ("board.arm.below=path", "board.arm.below", "path -> joint1 -> arm -> path"),
-    "by one of them": ("board.joint2.below=path", "board.joint2.below", "path -> joint2 -> path"),
-    "from above": ("board.path.above=arm", "board.path.above", "path -> joint1 -> arm -> path"),
     "two tables disagree": ("board.arm.below=joint3", "board.arm.below", "joint3 -> arm -> joint3"),
 }
 

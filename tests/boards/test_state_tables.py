@@ -13,7 +13,6 @@ from rack.boards import Rack
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
-from rack.levels.operator import Answer
 from tests.boards.commanded_racks import commands
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
@@ -96,21 +95,6 @@ def test_an_operator_does_a_command_of_the_level_until_resume(counter: MakeConfi
     assert statuses["count"][4:8].tolist() == [5, 10, 9, 8]
     assert statuses["state"][5] == State.DONE
     assert statuses["standing"][4:9].tolist() == [0, 6 + 1, 6 + 1, 6 + 1, 0]
-
-
-@pytest.mark.slow
-def test_an_operators_command_that_fails_is_refused_with_the_tables_reason(
-    counter: MakeConfig, tmp_path: Path
-) -> None:
-    given = counter(commands(RESET))
-    text = SAW.replace(
-        'do = ["take", "set"]\nstatus = "done"',
-        'do = ["take"]\nstatus = "error"\nreason = "no way"',
-    )
-    (tmp_path / "saw.toml").write_text(text)
-    statuses, _ = counted(given)
-    assert statuses["answer"][5:].tolist() == [Answer.REFUSED] * (len(statuses) - 5)
-    assert statuses["objection"][5] == b"no way"
 
 
 def test_a_table_with_a_hole_is_refused_with_its_state_and_case(

@@ -15,7 +15,6 @@ from typing import Any
 from rack.backplane.message import Field, Message, MessageType, State, status
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
-from rack.levels.messages import TASK_STATUS
 
 WAVE = status("wave", 1, Field("value", "f8", "1", "height of the wave"))
 GAIN = MessageType(
@@ -146,17 +145,6 @@ class Watch(Executor):
         write.status.state = read.status.value.state
         write.status.reason = read.status.value.reason
         write.status.value = read.status.value.value
-
-
-class Program(Executor):
-    """Fails at tick 8, with `moves` moves."""
-
-    outputs = {"status": TASK_STATUS}
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Report progress, then the error."""
-        write.status.state = State.ERROR if tick >= 8 else State.EXECUTING
-        write.status.moves = self.context.params["moves"]
 
 
 class Endless(Watch):

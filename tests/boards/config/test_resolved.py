@@ -29,7 +29,7 @@ def memory(config: MakeConfig) -> Iterator[tuple[Resolved, Segment]]:
 
 
 def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
-    memory: tuple[Resolved, Segment],
+    memory: tuple[Resolved, Segment], config: MakeConfig
 ) -> None:
     plan, segment = memory
     for task in plan.layout.tasks:
@@ -41,6 +41,10 @@ def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
     assert note.startswith(f"{REFUSED}; missed deadlines are likely")
     with pytest.raises(LaunchError, match=REFUSED):
         plan.check_realtime(segment)
+    # In lockstep there are no deadlines to miss.
+    stepped = resolve(config("clock.on_no_realtime=refuse", "board.wave.priority=50"))
+    stepped.check_realtime(segment)
+    assert not [note for note in stepped.notes(segment) if "SCHED_FIFO" in note]
 
 
 def test_a_launch_says_what_has_changed_since_an_older_format(

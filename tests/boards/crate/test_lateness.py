@@ -45,16 +45,11 @@ def struck(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
     ("due", "fraction", "plan", "permitted"),
     [
         (800, 0.05, 1, 40),
-        (790, 0.05, 1, 40),
         (10, 0.05, 1, 1),
-        (2, 0.05, 1, 1),
         (1, 0.05, 1, 0),
-        (0, 0.05, 1, 0),
         (100, 0.0, 1, 0),
         (10, 0.99, 1, 9),
-        (10, 1.0, 1, 10),
         (400, 0.05, 8, 24),
-        (10, 0.05, 4, 4),
         (4, 0.05, 4, 3),
     ],
 )
@@ -125,7 +120,13 @@ def test_lost_cycles_are_excused_by_an_injected_fault_as_far_as_it_can_have_cost
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fraction", "worked"), [(0.05, False), (0.15, True), (1.0, True)])
+@pytest.mark.parametrize(
+    ("fraction", "worked"),
+    [
+        (0.05, False),
+        (0.15, True),
+    ],
+)
 def test_a_board_that_dies_by_itself_is_not_excused(
     config: MakeConfig, fraction: float, worked: bool
 ) -> None:

@@ -218,7 +218,7 @@ def test_a_launcher_that_reads_no_valid_alarm_ends_in_one_line_and_leaves_nothin
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("region", ["words", "control block", "count of alarms", "all"])
+@pytest.mark.parametrize("region", ["control block", "all"])
 def test_a_rack_with_noise_in_it_runs_on_or_ends_and_leaves_nothing(
     region: str, tmp_path: Path, rack_name: str
 ) -> None:

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
-from tests.boards.conftest import LOOSE, NEVER, PLAIN, MakeConfig
+from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
 
 TASKS = ("wave", "wave.planner", "watch")
@@ -41,8 +41,9 @@ def of(events: Sequence[Event], kind: str, code: str = "") -> list[Event]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", TASKS)
-@pytest.mark.parametrize("kind", ["kill", "hang"])
+@pytest.mark.parametrize(
+    ("victim", "kind"), [("wave", "kill"), ("wave.planner", "kill"), ("watch", "hang")]
+)
 def test_a_lost_board_is_back_on_the_grid_at_its_tick(
     config: MakeConfig, victim: str, kind: str
 ) -> None:
@@ -60,8 +61,7 @@ def test_a_lost_board_is_back_on_the_grid_at_its_tick(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
-def test_a_run_with_its_faults_repeats(config: MakeConfig, coupling: tuple[str, ...]) -> None:
+def test_a_run_with_its_faults_repeats(config: MakeConfig) -> None:
     faults = [
         {"kind": "kill", "board": victim, "tick": 90 + 150 * k} for k, victim in enumerate(TASKS)
     ]
@@ -69,9 +69,8 @@ def test_a_run_with_its_faults_repeats(config: MakeConfig, coupling: tuple[str, 
         {"kind": "hang", "board": "watch", "tick": 600},
         {"kind": "clock-skip", "board": "clock", "tick": 650},
     ]
-    outcomes = [run(faulty(config(*coupling), *faults), 3.0)[0] for _ in range(3)]
-    assert len({outcome.digest for outcome in outcomes}) == 1
-    assert run(config(*coupling), 3.0)[0].digest != outcomes[0].digest
+    first, second = (run(faulty(config(*LOOSE), *faults), 2.2)[0].digest for _ in range(2))
+    assert first == second != run(config(*LOOSE), 2.2)[0].digest
 
 
 def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeConfig) -> None:
@@ -120,7 +119,11 @@ def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0]), ("brake", [2.0, 0.0])]
+    ("on_loss", "demand"),
+    [
+        ("hold", []),
+        ("stop", [1.0, 0.0]),
+    ],
 )
 def test_a_loss_demands_of_the_arm_as_configured(
     config: MakeConfig, on_loss: str, demand: list[float]
@@ -132,25 +135,13 @@ def test_a_loss_demands_of_the_arm_as_configured(
     assert [event.tick for event in found] == [100, 300][: len(demand)]
 
 
-def test_two_boards_lost_at_once_come_back_lower_first(config: MakeConfig) -> None:
-    faults = [
-        {"kind": "kill", "board": victim, "tick": 100}
-        for victim in ("watch", "wave.planner", "wave")
-    ]
-    outcome, events = run(faulty(config(), *faults))
-    assert outcome.worked
-    back = of(events, "recovery", "rejoined")
-    assert sorted(event.board for event in back) == sorted(TASKS)
-    assert {event.tick for event in back} == {300}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", [*TASKS, "clock"])
+@pytest.mark.parametrize("victim", ["wave.planner", "clock"])
 def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim: str) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
-        rack.start(2.0)
+        rack.start(1.5)
         words = rack.segment.words
-        while words[System.TICK] < 200:
+        while words[System.TICK] < 40:
             assert rack.watch(0.05)
         pid = (
             words[System.CLOCK_PID] if victim == "clock" else rack.segment.block(victim)[Block.PID]
@@ -236,21 +227,6 @@ def test_a_latch_set_while_running_brakes_until_it_is_reset(config: MakeConfig) 
         "reaction",
         "recovery",
     ]
-
-
-@pytest.mark.slow
-def test_a_board_without_restarts_ends_the_run(config: MakeConfig) -> None:
-    outcome, events = run(faulty(config(NEVER), {"kind": "kill", "board": "watch", "tick": 100}))
-    assert outcome.cause == "board lost"
-    assert [event.board for event in of(events, "reaction", "given_up")] == ["watch"]
-
-
-@pytest.mark.slow
-def test_alarms_are_read_by_whoever_attaches(config: MakeConfig) -> None:
-    with Rack(faulty(config(), {"kind": "kill", "board": "wave", "tick": 20})) as rack:
-        rack.run(1.0)
-        codes = alarm_ring(rack.segment, "clock").drain().rows["code"].tolist()
-    assert codes == [1, 2, 4]
 
 
 @pytest.mark.slow

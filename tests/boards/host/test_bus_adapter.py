@@ -20,8 +20,8 @@ from rack.boards.classes import find_class
 from rack.boards.config import resolve
 from rack.boards.config.resolved import Resolved
 from rack.boards.host.bus import HostBus
-from rack.boards.host.bus_adapter import BusAdapter, status_of
-from rack.boards.host.entries import ENTRY, NEVER, EntryConfig, Outward, Replayed
+from rack.boards.host.bus_adapter import BusAdapter
+from rack.boards.host.entries import NEVER, EntryConfig, Outward, Replayed
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Ports
 from tests.boards.conftest import MakeConfig
@@ -308,13 +308,3 @@ def test_a_replay_gives_out_what_was_written_at_its_ticks(
         replayed.exchange(Ports(), Ports(port=out), tick)
         seen.append(list(out.sent) if is_sent else out.raw[0])
     assert seen == expected
-
-
-def test_the_status_has_a_group_of_counts_for_each_entry() -> None:
-    entry = EntryConfig.model_validate({"from": "a.b"})
-    found = status_of({"one": entry, "two": entry})
-    assert (found.name, found.version) == ("adapter_status", 1)
-    assert [field.name for field in found.fields][-2:] == ["one", "two"]
-    counts = ("passed", "refused", "superseded", "full", "waiting", "arrived", "age")
-    assert found.dtype({})["two"].names == counts
-    assert ENTRY.version == 1
