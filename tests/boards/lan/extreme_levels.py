@@ -45,16 +45,14 @@ def message_type(name: str) -> MessageType:
     return ImportConfig.model_validate(table).message_type()
 
 
-def cases(
-    kind: MessageType, base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
-) -> Iterator[Case]:
+def cases(kind: MessageType, base: Mapping[str, Any]) -> Iterator[Case]:
     """Yield the base itself, and the base with each field at each of its extremes. A group's are
     those of its first."""
-    plain = filled(kind, base, sizes)
+    plain = filled(kind, base)
     yield "plain", bytes(plain.raw), True
     for path, field in _leaves(kind.fields):
         for value in _extremes(field, plain.record.dtype, path):
-            message = filled(kind, base, sizes)
+            message = filled(kind, base)
             message.record[path[0]][...] = message.record[path[0]]
             at: Any = message.record
             for name in path[:-1]:
@@ -69,11 +67,9 @@ def cases(
                 )
 
 
-def filled(
-    kind: MessageType, base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
-) -> Message:
+def filled(kind: MessageType, base: Mapping[str, Any]) -> Message:
     """Return a message with these fields."""
-    message = Message(kind.dtype(sizes or {}))
+    message = Message(kind.dtype({}))
     for name, value in base.items():
         if isinstance(value, Mapping):
             for inner, number in value.items():

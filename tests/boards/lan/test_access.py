@@ -40,10 +40,6 @@ def rules(
                                 yield flow, message, key, name
 
 
-def test_without_others_nothing_is_allowed() -> None:
-    assert list(rules(TLS)) == []
-
-
 def test_without_tls_anyone_may_see_that_it_is_there_and_compare_clocks() -> None:
     found = list(rules(TCP))
     assert {message for _, message, *_ in found} == {*WATCH_TOKENS, *TOKEN, *SUBSCRIBE, *PUT}
@@ -96,10 +92,6 @@ def test_whoever_may_stop_it_may_do_nothing_else() -> None:
     }
 
 
-def test_no_message_deletes() -> None:
-    assert not [rule for rule in rules(TCP, peers=("friend",)) if rule[1] == "delete"]
-
-
 def test_without_tls_rules_hold_for_anyone_but_by_the_same_keys() -> None:
     tables: dict[str, Any] = {
         "export": {"pulse": {"from": "pulse.status"}},
@@ -110,13 +102,6 @@ def test_without_tls_rules_hold_for_anyone_but_by_the_same_keys() -> None:
     assert known <= unknown
     assert unknown - known <= {rule[:3] for rule in rules(TCP)}
     assert {name for *_, name in rules(TCP, **tables)} == {"*"}
-
-
-def test_an_operator_sets_stops_and_sends_nothing_else() -> None:
-    found = list(rules(TLS, is_operator=True))
-    assert (OUT, "query", "rack/home/estop/*", "*") in found
-    assert (IN, "reply", "rack/home/estop/*", "*") in found
-    assert not [rule for rule in found if rule[1] in ("put", "declare_subscriber")]
 
 
 @pytest.mark.parametrize("cycle_ns", [0, 20_000_000])

@@ -21,25 +21,6 @@ def order() -> tuple[MessageOrder, ImportCount]:
     return MessageOrder(count), count
 
 
-def test_messages_in_order_are_all_new() -> None:
-    found, count = order()
-    assert all(found.admits(head(number)) for number in range(5, 10))
-    assert count == ImportCount()
-
-
-def test_what_is_missing_is_counted_and_what_comes_late_is_disorder_once() -> None:
-    found, count = order()
-    assert [found.admits(head(number)) for number in (1, 4, 3, 3, 4, 5)] == [
-        True,
-        True,
-        False,
-        False,
-        False,
-        True,
-    ]
-    assert (count.missing, count.disordered, count.repeated) == (2, 1, 2)
-
-
 def test_a_new_launch_begins_anew() -> None:
     found, count = order()
     assert found.admits(head(90))

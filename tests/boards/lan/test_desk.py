@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System
 from rack.boards.config import load, wire
 from rack.boards.lan.credentials import Credentials
-from rack.boards.lan.desk import CHECK, ESTOP_KIND, REQUESTS_A_CYCLE, Desk
+from rack.boards.lan.desk import CHECK, ESTOP_KIND, Desk
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
@@ -171,10 +171,6 @@ def test_nobody_asks_in_the_name_of_another(bench: Bench, tmp_path: Path) -> Non
     # The answer has the seal of the rack, which `Line` checks.
     assert len(bench.cycle()) == 1
     assert bench.is_stopped
-
-
-def test_a_cycle_looks_at_a_bounded_number_of_requests(bench: Bench) -> None:
-    assert bench.line.most == REQUESTS_A_CYCLE
 
 
 def test_a_desk_that_nobody_may_ask_takes_no_requests(bench: Bench) -> None:

@@ -195,25 +195,3 @@ def test_a_pulled_cable_is_seen_within_the_lease_by_both_and_nothing_old_counts_
         assert now.missing > first.missing
         assert (now.refused, now.repeated) == (0, 0)
         assert rack.heard()[1] == 0
-
-
-@pytest.mark.slow
-def test_a_killed_rack_is_lost_and_its_next_launch_is_told_from_it(
-    racks: tuple[LabRack, LabRack],
-) -> None:
-    killed, other = racks[1], racks[0]
-    before, count = other.counts(), other.heard()[0]
-    killed.process.end()
-    tick = other.tick
-    lost = other.await_presence(Presence.LOST)
-    assert lost.since - tick <= LEASE_TICKS + KEEP_ALIVE_TICKS + CYCLE_TICKS
-    killed.start()
-    now = other.await_presence(Presence.THERE)
-    other.await_messages(5)
-    assert (now.launches, now.losses) == (before.launches + 1, before.losses + 1)
-    # It counts from the start again: once, for the reader, it went back.
-    assert other.heard()[0] < count
-    assert other.heard()[1] == 1
-    assert other.counts().missing == before.missing
-    killed.await_messages(5)
-    assert killed.counts()[-4:-1] == (Presence.THERE, 1, 0)

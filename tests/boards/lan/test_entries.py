@@ -13,7 +13,6 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
-from rack.backplane.words import Block
 from rack.boards.config.resolved import loads
 from rack.boards.lan.adapter import LanAdapter, status_of
 from rack.boards.lan.entries import Import
@@ -133,12 +132,6 @@ def test_a_message_is_new_once_then_old_then_lost_by_its_age(importing: Importin
     assert importing.read(72) == (NEW, 2, False)
 
 
-def test_what_has_not_come_has_no_age(importing: Importing) -> None:
-    importing.cycle(8)
-    shown = importing.status.import_other
-    assert (shown["age"], shown["age_s"]) == (-1, -1.0)
-
-
 def test_what_is_too_old_when_it_comes_is_counted_and_not_passed(importing: Importing) -> None:
     importing.send(1, written=0)
     importing.cycle(MAX_AGE)
@@ -232,17 +225,6 @@ def test_a_rack_that_goes_on_keeps_the_last_message_however_old(segment: Segment
     # From here on by its age again.
     assert importing.read(10 * MAX_AGE + 16) == (NEW, 5, False)
     assert importing.read(11 * MAX_AGE + 1) == (OLD, 5, True)
-
-
-def test_a_dead_adapter_is_a_lost_writer(importing: Importing) -> None:
-    importing.send(1, written=2)
-    importing.cycle(8)
-    assert importing.read(16) == (NEW, 1, False)
-    importing.segment.block("lan")[Block.LOST] = 18
-    assert importing.read(17) == (OLD, 1, False)
-    assert importing.read(18) == (OLD, 1, True)
-    importing.segment.block("lan")[Block.LOST] = 0
-    assert importing.read(19) == (OLD, 1, False)
 
 
 def test_a_restarted_adapter_continues_and_takes_nothing_twice(importing: Importing) -> None:

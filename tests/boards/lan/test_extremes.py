@@ -1,25 +1,20 @@
-"""Every field of every type that shipped racks import, at its extremes, into the boards that read
-it: none ends."""
+"""Every field of every type that the racks of a cell import, at its extremes, into the boards that
+read it: none ends."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import count
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 
-from rack.backplane.message import State
 from rack.boards.config import CONFIGS, load, resolve
-from rack.boards.config.cell import built_cell, cell_sizes
 from rack.boards.config.schema import RackConfig
 from rack.levels.messages import Error
 from rack.levels.operator import Goal
-from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.cell.coordinator import CellProgram
 from rack.levels.systems.cell.messages import (
     CELL_ORDER,
@@ -30,9 +25,8 @@ from rack.levels.systems.cell.messages import (
 )
 from rack.levels.systems.cell.shared_bodies import SHARED_BODIES
 from rack.tools.viewer.window import free_port
-from tests.boards.lan.extreme_levels import Case, cases, message_type
+from tests.boards.lan.extreme_levels import Case, cases
 from tests.boards.lan.racks import Ended, run_together
-from tests.test_brown_network import configs
 
 pytestmark = pytest.mark.thorough
 
@@ -40,28 +34,14 @@ FOLDER = CONFIGS / "cell"
 ORDER = "rack.levels.systems.cell.messages:CELL_ORDER"
 REPORT = "rack.levels.systems.cell.messages:CELL_REPORT"
 BODIES = "rack.levels.systems.cell.shared_bodies:SHARED_BODIES"
-JOINT_BOARDS = "rack.levels.systems.joint_boards"
-BROWN = {
-    "rack.levels.messages:TASK_STATUS",
-    "rack.levels.messages:WORLD_MODEL",
-    f"{JOINT_BOARDS}.messages:JOINT_REFERENCE",
-    f"{JOINT_BOARDS}.messages:JOINT_STATUS",
-    f"{JOINT_BOARDS}.modified_from_afar:MODIFICATIONS",
-    f"{JOINT_BOARDS}.modified_from_afar:MODIFIED",
-}
-"""What the racks of brown send each other: all that they import is tried."""
 POSE = {
     "action": OrderAction.GOTO,
     "goal": Goal.POSE,
     "position": (0.45, -0.3, 0.7),
     "quaternion": (0, 1, 0, 0),
 }
-WRONG_NAMES = b"shoulder.none elbow. wrist.notch x.y wrist"
-"""Modifications that no board has."""
-Bases = Callable[[str, RackConfig], Iterator[Mapping[str, Any]]]
 ACTIONS: Sequence[Mapping[str, Any]] = (
     POSE,
-    {**POSE, "goal": Goal.DIRECTION, "direction": (0, 0, -1), "by": 500.0},
     {"action": OrderAction.GOTO, "goal": Goal.JOINTS, "count": 6, "joints": 0.1},
     {
         "action": OrderAction.TRANSFER,
@@ -107,12 +87,10 @@ rate_hz = {self.rate_hz}
 
 
 class Sender(NamedTuple):
-    """A rack that stands in for one. `extends`: the config whose arm and scene its types need."""
+    """A rack that stands in for one."""
 
     rack: str
     streams: Sequence[Stream]
-    extends: Sequence[str] = ()
-    rate_hz: float = 50.0  # of its adapter: lockstep needs that of the other
 
     @property
     def seconds(self) -> float:
@@ -124,7 +102,6 @@ class Sender(NamedTuple):
         return f"""
 format = 2
 name = "{self.rack}"
-extends = {json.dumps(self.extends)}
 python_path = ["{Path(__file__).parents[3]}"]
 
 [clock]
@@ -133,7 +110,7 @@ mode = "lockstep"
 
 [adapter.lan]
 slot = 2
-rate_hz = {self.rate_hz}
+rate_hz = 50
 listen = ["tcp/127.0.0.1:{port}"]
 insecure = true
 connect = {json.dumps([f"tcp/127.0.0.1:{at}" for at in peers])}
@@ -147,15 +124,11 @@ def real(file: str, name: str, folder: Path, listen: int) -> RackConfig:
     for path in FOLDER.glob("*.toml"):
         text = re.sub(r'"cell(?=["/-])', f'"{name}', path.read_text().replace('"../', '"'))
         (folder / path.name).write_text(text)
-    return listening(folder / f"{file}.toml", listen)
-
-
-def listening(path: Path, listen: int) -> RackConfig:
-    """Return a config in lockstep, with a network of nobody but those that connect to it."""
+    # In lockstep, with a network of nobody but those that connect to it.
     endpoint = f'listen=["tcp/127.0.0.1:{listen}"]'
     own = (endpoint, "insecure=true", "connect=[]", "launch=[]", "estop_from=[]")
     lan = (f"adapter.lan.{setting}" for setting in own)
-    return load(path, ["clock.mode=lockstep", *lan])
+    return load(folder / f"{file}.toml", ["clock.mode=lockstep", *lan])
 
 
 def run(rack: RackConfig, listen: int, senders: Sequence[Sender], folder: Path) -> Ended:
@@ -181,14 +154,13 @@ def check(found: Ended, counts: Mapping[str, int]) -> None:
     assert all(entry["taken"] > 0 for entry in imports.values())
 
 
-def test_all_types_that_shipped_racks_import_are_tried() -> None:
-    texts = [path.read_text() for path in CONFIGS.rglob("*.toml")]
+def test_all_types_that_the_racks_of_a_cell_import_are_tried() -> None:
+    texts = [path.read_text() for path in FOLDER.rglob("*.toml")]
     found = [
         re.findall(r"\[adapter\.lan\.import\.[^]]*\][^[]*?\ntype = \"(.*)\"", text)
         for text in texts
     ]
-    tried = {ORDER, REPORT, BODIES} | BROWN
-    assert {name for names in found for name in names} == tried
+    assert {name for names in found for name in names} == {ORDER, REPORT, BODIES}
 
 
 def orders_and_bodies(
@@ -259,104 +231,3 @@ def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Pat
     found = run(cell, listen, senders, tmp_path)
     refused = senders[0].streams[0].refused
     check(found, {"puma": refused, "k1607": refused})
-
-
-def rows_of(kind: str, bases: Iterable[Mapping[str, Any]], sizes: Mapping[str, int]) -> list[Case]:
-    """Return the cases of a type, each with the next base, and with the plain one of that after
-    it."""
-    given = iter(bases)
-    found = []
-    for number, _ in enumerate(cases(message_type(kind), next(given), sizes)):
-        found.append(list(cases(message_type(kind), next(given), sizes))[number])
-        found.append(next(cases(message_type(kind), next(given), sizes)))
-    return found
-
-
-def brown(
-    file: str, other: str, rack_name: str, folder: Path, bases: Bases
-) -> tuple[Ended, Mapping[str, int]]:
-    """Run a rack of brown with one that stands in for the other and sends what that one does;
-    return how it ended, and how many messages it had to refuse, by port."""
-    configs(rack_name, folder)
-    listen = free_port()
-    rack = listening(folder / f"{file}.toml", listen)
-    assert rack.adapter.lan is not None
-    sizes = cell_sizes(rack)
-    streams = {
-        port: Stream(
-            entry.mailbox,
-            entry.type,
-            round(entry.rate_hz),
-            [(1, case) for case in rows_of(entry.type, bases(entry.mailbox, rack), sizes)],
-        )
-        for port, entry in rack.adapter.lan.imports.items()
-    }
-    sender = Sender(other, list(streams.values()), ["robots/puma560.toml"], 100.0)
-    found = run(rack, listen, [sender], folder)
-    return found, {port: stream.refused for port, stream in streams.items()}
-
-
-def asked_of_servo(mailbox: str, rack: RackConfig) -> Iterator[Mapping[str, Any]]:
-    """Yield what the general machine sends in each of its cycles."""
-    cell = built_cell(rack)
-    still = Dynamics(cell).terms(cell.home, np.zeros(len(cell.home)))
-    for cycle in count(1):
-        yield {
-            "trajectory.command": {
-                "id": cycle,
-                # In its ticks of 5 ms: due two of its cycles later.
-                "due": 4 * (cycle + 2),
-                "position": cell.home,
-                "inertia": still.inertia.diagonal(),
-                "load": still.bias,
-            },
-            "modifications.command": {"id": cycle, "wanted": WRONG_NAMES},
-            "planning.status": {"state": State.EXECUTING},
-        }[mailbox]
-
-
-@pytest.mark.slow
-def test_no_extreme_of_the_general_machine_ends_a_board_of_the_servo_rack(
-    rack_name: str, tmp_path: Path
-) -> None:
-    found, refused = brown("servo", rack_name, rack_name, tmp_path, asked_of_servo)
-    check(found, refused)
-    last = found.last
-    answers = [last[f"{board}.modified"]["reason"] for board in ("shoulder", "elbow", "wrist")]
-    assert answers == [
-        "no modification 'none'; permitted: pd, notch",
-        "no modification ''; permitted: pd",
-        "no modification 'notch'; permitted: deadzone",
-    ]
-    # The plain one was due when the run began.
-    assert last["supervisor.status"]["reason"].startswith("rejected: a reference due in -")
-    home = built_cell(load("brown")).home
-    assert last["arm.status"]["position"] == pytest.approx(home, abs=1e-3)
-
-
-def told_by_servo(mailbox: str, rack: RackConfig) -> Iterator[Mapping[str, Any]]:
-    """Yield what the servo rack sends in each of its cycles."""
-    cell = built_cell(rack)
-    for cycle in count(1):
-        yield {
-            "supervisor.status": {
-                "driven": 1,
-                "holding": 1,
-                "position": cell.home,
-                "target": cell.home,
-            },
-            "world.model": {
-                "revision": 1,
-                "quaternion": (1.0, 0.0, 0.0, 0.0),
-                "sensed": 20 * cycle,
-            },
-        }.get(mailbox, {})
-
-
-@pytest.mark.slow
-def test_no_extreme_of_the_servo_rack_ends_a_board_of_the_general_machine(
-    rack_name: str, tmp_path: Path
-) -> None:
-    found, refused = brown("brown", f"{rack_name}-servo", rack_name, tmp_path, told_by_servo)
-    check(found, refused)
-    assert found.last["planning.status"]["error"] == 0, "no motion was planned from an extreme"

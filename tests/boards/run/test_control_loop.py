@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import pytest
 
@@ -15,7 +13,7 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock, open_writer
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.process import die_with_parent, set_priority, take_processor
+from rack.backplane.process import die_with_parent
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import Flag, trace_ring
 from rack.backplane.words import Block, Slot, System
@@ -25,7 +23,6 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.run import control_loop
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
-from tests.backplane.bus import task as task_spec
 from tests.boards.conftest import MakeConfig
 from tests.processes import FORKS, exit_status, fork, runs, wait_until
 
@@ -82,20 +79,6 @@ def bench(config: MakeConfig) -> Iterator[MakeBench]:
         semaphores.unlink(found.plan.layout)
         unlink(found.segment.rack)
         found.segment.close()
-
-
-def test_a_cycle_in_time_has_no_trouble(bench: MakeBench) -> None:
-    rack = bench()
-    wave = rack.task("wave")
-    for tick in range(3):
-        rack.to(tick)
-        wave.cycle(tick)
-    assert rack.flags("wave") == [Flag(0)] * 3
-    assert [rack.segment.block("wave")[w] for w in (Block.CYCLES, Block.DONE, Block.MISSED)] == [
-        3,
-        2,
-        0,
-    ]
 
 
 def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
@@ -220,21 +203,6 @@ def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:
         rack.task("wave")
     writer.close()
     rack.task("wave")
-
-
-def test_a_board_takes_its_core_and_stops_its_garbage_collector() -> None:
-    core = max(os.sched_getaffinity(0))
-
-    def take() -> bool:
-        priority = take_processor(replace(task_spec("board"), core=core))
-        return os.sched_getaffinity(0) == {core} and priority == 0 and not gc.isenabled()
-
-    assert exit_status(fork(take)) == 0
-
-
-def test_ordinary_scheduling_is_never_refused() -> None:
-    assert set_priority(0)
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def test_a_board_dies_with_its_crate() -> None:

@@ -3,9 +3,7 @@ restarts."""
 
 from __future__ import annotations
 
-import re
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
@@ -15,8 +13,6 @@ from rack.boards.config import wire
 from rack.boards.config.timing import rack_timing
 from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.schedule import simulate
-from rack.tools.timing.charts.gantt import Subject, gantt_of
-from rack.tools.timing.charts.window import WindowOptions
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
 
@@ -103,7 +99,12 @@ def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", ["left", "wave"])
+@pytest.mark.parametrize(
+    "victim",
+    [
+        "left",
+    ],
+)
 def test_a_restart_keeps_the_phase(config: MakeConfig, victim: str) -> None:
     plain = config("supervision.lockstep_restart_s=0.06", text=cyclic())
     kill = FaultConfig(kind="kill", board=victim, tick=42)
@@ -128,24 +129,3 @@ def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
         # What was not taken was skipped, and counted.
         last = int(rows["tick"][-1])
         assert len(rows) + block[Block.SKIPPED] == (last - phase) // every + 1
-
-
-def test_gantt_draws_the_cyclic_schedule_without_preemption(
-    config: MakeConfig, tmp_path: Path
-) -> None:
-    found = config(text=cyclic())
-    gantt = gantt_of(
-        Subject(found, wire(found), None, tmp_path),
-        WindowOptions(),
-        {},
-        lambda part: None,
-    )
-    text = gantt.text()
-    rows = [line.split()[-1] for line in text.splitlines() if line.startswith("core 0 ")]
-    # One stretch of each job, from its release on: the first of the watch "right" is at tick 3.
-    stretches = [[match.start() for match in re.finditer("X+", row)] for row in rows]
-    assert [len(found) for found in stretches] == [4, 2, 2]
-    tick = (stretches[0][1] - stretches[0][0]) / 2
-    assert [found[0] / tick for found in stretches] == pytest.approx([0, 1, 3], abs=1 / tick)
-    assert "wave: X -: 20 of 20 cycles" in text
-    assert "right: X -: 10 of 10 cycles" in text

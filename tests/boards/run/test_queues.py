@@ -142,15 +142,6 @@ def link(rack_name: str) -> Iterator[MakeQueue]:
         one.close()
 
 
-def test_no_message_of_a_burst_is_lost_to_a_slower_reader(link: MakeQueue) -> None:
-    # 10 Hz, three motions a cycle, a reader at 4 Hz: it would sample 9 of 27.
-    rack = link(32, rates=(10, 25))
-    rack.run(0, 90, lambda tick: 3)
-    rack.run(90, 200, lambda tick: 0)
-    assert rack.taken == [*range(1, 28)]
-    assert rack.refused == rack.alarms("writer") == rack.alarms("reader") == []
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     capacity=st.integers(1, 6),
@@ -199,13 +190,6 @@ def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
     rack.room = 0
     rack.run(80, 90, lambda tick: 1)
     assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
-
-
-def test_room_comes_back_one_cycle_of_the_reader_after_it_has_taken(link: MakeQueue) -> None:
-    rack = link(1, rates=(1, 4))
-    rack.run(0, 17, lambda tick: 1)
-    # Sent at 0, taken at 4, known from 8 on.
-    assert [serial - 1 for serial in range(1, 18) if serial not in rack.refused] == [0, 8, 16]
 
 
 def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) -> None:

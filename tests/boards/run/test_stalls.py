@@ -88,8 +88,8 @@ def run(rack: Link, seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rates", "depth"), [((1, 1), 1024), ((1, 8), ROUND), ((8, 1), 1024)])
 @pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize(("rates", "depth"), [((1, 8), ROUND), ((8, 1), 1024)])
 def test_stalls_of_writer_and_reader_raise_no_alarm(
     link: MakeLink, protocol: Protocol, rates: tuple[int, int], depth: int
 ) -> None:

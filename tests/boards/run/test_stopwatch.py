@@ -225,21 +225,3 @@ def test_traffic_is_counted_every_so_many_cycles(site: Site) -> None:
     ]
     site.watch.count_bus()
     assert site.counts(Block.READS, Block.WRITES) == [BUS_COUNT_CYCLES] * 2
-
-
-def test_what_goes_over_the_bus_is_counted_by_accesses_and_bytes(
-    site: Site,
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    site.outputs.messages.status.value = 1.0
-    for tick in range(3):
-        site.inputs.read(tick)
-        site.outputs.write(tick, None)
-    reads = site.inputs.traffic
-    site.watch.count_bus()
-    size = site.segment.layout.mailbox("level.status").size
-    # A restarted task does not count again what its predecessor wrote.
-    site.outputs.writers["status"].close()
-    Site(site.segment).watch.count_bus()
-    assert site.counts(Block.READS, Block.READ_BYTES) == list(reads)
-    assert site.counts(Block.WRITES, Block.WRITE_BYTES) == [3, 3 * size]

@@ -19,9 +19,7 @@ from rack.backplane.operator_table import (
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, Demand, System, TaskState
-from rack.boards import Rack
 from rack.boards.config.layout import field_specs
-from rack.boards.faults.config import FaultConfig
 from rack.boards.operator import hold
 from rack.boards.run.system_controller import EndOfRun, SystemController
 from rack.boards.wiring import ClockWiring
@@ -29,22 +27,10 @@ from rack.levels.messages import TASK_STATUS
 from rack.levels.operator import OPERATOR_COMMAND, Operation
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
-from tests.boards.conftest import MakeConfig
 from tests.tools.faults.test_ending import box
 
 RESTART_TICKS = 200
 """Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("tick", [0, 1])
-def test_a_board_that_dies_at_the_first_ticks_comes_back(config: MakeConfig, tick: int) -> None:
-    fault = FaultConfig.model_validate({"kind": "kill", "board": "wave", "tick": tick})
-    with Rack(config().model_copy(update={"fault": (fault,)})) as rack:
-        outcome = rack.run(1.0)
-    assert (outcome.cause, outcome.worked) == ("time over", True)
-    back = [event for event in rack.events if event.code == "rejoined"]
-    assert [(event.board, event.tick) for event in back] == [("wave", tick + RESTART_TICKS)]
 
 
 def wiring(**changed: object) -> ClockWiring:
@@ -162,17 +148,6 @@ def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     last = Operation.GOTO if is_released else Operation.HOLD
     assert operator.peek().value.what == last
     assert not table.leased()
-
-
-def test_the_emergency_stop_engages_brakes_until_it_is_released(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    rack = Controlled(make_bus(*BOARDS))
-    assert rack.demand(0) is Demand.NONE
-    rack.words[System.EMERGENCY_STOP] = 1
-    assert rack.demand(1) is Demand.BRAKE
-    rack.words[System.EMERGENCY_STOP] = 0
-    assert rack.demand(2) is Demand.NONE
 
 
 def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come_to_rest(
