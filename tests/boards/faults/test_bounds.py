@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rack.backplane.layout import Layout
-from rack.boards.config import load, wire
+from rack.boards.config import wire
 from rack.boards.config.faults import injections
-from rack.boards.faults.bounds import BY_SIZE, NOT_ARMED, cycle_ticks, struck_mailboxes
 from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
@@ -111,45 +109,3 @@ def test_a_held_lock_is_detected_within_the_bound_of_a_wait(config: MakeConfig) 
         bound(config, {"kind": "lock-held", "board": "wave"}, None, "protocol.default=lock")
         == 1 + 4
     )
-
-
-def test_every_kind_has_a_bound_or_says_why_not() -> None:
-    without = {kind.name for kind in KINDS if kind.bound in (BY_SIZE, NOT_ARMED)}
-    assert without == {"sensor-bias", "sensor-noise", "self-test"}
-
-
-def test_the_text_of_a_bound_matches_its_computation() -> None:
-    words = {
-        name: str(KINDS[name].bound)
-        for name in ("hang", "mute", "planner-slow", "clock-stop", "command-nan")
-    }
-    assert words == {
-        "hang": "5 cycles",
-        "mute": "2 writes + 1 read",
-        "planner-slow": "1 time slice + 1 cycle",
-        "clock-stop": "3 ticks",
-        "command-nan": "the same cycle",
-    }
-
-
-def test_the_clocks_cycle_is_a_tick_and_a_planners_is_its_slice(config: MakeConfig) -> None:
-    layout = wire(rack(config))
-    assert [cycle_ticks(layout, name) for name in ("clock", "wave", "wave.planner", "watch")] == [
-        1,
-        1,
-        4,
-        8,
-    ]
-
-
-def test_a_fault_concerns_one_mailbox_of_its_task_or_all_that_it_writes(small: Path) -> None:
-    layout = wire(load(small))
-    names = [box.name for box in layout.mailboxes]
-    assert names[:3] == ["upper.command", "upper.status", "lower.status"]
-
-    def struck(at: int, board: str) -> list[str]:
-        return [box.name for box in struck_mailboxes(layout, at, board)]
-
-    assert struck(-1, "upper") == names[:2]
-    assert [struck(at, "upper") for at in range(3)] == [[names[0]], [names[1]], []]
-    assert struck(2, "lower") == [names[2]]

@@ -133,12 +133,6 @@ def test_a_fault_lasts_from_its_tick_for_its_ticks(site: Site) -> None:
     assert (site.advance(9), site.stage.injected) == ([], 1)
 
 
-def test_a_fault_without_an_end_lasts_to_the_end_of_the_run(site: Site) -> None:
-    entry = site.add("mute", tick=5)
-    site.advance(5, 6, 10**6)
-    assert (entry.until, entry.stage) == (NEVER, Stage.ACTIVE)
-
-
 def test_a_fault_of_the_clock_that_strikes_once_is_over_a_tick_later(site: Site) -> None:
     entry = site.add("clock-skip", task=-1, tick=5)
     assert site.driver.skip == 0
@@ -259,14 +253,6 @@ def test_a_hanging_task_goes_on_when_its_fault_ends_and_if_it_is_lost_the_fault_
         assert state_of(pid) in STOPPED
 
 
-def test_in_lockstep_a_phase_does_not_matter(site: Site) -> None:
-    entry = site.add("clock-skip", task=-1, tick=5, phase=500)
-    site.advance(5)
-    assert entry.count == 1
-    site.stage.within(5)
-    assert entry.count == 1
-
-
 def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -> None:
     site.segment.words[System.LOCKSTEP] = 0
     site.segment.words[System.EPOCH_NS] = time.monotonic_ns() - 5 * 2_500_000
@@ -279,12 +265,3 @@ def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -
     assert entry.struck_ns >= site.segment.words[System.EPOCH_NS] + 5.9 * 2_500_000
     site.stage.within(6)
     assert entry.count == 1
-
-
-def test_a_babble_floods_the_rings_while_it_lasts(site: Site) -> None:
-    site.add("babble", tick=2, ticks=2)
-    flooded = []
-    for tick in range(1, 5):
-        site.advance(tick)
-        flooded.append(site.driver.is_flooded)
-    assert flooded == [False, True, True, False]

@@ -94,52 +94,5 @@ def test_a_script_holds_faults_and_nothing_else(small: Path, write: Write, text:
         load(small, faults=write("script.toml", text))
 
 
-def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
-    plain = load(small)
-    assert (
-        plain.supervision.restarts,
-        plain.supervision.within_s,
-        plain.supervision.lockstep_restart_s,
-    ) == (
-        5,
-        10,
-        0.5,
-    )
-    assert (plain.board["lower"].restarts, plain.board["lower"].on_loss) == (None, "hold")
-    settings = ["supervision.restarts=2", "board.lower.restarts=0", "board.lower.on_loss=brake"]
-    config = load(small, settings)
-    assert (
-        config.supervision.restarts,
-        config.board["lower"].restarts,
-        config.board["lower"].on_loss,
-    ) == (
-        2,
-        0,
-        "brake",
-    )
-    assert loads(config.text()) == config
-
-
-@pytest.mark.parametrize(
-    ("setting", "expected"),
-    [
-        (
-            "supervision.restarts=-1",
-            "supervision.restarts = -1: should be greater than or equal to 0",
-        ),
-        ("supervision.within_s=0", "supervision.within_s = 0: should be greater than 0"),
-        ("supervision.lockstep_restart_s=inf", "should be a finite number"),
-        ("board.lower.on_loss=stay", "'hold', 'stop' or 'brake'"),
-        ("board.lower.restarts=1.5", "should be a valid integer"),
-        ("supervision.restart=1", "unknown key; did you mean 'restarts'?"),
-    ],
-)
-def test_load_reports_a_mistake_of_supervision(small: Path, setting: str, expected: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, [setting])
-    assert expected in str(error.value)
-    assert len(error.value.mistakes) == 1
-
-
 def test_the_page_of_all_keys_has_those_of_faults() -> None:
     assert reference.is_on_page("fault")

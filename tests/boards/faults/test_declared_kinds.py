@@ -43,3 +43,16 @@ def test_a_kind_declares_what_it_did(kind: Kind) -> None:
 
 def test_every_kind_of_the_project_is_known() -> None:
     assert SNAPSHOTS.known.keys() == BUILT_IN
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_drawn_values_are_permitted_ones(kind: Kind) -> None:
+    for seed in range(40):
+        d = Drawing(Random(seed), cycle=2, reader=8, second=400.0, joints=6)
+        for parameter in kind.parameters:
+            if parameter.drawn is not None:
+                value = parameter.drawn(d)
+                assert parameter.least <= value <= parameter.most
+                assert value == int(value) or not parameter.is_whole
+                assert parameter is not kind.size or value >= 0.999 * (kind.visible_from or 0)
+        assert kind.lasts is None or kind.lasts(d) >= 1

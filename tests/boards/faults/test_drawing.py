@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from random import Random
 
@@ -64,11 +63,3 @@ def test_some_faults_are_of_all_joints(draw: Callable[[Drawing], float], share: 
     found = draws(draw)
     assert set(found) == {-1, *range(JOINTS)}
     assert found.count(-1) / len(found) == pytest.approx(share, abs=0.04)
-
-
-def test_a_sweep_goes_from_its_least_size_to_well_beyond_the_visible_one() -> None:
-    sizes = drawing.swept(0.001, 0.02, 5)
-    assert (sizes[0], sizes[-1]) == (0.001, pytest.approx(BEYOND * 0.02))
-    ratios = [after / before for before, after in itertools.pairwise(sizes)]
-    assert ratios == pytest.approx([ratios[0]] * 4, rel=1e-2)
-    assert drawing.swept(0.001, 0.02, 1) == [0.001]

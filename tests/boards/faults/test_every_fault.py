@@ -29,7 +29,6 @@ pytestmark = pytest.mark.thorough
 FIRST = 104
 LENGTHS: dict[str, dict[str, Any]] = {
     "one cycle": {"cycles": 1},
-    "25 cycles": {"cycles": 25},
     "beyond patience": {"for": 1.0},
 }
 OTHERS = [kind for kind in KINDS if kind.where != "arm"]

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
+from rack.boards import Rack
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import LOOSE, MakeConfig
 from tests.boards.fault_racks import DRIVEN, FOLLOWED, LOCKED, TARGETS
 from tests.snapshots import Snapshots
 from tests.whole_runs import in_short, whole_run
@@ -64,3 +65,20 @@ def test_a_fault_strikes_as_it_did(kind: Kind, rack: str, config: MakeConfig) ->
     if kind.name in BY_ORDER:
         del parts["events"]
     SNAPSHOTS.check(f"{kind.name}, {rack}", in_short(parts))
+
+
+@pytest.mark.parametrize(
+    ("kind", "coupling"),
+    [("drop", ()), ("reorder", ()), ("delay", LOOSE), ("masquerade", LOOSE)],
+)
+def test_a_run_with_a_fault_of_a_planner_repeats(
+    kind: str, coupling: tuple[str, ...], config: MakeConfig
+) -> None:
+    lasts = {} if KINDS[kind].once else {"cycles": 80}
+    fault = FaultConfig(kind=kind, board="wave.planner", tick=101, **lasts)
+    struck = config(*coupling).model_copy(update={"fault": (fault,)})
+    digests = []
+    for _ in range(2):
+        with Rack(struck) as rack:
+            digests.append(rack.run(1.0).digest)
+    assert digests[0] == digests[1]

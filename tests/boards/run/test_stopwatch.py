@@ -225,3 +225,7 @@ def test_traffic_is_counted_every_so_many_cycles(site: Site) -> None:
     ]
     site.watch.count_bus()
     assert site.counts(Block.READS, Block.WRITES) == [BUS_COUNT_CYCLES] * 2
+    # A restarted task does not count again what its predecessor wrote.
+    site.outputs.writers["status"].close()
+    Site(site.segment).watch.count_bus()
+    assert site.counts(Block.READS, Block.WRITES) == [BUS_COUNT_CYCLES] * 2
