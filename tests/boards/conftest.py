@@ -56,14 +56,6 @@ MakeConfig = Callable[..., RackConfig]
 
 
 @pytest.fixture
-def wave_file(tmp_path: Path) -> Path:
-    """The rack of waves with a planner, as a file."""
-    path = tmp_path / "waves.toml"
-    path.write_text(PLANNED)
-    return path
-
-
-@pytest.fixture
 def config(rack_name: str, tmp_path: Path) -> Iterator[MakeConfig]:
     """Configs of this test's own rack, with settings; checks that it leaves nothing behind."""
 

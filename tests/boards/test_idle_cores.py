@@ -60,17 +60,3 @@ def test_a_rack_that_is_asked_to_holds_idle_cores_awake_and_says_so(config: Make
     held, notes = held_in(Rack(config("clock.mode=realtime", AWAKE), share=True))
     assert held == ["clock"]
     assert notes == ['clock.idle_cores = "awake": idle cores are held awake']
-
-
-def test_a_launch_says_why_idle_cores_cannot_be_held_awake(
-    config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # As for a user who is not root: the device cannot be opened.
-    monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
-    with Rack(config("clock.mode=realtime", AWAKE), share=True) as rack:
-        (note,) = [event.text for event in rack.events if "idle" in event.text]
-    reason = (
-        f"idle cores sleep, since {tmp_path / 'missing'} cannot be opened: No such file or"
-        " directory"
-    )
-    assert note == f'clock.idle_cores = "awake": {reason}'

@@ -202,20 +202,3 @@ def test_a_mistake_in_a_modification_is_one_line(
     assert len(caught.value.mistakes) == 1
     assert str(caught.value).startswith(place)
     assert why in str(caught.value)
-
-
-def test_a_name_given_twice_is_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "twice.toml"
-    table = '[board.shoulder.params.modifications.it]\nclass = "law_modifications:Lean"\n'
-    path.write_text(f"{TEXT}\n{table}{table}")
-    with pytest.raises(ConfigError) as caught:
-        load(path)
-    assert len(str(caught.value).splitlines()) == 1
-
-
-@pytest.mark.slow
-def test_a_command_names_a_modification_of_its_board(rack_of: Callable[..., RackConfig]) -> None:
-    with pytest.raises(ConfigError, match="modify of 'shoulder' knows: pd, lean, breaks"):
-        wire(rack_of(commands(switch("leans", True, 1))))
-    with pytest.raises(ConfigError, match="modify of 'wrist' knows: none"):
-        wire(rack_of(commands("level='wrist', what='modify', name='lean', on=true")))

@@ -212,53 +212,6 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
 
 
 @pytest.mark.slow
-def test_a_command_stays_in_force_when_the_next_one_is_refused(
-    commanded: Callable[..., RackConfig],
-) -> None:
-    # Both come within one cycle of the level.
-    setting = commands(
-        "level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52"
-    )
-    _, _, boxes = run(commanded(setting))
-    told = boxes["upper.status"]["message"][["order", "answer"]].tolist()
-    # Each gets its answer; the hold's comes when the level below has followed.
-    assert list(dict.fromkeys(told)) == [
-        (0, Answer.NONE),
-        (1, Answer.TAKEN),
-        (2, Answer.REFUSED),
-        (1, Answer.DONE),
-    ]
-    assert boxes["upper.status"]["message"][-1]["standing"] == Operation.HOLD
-
-
-@pytest.mark.slow
-def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
-    commanded: Callable[..., RackConfig],
-) -> None:
-    setting = commands(
-        "level='lower', what='modify', name='twice', on=true, tick=50",
-        "level='lower', what='hold', tick=60",
-        "level='lower', what='modify', name='twice', on=false, tick=70",
-        "level='lower', what='resume', tick=80",
-    )
-    _, events, boxes = run(commanded(setting))
-    rows = boxes["lower.status"]
-    counts = np.diff(rows["message"]["count"])
-    assert [counts[rows["tick"][1:] == tick].item() for tick in (50, 51, 60, 61, 80, 81)] == [
-        1,
-        2,
-        2,
-        0,
-        0,
-        1,
-    ]
-    at = rows["message"][rows["tick"] == 71]
-    assert (at["standing"], at["answer"], at["operator"]) == (Operation.HOLD, Answer.DONE, 3)
-    texts = [event.text for event in events if event.kind == "command" and event.code == "modify"]
-    assert texts == ["modify twice on (command 1)", "modify twice off (command 3)"]
-
-
-@pytest.mark.slow
 def test_a_program_commands_its_rack_during_the_run(commanded: Callable[..., RackConfig]) -> None:
     with Rack(commanded("clock.mode=realtime")) as rack:
         rack.start(20.0)

@@ -18,7 +18,6 @@ from rack.boards.config import wire
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from tests.boards.conftest import CLOCK, MakeConfig
-from tests.boards.messages import Written
 
 QUEUES = f"""{CLOCK}
 [board.upper]
@@ -67,19 +66,6 @@ def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str
 
 
 @pytest.mark.slow
-def test_a_slower_reader_gets_every_request_of_a_burst(config: MakeConfig) -> None:
-    with Rack(config("board.upper.params.until=360", text=QUEUES)) as rack:
-        rack.run(2.0)
-        assert counts(rack, "upper")["sent"] == 27
-        assert counts(rack, "lower") | {
-            "taken": 27,
-            "newest": 27,
-            "repeated": 0,
-            "missing": 0,
-        } == counts(rack, "lower")
-
-
-@pytest.mark.slow
 def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> None:
     faults = tuple(
         FaultConfig(kind="kill", board=board, tick=tick)
@@ -96,22 +82,6 @@ def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> 
             assert counts(rack, "lower")["repeated"] == 0
             assert [e.text for e in rack.events if e.code == "queue_full"]
     assert len(digests) == 1
-
-
-@pytest.mark.slow
-def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
-    depth = "protocol.depth={ 'upper.requests' = 7 }"
-    runs = []
-    for mode in ("lockstep", "realtime"):
-        with Rack(
-            config(f"clock.mode={mode}", "board.lower.params.most=4", depth, text=QUEUES)
-        ) as rack:
-            rack.run(1.0)
-            runs.append(Written.on(rack.segment))
-    exact, real = runs
-    same = real.first_miss(400)
-    assert same > 0
-    assert real.until(same) == exact.until(same)
 
 
 def kill_often(rack: Rack, board: str, times: int, rng: random.Random) -> None:

@@ -45,20 +45,6 @@ def at(rows: np.ndarray, tick: int) -> np.void:
 
 
 @pytest.mark.slow
-def test_each_joint_takes_its_part_and_the_level_below_has_the_whole_vector(
-    jointed: MakeConfig,
-) -> None:
-    digest, written = run(jointed())
-    assert run(jointed())[0] == digest
-    arm, path = written.messages["arm.status"], written.messages["path.status"]
-    # Commanded at 80, taken by the joints at 88, added up at 89, seen by them at 90.
-    assert at(arm, 88)["message"]["position"].tolist() == [72.0, 144.0, 216.0]
-    assert at(arm, 89)["message"]["position"].tolist() == [80.0, 160.0, 240.0]
-    assert at(path, 96)["message"]["position"].tolist() == [80.0, 160.0, 240.0]
-    assert not path["message"]["lost"].any()
-
-
-@pytest.mark.slow
 def test_a_message_that_rests_on_many_rests_on_the_oldest_of_them(jointed: MakeConfig) -> None:
     written = run(jointed("board.joint2.rate_hz=100"))[1].messages
     # joint1 rests on the arm's cycle one tick before its own, joint2 on that before its last cycle

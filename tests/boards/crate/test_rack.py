@@ -39,7 +39,7 @@ ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
 SMALL = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o size=$0 tmpfs /dev/shm && exec "$@"')
 """A command in a /dev/shm of its own, of the size that comes next."""
-ONE_MAY, TWO_MAY, FOUR_MAY, FIVE_MAY = range(65_521, 65_525)
+TWO_MAY, FIVE_MAY = range(65_521, 65_523)
 """Users of nobody else: processes are counted by user, and tests run side by side."""
 PLAIN_ROOT = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "--inh-caps=-sys_nice,-ipc_lock")
 """A command without the rights to real-time priorities and to locked memory."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 
@@ -13,7 +12,6 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock, open_writer
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.process import die_with_parent
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import Flag, trace_ring
 from rack.backplane.words import Block, Slot, System
@@ -24,7 +22,7 @@ from rack.boards.run import control_loop
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
 from tests.boards.conftest import MakeConfig
-from tests.processes import FORKS, exit_status, fork, runs, wait_until
+from tests.processes import FORKS
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 TROUBLE = Flag.MISSED | Flag.SKIPPED | Flag.BUS_ERROR | Flag.CORRUPT
@@ -203,29 +201,6 @@ def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:
         rack.task("wave")
     writer.close()
     rack.task("wave")
-
-
-def test_a_board_dies_with_its_crate() -> None:
-    reading, writing = os.pipe()
-
-    def crate() -> None:
-        parent = os.getpid()
-
-        def board() -> None:
-            die_with_parent(parent)
-            os.write(writing, b"%d\n" % os.getpid())
-            time.sleep(60)
-
-        fork(board)
-        time.sleep(60)
-
-    pid = fork(crate)
-    with os.fdopen(reading) as lines:
-        board = int(lines.readline())
-    os.close(writing)
-    os.kill(pid, 9)
-    assert exit_status(pid) == -9
-    wait_until(lambda: not runs(board))
 
 
 def test_a_pause_in_reading_is_noted_in_a_cycle_that_begins_late(bench: MakeBench) -> None:

@@ -15,7 +15,6 @@ from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import FIELDS, TraceWriter
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.words import Block
 from rack.boards.faults import messages
 from rack.boards.faults.kind import KINDS
 from rack.boards.run.ports import InputPorts, OutputPorts
@@ -203,16 +202,6 @@ def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) 
     assert rack.taken == [1, 2]
     assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
     assert [rack.read(9).value.id, rack.taken] == [6, [1, 2, 5, 6]]
-
-
-def test_silence_of_the_writer_proves_nothing_but_its_loss_counts(link: MakeQueue) -> None:
-    rack = link()
-    rack.run(0, 4, lambda tick: 1)
-    rack.run(4, 200, lambda tick: 0)
-    assert not rack.read(200).is_lost
-    rack.segment.block("writer")[Block.LOST] = 201
-    assert [rack.read(200).is_lost, rack.read(201).is_lost] == [False, True]
-    assert rack.alarms("reader") == []
 
 
 FOUND = {
