@@ -75,17 +75,6 @@ class Counting(Host):
             bus.wait(1.0)
 
 
-class Flooding(Host):
-    """Sends for ever more than the ring holds, and never reads."""
-
-    def run(self, bus: Bus) -> None:
-        """Send as often as it is let."""
-        while not bus.is_over:
-            for _ in range(200):
-                bus.send("numbers", value=1.0)
-            bus.wait(0.001)
-
-
 class Deaf(Host):
     """Blocks for ever in one call, and keeps out SystemExit."""
 
@@ -131,18 +120,6 @@ class Printing(Host):
             super().run(bus)
         while not bus.is_over:
             os.write(1, f"{text}\n".encode())
-
-
-class Improper(Host):
-    """Sends what no number may hold, then a proper one."""
-
-    def run(self, bus: Bus) -> None:
-        """Send NaN, an unknown colour, then 7."""
-        bus.send("numbers", value=float("nan"))
-        bus.send("numbers", value=1.0, colour=9)
-        bus.send("numbers", value=7.0)
-        while bus.read("sum").value.sum < 7.0:
-            bus.wait(1.0)
 
 
 class Silent(Host):

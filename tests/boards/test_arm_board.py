@@ -36,17 +36,11 @@ WRONG: dict[str, tuple[Mapping[str, Mapping[str, Any]], str, str]] = {
         "board.arm.above",
         "the gripper must be commanded by one board; it is commanded by none",
     ),
-    "a gripper that two boards drive": (
-        APART | {"servo_j2": {"joints": ["j2"], "gripper": True}},
-        "board.arm.above",
-        "the gripper must be commanded by one board; it is commanded by 'servo_j2', 'servo_j6'",
-    ),
     "a joint that the arm lacks": (
         named(["j1", "j7"]),
         "board.servo_j1.params.joints",
         "the arm has no such joint; joints: j1, j2, j3, j4, j5, j6",
     ),
-    "a joint named twice": (named(["j1", "j1"]), "board.servo_j1.params.joints", "named twice"),
     "a board that drives nothing": (
         TOGETHER | {"idle": {"joints": []}},
         "board.idle.params.joints",

@@ -12,7 +12,6 @@ from rack.boards.config import load, resolve, shared_out, wire
 from rack.boards.config import resolved as resolved
 from rack.boards.config.layout import obtained_core
 from rack.boards.config.rules import broken_rules
-from rack.levels.level import Pace
 
 SIZES = {"joints": 6, "bodies": 3, "state": 120}
 
@@ -43,13 +42,6 @@ def test_mailboxes_keep_two_seconds_and_at_least_their_readers_slice(small: Path
     assert layout.mailbox("upper.command").depth == depth_for(9008, 8)
 
 
-def test_protocols_are_set_for_the_rack_and_for_one_mailbox(small: Path) -> None:
-    settings = ["protocol.default=double-buffer", "protocol.mailbox={ 'lower.plan' = 'lock' }"]
-    layout = wire(load(small, settings))
-    assert layout.mailbox("lower.plan").protocol == "lock"
-    assert layout.mailbox("upper.command").protocol == "double-buffer"
-
-
 def test_missing_cores_are_replaced_and_reported(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -58,22 +50,6 @@ def test_missing_cores_are_replaced_and_reported(
     assert shared_out(
         load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])
     ) == ["core 5 is not available (available: 2, 3): core 3 runs upper"]
-
-
-def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
-    upper, lower, _ = (
-        task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks
-    )
-    assert (lower.board, lower.every, lower.within_cycles, lower.clock_ns, lower.seed) == (
-        "lower",
-        1,
-        4,
-        2_500_000,
-        5,
-    )
-    assert (lower.above, lower.below) == ({"upper": Pace(8, 1)}, {})
-    assert upper.below == {"lower": Pace(1, 4)}
-    assert lower.params == {"gain": 2}
 
 
 def test_a_launch_resolves_and_checks_everything_once(

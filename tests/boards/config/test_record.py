@@ -16,12 +16,6 @@ def test_durations_are_text_or_seconds_and_survive_the_config_of_a_run(small: Pa
     assert loads(config.text()).record == config.record
 
 
-def test_by_default_everything_is_kept_with_a_checkpoint_each_5_s(small: Path) -> None:
-    record = load(small, []).record
-    assert (record.keep, record.checkpoint_s) == (None, 5.0)
-    assert load(small, ["record.checkpoint_s=0"]).record.checkpoint_s == 0.0
-
-
 @pytest.mark.parametrize(
     ("table", "line"),
     [

@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Demand
 from rack.boards.config.resolved import Resolved, load, resolve
-from rack.boards.errors import ConfigError, LaunchError
+from rack.boards.errors import LaunchError
 from tests.boards.conftest import MakeConfig
 
 REFUSED = "SCHED_FIFO refused, ordinary scheduling for wave"
@@ -86,19 +86,6 @@ def test_a_launch_says_whether_idle_cores_are_held_awake(
     awake = resolve(config("clock.mode=realtime", "clock.idle_cores=awake"))
     (note,) = [note for note in awake.notes(segment) if "idle_cores" in note]
     assert note.startswith('clock.idle_cores = "awake": ')
-
-
-def test_a_board_beside_a_broken_one_is_checked_and_so_is_what_is_of_no_board(
-    config: MakeConfig,
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        config("board.wave.slot=99", "board.watch.params.nothing=1", "clock.core=-1")
-    found = {mistake.place for mistake in caught.value.mistakes}
-    assert {"board.wave.slot", "clock.core"} <= found
-    with pytest.raises(ConfigError) as caught:
-        config("board.wave.slot=99", "board.watch.executor=wave_levels:Nobody")
-    found = {mistake.place for mistake in caught.value.mistakes}
-    assert found == {"board.wave.slot", "board.watch.executor"}
 
 
 @pytest.mark.parametrize(

@@ -120,13 +120,7 @@ def test_lost_cycles_are_excused_by_an_injected_fault_as_far_as_it_can_have_cost
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("fraction", "worked"),
-    [
-        (0.05, False),
-        (0.15, True),
-    ],
-)
+@pytest.mark.parametrize(("fraction", "worked"), [(0.05, False), (0.15, True)])
 def test_a_board_that_dies_by_itself_is_not_excused(
     config: MakeConfig, fraction: float, worked: bool
 ) -> None:

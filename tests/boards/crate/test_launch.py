@@ -115,17 +115,6 @@ def test_a_launch_reports_what_it_waits_for(
 
 
 @pytest.mark.slow
-def test_a_preload_that_does_not_end_is_named(
-    config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
-    fifo(tmp_path, monkeypatch)
-    reason = refusal(Rack(config("board.watch.executor=wave_levels:SlowlyPreloaded", text=PLAIN)))
-    assert reason.startswith("preloading 'wave_levels:SlowlyPreloaded'")
-    assert reason.endswith("not done within 2 s")
-
-
-@pytest.mark.slow
 def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(
     config: MakeConfig,
 ) -> None:

@@ -177,23 +177,6 @@ def test_a_removed_rack_frees_its_memory(config: MakeConfig) -> None:
     assert maps.read_text().count("(deleted)") < before, name
 
 
-def test_counters_show_the_bus_traffic(config: MakeConfig) -> None:
-    rack = Rack(config(text=PLAIN))
-    run(rack, 0.4)
-    wave, watch = (rack.segment.block(name) for name in ("wave", "watch"))
-    size = rack.segment.layout.mailbox("wave.status").size
-    assert [wave[w] for w in (Block.CYCLES, Block.WRITES, Block.WRITE_BYTES)] == [
-        160,
-        160,
-        160 * size,
-    ]
-    # At tick 0 there is nothing yet to read.
-    assert [watch[w] for w in (Block.CYCLES, Block.READS, Block.READ_BYTES)] == [20, 20, 19 * size]
-    assert [
-        block[w] for block in (wave, watch) for w in (Block.MISSED, Block.CORRUPT, Block.BUS_ERRORS)
-    ] == [0] * 6
-
-
 def text_of(events: Sequence[Event], kind: str) -> str:
     return "\n".join(event.text for event in events if event.kind == kind)
 

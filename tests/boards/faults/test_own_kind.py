@@ -3,11 +3,8 @@ other change."""
 
 from __future__ import annotations
 
-import json
-import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -19,7 +16,6 @@ from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults.bounds import cycles
 from rack.tools.commands.inject import kinds_text
 from tests.boards.conftest import PLAIN, MakeConfig
-from tests.processes import RACK
 
 BOUND_S = 60
 MODULE = "gauge_levels"
@@ -72,13 +68,6 @@ def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
     )
 
 
-def test_a_value_that_a_users_own_enum_lacks_lists_those_it_has(config: MakeConfig) -> None:
-    with pytest.raises(
-        ConfigError, match="'ajar' is not a value of 'valve'; permitted: shut, open"
-    ):
-        wire(config(fault('when = "wave.status.valve == ajar"'), text=GAUGED))
-
-
 @pytest.mark.slow
 def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
     with Rack(
@@ -92,34 +81,6 @@ def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
     detected = next(event for event in events if event.kind == "detection")
     assert (detected.code, detected.subject) == ("gap", "wave.status")
     assert sum(event.kind == "fault" and "acted 20 time" in event.text for event in events) == 1
-
-
-@pytest.mark.slow
-def test_a_campaign_draws_and_judges_a_kind_of_a_users_own(tmp_path: Path) -> None:
-    path, out = tmp_path / "gauge.toml", tmp_path / "campaign"
-    path.write_text(GAUGED)
-    command = [
-        *RACK,
-        "campaign",
-        str(path),
-        "--lockstep",
-        "--injections",
-        "2",
-        "--kinds",
-        "lose-every",
-    ]
-    done = subprocess.run(
-        [*command, "--seconds", "6", "--out", str(out), "--json"],
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
-    report = json.loads(done.stdout)
-    assert (done.returncode, report["shortfalls"]) == (0, [])
-    figures = report["by_kind"]["lose-every"]
-    assert (figures["injected"], figures["detected"], figures["within_bound"]) == (2, 2, 2)
-    assert figures["bound"] == "1 write + 1 delivery"
 
 
 def test_two_kinds_of_one_name_are_refused() -> None:

@@ -140,44 +140,6 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
 
 
 @pytest.mark.slow
-def test_a_flood_is_bounded_in_every_cycle_and_its_writer_is_refused(config: MakeConfig) -> None:
-    settings = (
-        "host.program.program=host_programs:Flooding",
-        "board.bridge.params.pass.numbers.most=3",
-    )
-    with Rack(config(*settings, text=HOSTED)) as rack:
-        rack.start()
-        watch(
-            rack,
-            lambda: (
-                status(rack.segment).numbers["full"] > 100
-                and status(rack.segment).numbers["passed"] > 100
-            ),
-        )
-        entry, bridge = status(rack.segment).numbers, rack.segment.block("bridge")
-        assert entry["passed"] <= 3 * bridge[Block.CYCLES]
-        assert entry["waiting"] <= 32
-        assert bridge[Block.MISSED] == rack.segment.block("adder")[Block.MISSED] == 0
-
-
-@pytest.mark.slow
-def test_what_is_improper_is_refused_at_the_bridge(config: MakeConfig) -> None:
-    settings = (
-        "host.program.program=host_programs:Improper",
-        "board.bridge.params.pass.sum={ every = 3, phase = 1 }",
-    )
-    with Rack(config(*settings, text=HOSTED)) as rack:
-        assert rack.run().cause == "task done"
-        entry = status(rack.segment).numbers
-        assert (entry["passed"], entry["refused"], status(rack.segment, "adder").sum) == (1, 2, 7.0)
-        # The other entry is exchanged in the second of every three cycles.
-        assert (
-            status(rack.segment).sum["passed"]
-            == (rack.segment.block("bridge")[Block.CYCLES] + 1) // 3
-        )
-
-
-@pytest.mark.slow
 def test_a_program_that_keeps_every_signal_out_ends_with_its_rack_and_all_that_it_started(
     config: MakeConfig,
 ) -> None:

@@ -73,18 +73,12 @@ def test_a_run_repeats_however_long_its_program_takes(
     assert slow(config, 0.0, *settings) == slow(config, 0.03, *settings)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "kill",
-    ],
-)
 def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(
-    config: MakeConfig, kind: str
+    config: MakeConfig,
 ) -> None:
     settings = (
         "host.program.program=host_programs:Lingering",
-        f"fault=[{{ kind='{kind}', board='program', at=0.2 }}]",
+        "fault=[{ kind='kill', board='program', at=0.2 }]",
     )
     with Rack(config(*settings, "board.bridge.ends_run=false", text=HOSTED)) as rack:
         assert rack.run(0.5).cause == "time over"
@@ -130,21 +124,22 @@ def test_a_stop_ends_the_wait_for_a_program(config: MakeConfig) -> None:
     assert time.monotonic() - began < LONGEST_S / 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGSTOP])
-def test_a_program_that_dies_while_the_rack_waits_for_it_does_not_hold_the_rack(
-    config: MakeConfig, number: signal.Signals
+def test_a_program_that_stops_while_the_rack_waits_for_it_does_not_hold_the_rack(
+    config: MakeConfig,
 ) -> None:
     with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
         rack.start()
         block = rack.segment.block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
-        os.kill(block[Block.PID], number)
+        os.kill(block[Block.PID], signal.SIGSTOP)
         watch(rack, lambda: "rejoined" in codes(rack, "program"))
     assert [code for code in codes(rack, "program") if code in ENDS] == [
         "died",
         "restart",
         "rejoined",
     ]
+    said = [event.text for event in rack.events]
+    assert "'program' is not responding: stopped by a signal" in said
 
 
 def test_a_program_that_is_given_up_ends_the_run_at_the_same_tick(config: MakeConfig) -> None:

@@ -113,22 +113,6 @@ def test_what_cannot_be_a_round_trip_is_refused(bad: RoundTrip) -> None:
     assert found.best is None
 
 
-def test_another_launch_and_a_loss_begin_anew() -> None:
-    peer = PeerRack("b")
-    clock = PeerClock(peer)
-    for change, is_anew in (
-        (lambda: peer.comes(7, 0), True),
-        (lambda: peer.goes(7, 1), True),
-        (lambda: peer.comes(7, 2), False),  # the loss has begun it anew
-        (lambda: peer.comes(8, 3), True),
-    ):
-        clock.offset.add(trip(0, 0))
-        peer.offset_ns = 0
-        change()
-        clock.begin()
-        assert (clock.offset.best is None) == (peer.offset_ns is None) == is_anew
-
-
 def test_what_was_measured_of_an_earlier_launch_is_forgotten() -> None:
     peer = PeerRack("b")
     peer.comes(7, 0)

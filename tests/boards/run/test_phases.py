@@ -99,18 +99,12 @@ def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "victim",
-    [
-        "left",
-    ],
-)
-def test_a_restart_keeps_the_phase(config: MakeConfig, victim: str) -> None:
+def test_a_restart_keeps_the_phase(config: MakeConfig) -> None:
     plain = config("supervision.lockstep_restart_s=0.06", text=cyclic())
-    kill = FaultConfig(kind="kill", board=victim, tick=42)
+    kill = FaultConfig(kind="kill", board="left", tick=42)
     rack = Rack(plain.model_copy(update={"fault": (kill,)}))
-    ticks = written(rack, 0.5).cycles[victim]["tick"].tolist()
-    every, phase, _ = MINOR[victim]
+    ticks = written(rack, 0.5).cycles["left"]["tick"].tolist()
+    every, phase, _ = MINOR["left"]
     assert ticks[0] == phase
     assert {tick % every for tick in ticks} == {phase}
     steps = [later - earlier for earlier, later in pairwise(ticks)]

@@ -38,11 +38,8 @@ def mistakes(config: RackConfig, broken: frozenset[str] = frozenset(), **given: 
     "given",
     [
         {"level": "task", "what": "hold"},
-        {"level": "task", "what": "resume", "tick": 0},
         {"level": "task", "what": "goto", "home": True},
         {"level": "task", "what": "goto", **PLACE, "at": 2.0},
-        {"level": "task", "what": "goto", **PLACE, "quaternion": [0.0, 1.0, 0.0, 0.0]},
-        {"level": "task", "what": "goto", **PLACE, "direction": [0.0, 0.0, -1.0]},
         {"level": "servo", "what": "setpoint", "joints": HOME},
     ],
 )
@@ -72,15 +69,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
         "position: not a goal for setpoint of 'servo'; permitted: joints",
     ),
     (
-        {"level": "servo", "what": "setpoint", "home": True},
-        "home: not a goal for setpoint of 'servo'; permitted: joints",
-    ),
-    (
         {"level": "task", "what": "goto", "quaternion": [1.0, 0.0, 0.0, 0.0]},
-        "position: missing; tool position, m",
-    ),
-    (
-        {"level": "task", "what": "goto", "direction": [1.0, 0.0, 0.0]},
         "position: missing; tool position, m",
     ),
     (

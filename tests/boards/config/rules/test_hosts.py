@@ -116,21 +116,6 @@ def test_a_mistake_is_one_line(name: str) -> None:
     assert line in str(mistake)
 
 
-def test_a_bridge_and_its_host_boards_are_in_the_layout() -> None:
-    resolved = resolve(loads(HOSTED))
-    layout = resolved.layout
-    assert [host.name for host in layout.hosts] == ["program"]
-    assert [task.name for task in layout.tasks] == ["bridge", "adder"]
-    boxes = {box.name: (box.writer, box.readers, box.protocol) for box in layout.mailboxes}
-    assert boxes["program.numbers"] == ("program", ("bridge",), "queue")
-    assert boxes["bridge.numbers"] == ("bridge", ("adder",), "queue")
-    assert boxes["bridge.sum"] == ("bridge", ("program",), "time-slice")
-    assert {box.name for box in layout.timed} == set(boxes) - {"program.numbers"}
-    bridge = next(task for task in resolved.tasks if task.task == "bridge")
-    assert dict(bridge.inputs) == {"sum": "adder.status"}
-    assert set(bridge.outputs) == {"numbers", "status"}
-
-
 def test_a_host_board_with_a_mistake_hides_none_of_another_and_causes_none() -> None:
     other = 'program = "host_programs:Nobody"\nbelow = "bridge"'
     text = HOSTED.replace("[host.program]", "[host.program]\ncomputing_ms = -1")

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, loads, resolve, wire
-from rack.boards.config.files import CONFIGS
+from rack.boards.config import load, loads, resolve
 from rack.boards.config.rules.lan import network_notes
 from rack.boards.errors import ConfigError
 from rack.tools.network.certificates import make_credentials
@@ -109,16 +108,6 @@ def test_certificates_are_found_next_to_the_config_from_anywhere(
     assert "cell.pem: not for address 127.0.0.2; for 127.0.0.1" in line
 
 
-def test_a_recorded_config_can_be_wired_where_its_certificates_are_not(tmp_path: Path) -> None:
-    make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
-    assert mistakes(tmp_path, TLS, 'certificates = "certs"') == []
-    text = load(tmp_path / "rack.toml").text()
-    (tmp_path / "certs/cell-key.pem").unlink()
-    assert wire(loads(text)).task("lan").every > 0
-    with pytest.raises(ConfigError, match=r"cell-key\.pem: missing"):
-        resolve(loads(text))
-
-
 def test_nobody_could_import_over_tls_without_being_named(tmp_path: Path) -> None:
     make_credentials(tmp_path / "certs", {"cell": ["127.0.0.1"]}, 1)
     path = tmp_path / "rack.toml"
@@ -187,7 +176,3 @@ def test_nobody_may_stop_a_rack_where_anyone_could_pass_for_another(tmp_path: Pa
         assert mistakes(tmp_path, lan=lan + more, connect=(at,)) == [line]
     assert mistakes(tmp_path, TLS, lan + own) == []
     assert mistakes(tmp_path, "unix/cell", lan, connect=("unix/puma",)) == []
-
-
-def test_bundled_configs_bring_no_certificates() -> None:
-    assert not list(CONFIGS.rglob("*.pem"))

@@ -146,23 +146,9 @@ MISTAKES = {
         ],
         "adapter.lan.import.status: the adapter writes its status under this name; rename the port",
     ),
-    "a port of a peer": (
-        [
-            "adapter.lan.import.peer_two={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms"
-            " = 500 }"
-        ],
-        (
-            "adapter.lan.import.peer_two: the adapter writes what it knows of rack 'two' under this"
-            " name; rename the port"
-        ),
-    ),
     "a board of its name": (
         ["board.lan={ slot = 9, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
         "board.lan: [adapter.lan] makes the board of this name; rename the board, or leave one out",
-    ),
-    "a host board of its name": (
-        ["host.lan={ program = 'rack.levels.host_program:HostProgram' }"],
-        "host.lan: adapter.lan has this name already",
     ),
     "a board that is the adapter": (
         ["board.net={ slot = 9, rate_hz = 50, executor = 'rack.boards.lan.adapter:LanAdapter' }"],
@@ -174,10 +160,6 @@ MISTAKES = {
     "a slot that is taken": (
         ["adapter.lan.slot=2"],
         "adapter.lan.slot = 2: already taken by board.pulse.slot",
-    ),
-    "a slot that it has taken": (
-        ["board.late={ slot = 5, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
-        "adapter.lan.slot = 5: already taken by board.late.slot",
     ),
     "a priority below a neighbour's": (
         ["clock.mode=realtime", "adapter.lan.priority=40", "board.pulse.priority=40"],

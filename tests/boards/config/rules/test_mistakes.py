@@ -33,8 +33,6 @@ MISTAKES = {
     "slot of the clock": ("board.upper.slot=1", "slot 1 is the clock's"),
     "slot taken": ("board.upper.slot=3", "board.lower.slot = 3: already taken by board.upper.slot"),
     "name": ("name='../x'", 'name = "../x": '),
-    "choice": ("clock.mode=fast", "'realtime' or 'lockstep'"),
-    "not finite": ("clock.speed=inf", "clock.speed = inf: should be a finite number"),
     "period": (
         "clock.period_ms=2.4999995",
         "clock.period_ms = 2.4999995: not a whole number of ns",
@@ -46,7 +44,6 @@ MISTAKES = {
             " (every 6 ticks)"
         ),
     ),
-    "rate above the clock": ("board.upper.rate_hz=1000", "nearest: 400 Hz (every 1 tick)"),
     "rate and period": ("board.upper.every=4", "every is also given"),
     "speed in lockstep": ("clock.speed=2", "clock.speed = 2.0: lockstep runs as fast as it can"),
     "neighbour": (
@@ -99,10 +96,6 @@ MISTAKES = {
     "end without a state": (
         "board.upper.executor=two_levels:Stateless",
         "board.upper.ends_run = true: its status has no field 'state' of State",
-    ),
-    "board name": (
-        "board.own={ slot = 4, every = 1, executor = 'two_levels:Upper', below = 'lower' }",
-        "invalid name for a board",
     ),
     "no class name": ("board.upper.executor=two_levels", "package.module:Class"),
     "moving what is not there": (
