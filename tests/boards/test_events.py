@@ -100,25 +100,6 @@ def test_the_last_status_of_the_level_that_ends_a_run_is_its_cause(
     assert ending(bus).final_state() == (state.name.lower(), "so it is")
 
 
-def test_an_error_or_a_hold_of_a_level_without_a_reason_counts_as_any_other(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    kind = MessageType(
-        "terse", 1, (Field("state", "u1", State, ""), Field("error", "u2", "1", "code"))
-    )
-    bus = make_bus(task("upper"), box("upper.status", kind, "upper"))
-    write(bus, "upper.status", state=State.HOLDING, error=3)
-    bus.block("upper")[Block.LEVEL_STATE] = State.HOLDING
-    assert ending(bus, None).latched() == ["level 'upper': error 3"]
-    (held,) = ending(bus, None).held((), (), 2 * HELD_MS)
-    assert held.endswith("without a cause in sight: no reason given")
-
-
-def test_a_run_that_no_level_ends_is_over_in_time(bus: Segment) -> None:
-    assert ending(bus, None).cause() == "time over"
-    assert ending(bus, None).final_state() == ("", "")
-
-
 @pytest.mark.parametrize(("written", "at", "is_silent"), [(5, 45, False), (5, 46, True)])
 @pytest.mark.parametrize("state", [State.EXECUTING, State.DONE, State.ERROR])
 def test_a_level_that_is_silent_for_too_long_has_failed_unless_it_is_done(

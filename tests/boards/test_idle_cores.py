@@ -44,17 +44,6 @@ def held_in(rack: Rack) -> tuple[list[str], list[str]]:
     return held, [event.text for event in rack.events if "idle" in event.text]
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [("clock.mode=realtime", "clock.priority=90"), (AWAKE,)],
-    ids=["default", "lockstep"],
-)
-def test_a_rack_leaves_idle_cores_alone_by_default_and_in_lockstep(
-    config: MakeConfig, settings: tuple[str, ...]
-) -> None:
-    assert held_in(Rack(config(*settings), share=True)) == ([], [])
-
-
 @needs_request
 def test_a_rack_that_is_asked_to_holds_idle_cores_awake_and_says_so(config: MakeConfig) -> None:
     held, notes = held_in(Rack(config("clock.mode=realtime", AWAKE), share=True))

@@ -149,35 +149,6 @@ def test_a_setting_that_cannot_be_is_one_line(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
-def test_commands_reach_their_level_under_any_protocol(
-    commanded: Callable[..., RackConfig], protocol: str
-) -> None:
-    config = commanded(HELD, f"protocol.default={protocol}")
-    # The clock must never wait.
-    assert wire(config).mailbox("upper.operator").protocol == "double-buffer"
-    _, _, boxes = run(config)
-    assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
-
-
-@pytest.mark.slow
-def test_serials_rise_over_all_levels_in_order_of_issue(
-    commanded: Callable[..., RackConfig],
-) -> None:
-    setting = commands(
-        "level='lower', what='hold', at=0.5",
-        "level='upper', what='hold', tick=50",
-        "level='lower', what='resume', at=0.5",
-    )
-    _, _, boxes = run(commanded(setting))
-    assert boxes["upper.operator"]["message"]["id"].tolist() == [1]
-    assert boxes["lower.operator"]["message"]["id"].tolist() == [2, 3]
-    assert boxes["lower.operator"]["tick"].tolist() == [200, 200]
-    # Of two for one level in one tick the newest counts.
-    assert set(boxes["lower.status"]["message"]["order"].tolist()) == {0, 3}
-
-
-@pytest.mark.slow
 def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., RackConfig]) -> None:
     _, _, boxes = run(commanded(commands("level='upper', what='goto', home=true, tick=50")))
     last = boxes["upper.status"]["message"][-1]

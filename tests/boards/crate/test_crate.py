@@ -15,7 +15,6 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.crate import line as crate_line
 from rack.boards.crate.line import CrateLine, WarmCrate, received
 from rack.boards.crate.requests import Preload, Preloading
 from rack.boards.errors import LaunchError
@@ -47,14 +46,6 @@ def test_a_crate_that_does_not_end_is_killed() -> None:
     os.kill(line.pid, signal.SIGSTOP)
     line.close(0.05)
     assert not runs(line.pid)
-
-
-def test_output_comes_line_by_line_and_once(line: CrateLine) -> None:
-    line.send(Preload(("wave_printer:Printer",), PATH))
-    found: list[str] = []
-    wait_until(lambda: found.extend(line.printed()) or len(found) == 2)
-    assert found == ["first", "second"]
-    assert line.printed() == []
 
 
 def test_what_a_crate_has_preloaded_it_does_not_preload_again(line: CrateLine) -> None:
@@ -127,16 +118,6 @@ def test_a_warm_crate_that_is_killed_is_seen_and_over(
         assert rack.outcome.faults == ("the crate ended, and all boards with it",)
     assert warm.is_over
     assert not [path for path in SHM_FOLDER.iterdir() if rack_name in path.name]
-
-
-def test_a_warm_crate_that_does_not_leave_a_rack_is_ended(
-    warm: WarmCrate, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(crate_line, "LEAVE_S", 0.05)
-    os.kill(warm.pid, signal.SIGSTOP)
-    warm.close(0.0)
-    assert warm.is_over
-    assert not runs(warm.pid)
 
 
 @pytest.mark.slow

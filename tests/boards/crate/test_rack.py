@@ -11,7 +11,6 @@ import signal
 import subprocess
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -26,11 +25,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import (
-    FORKS,
     RACK,
-    exit_status,
-    forked,
-    named,
     parent_of,
     wait_until,
 )
@@ -39,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
 SMALL = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o size=$0 tmpfs /dev/shm && exec "$@"')
 """A command in a /dev/shm of its own, of the size that comes next."""
-TWO_MAY, FIVE_MAY = range(65_521, 65_523)
+TWO_MAY = 65_521
 """Users of nobody else: processes are counted by user, and tests run side by side."""
 PLAIN_ROOT = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "--inh-caps=-sys_nice,-ipc_lock")
 """A command without the rights to real-time priorities and to locked memory."""
@@ -259,55 +254,3 @@ def test_memory_that_could_not_be_locked_is_said_with_its_limit(
         == 1
     )
     assert "memory not locked" not in run_limited(real_time, tmp_path).stdout
-
-
-@pytest.mark.slow
-@as_root
-@pytest.mark.filterwarnings(FORKS)
-def test_a_restart_that_the_system_refuses_is_said_and_ends_the_run_in_order(
-    config: MakeConfig, tmp_path: Path, rack_name: str
-) -> None:
-    plain, out = config("clock.mode=realtime", text=PLAIN), tmp_path / "out"
-
-    def run_long() -> None:
-        done = run_limited(
-            plain, tmp_path, "prlimit", "--nproc=5", *as_user(FIVE_MAY), seconds="60"
-        )
-        out.write_text(f"{done.returncode} {done.stdout}")
-
-    def occupy() -> None:
-        os.setuid(FIVE_MAY)
-        time.sleep(BOUND_S)
-
-    def is_full() -> bool:
-        assert not out.exists(), out.read_text()
-        return users_processes(FIVE_MAY) >= 8
-
-    with ExitStack() as stack:
-        runner = stack.enter_context(forked(run_long))
-        # A whole command: on a loaded machine its imports alone may take half a minute.
-        wait_until(lambda: rack_name in racks(), BOUND_S)
-        segment = Segment.attach(rack_name)
-        stack.callback(segment.close)
-        # Before the clock runs, a board that cannot be forked is a launch that fails.
-        wait_until(lambda: segment.words[System.TICK] > 0, BOUND_S)
-        # More than the board that dies leaves room for.
-        for _ in range(3):
-            stack.enter_context(forked(occupy))
-        wait_until(is_full)
-        os.kill(named(f"{rack_name}:wave")[0], signal.SIGKILL)
-        assert exit_status(runner, BOUND_S) == 0
-    assert out.read_text().startswith("1 ")
-    # The kernel keeps only the first letters of either name.
-    assert re.search(
-        "printed: board '(wave|watch)' cannot be forked: Resource temp", out.read_text()
-    )
-
-
-def users_processes(uid: int) -> int:
-    """Return how many processes a user has."""
-    count = 0
-    for status in Path("/proc").glob("[0-9]*/status"):
-        with suppress(OSError):
-            count += f"\nUid:\t{uid}\t" in status.read_text()
-    return count

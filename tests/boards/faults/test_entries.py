@@ -75,11 +75,6 @@ def test_targets_are_places_in_the_layout(config: MakeConfig) -> None:
     assert (layout.tasks[third.task].name, third.mailbox) == ("wave", -1)
 
 
-def test_a_forged_message_goes_to_the_first_mailbox_that_is_read(config: MakeConfig) -> None:
-    (found,) = injected(config, {"kind": "masquerade", "board": "wave.planner"})
-    assert wire(rack(config)).mailboxes[found.mailbox].name == "wave.plan"
-
-
 @pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
 def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, value: str) -> None:
     (found,) = injected(
@@ -93,13 +88,6 @@ def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, valu
         "state",
     )
     assert number == State.DONE
-
-
-def test_parameters_stand_in_the_order_of_their_kind(config: MakeConfig) -> None:
-    (found,) = injected(config, {"kind": "sensor-bias", "board": "driven", "joint": 3})
-    assert found.parameters == (3.0, 0.02)
-    (found,) = injected(config, {"kind": "overrun", "board": "wave", "random": True})
-    assert found.parameters == (1.5, 1.0)
 
 
 def test_a_phase_is_rounded_down_to_thousandths_of_a_tick(config: MakeConfig) -> None:

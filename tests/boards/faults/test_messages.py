@@ -229,23 +229,6 @@ def test_a_forged_message_is_never_delivered(link: MakeLink, protocol: Protocol)
     assert [seen.verdict for seen in rack.reader.seen[9:]] == ["NEW"] * 3
 
 
-def test_a_forged_message_in_an_idle_mailbox_stays_unread(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 8)
-    for tick in range(8, 12):
-        forge(rack, tick)
-        assert rack.reader.cycle(tick).value.id == 7
-    assert next(code for _, code in rack.alarms()) is Alarm.MASQUERADE
-    rack.writer.cycle(12)
-    assert rack.reader.cycle(13).value.id == 12
-
-
-def test_a_forged_first_message_is_ignored(link: MakeLink) -> None:
-    rack = link()
-    forge(rack, 0)
-    assert not rack.reader.cycle(0).is_there
-
-
 @pytest.mark.parametrize("is_killed", [False, True])
 def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wait(
     link: MakeLink, is_killed: bool

@@ -11,7 +11,6 @@ import pytest
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.config.faults import injections
-from rack.boards.errors import ConfigError
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults.bounds import cycles
 from rack.tools.commands.inject import kinds_text
@@ -43,15 +42,6 @@ def test_a_kind_of_a_users_own_is_listed_with_its_bound_and_parameters(config: M
     kind, parameter = ([cell.strip() for cell in line if cell] for line in lines)
     assert kind == ["lose-every", "every n-th message is lost", "1 write + 1 delivery"]
     assert parameter == ["lose-every", "n", "messages", "4", "2 to 8", "the n"]
-
-
-def test_a_kind_of_a_users_own_is_checked_in_a_config(config: MakeConfig) -> None:
-    with pytest.raises(ConfigError) as error:
-        wire(config(fault("n = 9, cycles = 2, mailbox = 'sea'"), text=GAUGED))
-    assert [str(mistake) for mistake in error.value.mistakes] == [
-        "fault[0].n = 9: out of range; permitted: whole numbers 2 to 8; the n, messages",
-        "fault[0].mailbox = \"sea\": 'wave' does not write it; it writes: wave.status",
-    ]
 
 
 @pytest.mark.parametrize("valve", ["open", "OPEN", "3"])

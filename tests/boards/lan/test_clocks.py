@@ -27,7 +27,6 @@ from rack.boards.lan.clocks import (
     PING_NS,
     RECENT,
     UNANSWERED,
-    UNKNOWN_NS,
     ClockOffset,
     Clocks,
     PeerClock,
@@ -148,23 +147,6 @@ def test_a_message_counts_as_old_as_it_may_be(segment: Segment) -> None:
     assert grid.tick_of(head, peer, tick=50) == 10
     peer.uncertainty_ns = 3 * PERIOD_NS
     assert grid.tick_of(head, peer, tick=50) == 7
-
-
-def test_a_clock_that_does_not_answer_is_reported_after_its_time(segment: Segment) -> None:
-    segment.words[System.PERIOD_NS] = PERIOD_NS
-    peers = Peers(["b"])
-    found = Clocks(segment, peers, 1, OwnGrid(segment, 1))
-    bound = UNKNOWN_NS // PERIOD_NS
-    peer = peers["b"]
-    assert not found.is_unanswered(peer, 10 * bound)
-    peer.comes(7, 5)
-    assert [found.is_unanswered(peer, 5 + ticks) for ticks in (bound, bound + 1)] == [False, True]
-    peer.offset_ns = 0
-    assert not found.is_unanswered(peer, 5 + bound + 1)
-    peer.offset_ns = None
-    segment.words[System.LOCKSTEP] = 1
-    stepped = Clocks(segment, peers, 1, OwnGrid(segment, 1))
-    assert not stepped.is_unanswered(peer, 5 + bound + 1)
 
 
 def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> None:

@@ -79,15 +79,6 @@ def bench(config: MakeConfig) -> Iterator[MakeBench]:
         found.segment.close()
 
 
-def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
-    rack = bench()
-    wave = rack.task("wave")
-    rack.to(1)
-    wave.cycle(0)
-    assert rack.flags("wave") == [Flag.MISSED]
-    assert rack.segment.block("wave")[Block.MISSED] == 1
-
-
 def test_a_slow_level_may_use_its_whole_cycle(bench: MakeBench) -> None:
     rack = bench()
     watch = rack.task("watch")
