@@ -69,7 +69,6 @@ def bus(make_bus: MakeBus) -> Segment:  # noqa: F811
 
 
 def write(segment: Segment, name: str, tick: int = 0, **fields: Any) -> None:
-    """Write a message at a tick."""
     writer = open_writer(segment, name)
     for field, value in fields.items():
         setattr(writer.message, field, value)
@@ -78,7 +77,6 @@ def write(segment: Segment, name: str, tick: int = 0, **fields: Any) -> None:
 
 
 def ending(segment: Segment, ends_run: str | None = "upper.status") -> Ending:
-    """Return what judges the end."""
     return Ending(segment, ends_run, SILENT)
 
 

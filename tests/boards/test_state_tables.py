@@ -33,7 +33,6 @@ def counted(config: RackConfig, seconds: float = 0.25) -> tuple[np.ndarray, str]
 
 @pytest.fixture
 def counter(config: MakeConfig, tmp_path: Path) -> MakeConfig:
-    """Configs of the rack that counts."""
     return lambda *settings: config(*settings, text=counting(tmp_path))
 
 

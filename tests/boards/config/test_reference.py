@@ -145,10 +145,7 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
     [
         ("clock", ["clock"]),
         ("[board.servo.budget]", ["board.budget"]),
-        ("board.servo", ["board"]),
         ("board.servo.params", ["board.servo.params"]),
-        ("board.servo.params.modifications", ["board.servo.params.modifications"]),
-        ("board.<name>", ["board"]),
         ("task", ["task.action.goto", "task.action.home", "task.action.transfer"]),
     ],
 )

@@ -43,7 +43,6 @@ def process_of(rack: Rack, name: str) -> int:
 
 
 def end_of(rack: Rack) -> Outcome:
-    """Watch a rack to its end."""
     deadline = time.monotonic() + BOUND_S
     while rack.watch(0.5):
         assert time.monotonic() < deadline

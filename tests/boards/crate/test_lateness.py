@@ -37,7 +37,6 @@ def run(config: RackConfig, seconds: float) -> tuple[Outcome, list[Event], dict[
 
 
 def struck(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
-    """Return the config with these faults."""
     return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
 
 

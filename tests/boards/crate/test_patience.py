@@ -31,7 +31,6 @@ class Clock:
         self.now = 1000.0
 
     def monotonic(self) -> float:
-        """Return it."""
         return self.now
 
 
@@ -43,7 +42,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def said(journal: Journal) -> list[str]:
-    """Return what was reported."""
     assert {event.kind for event in journal.events} <= {"waiting"}
     return [event.text for event in journal.events]
 
@@ -69,7 +67,6 @@ class Line:
         self.output: list[str] = []
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait for the next answer."""
         if self._answers and self._answers[0][0] <= self._clock.now - 1000.0 + timeout_s:
             self._clock.now = max(self._clock.now, 1000.0 + self._answers[0][0])
             return True
@@ -77,11 +74,9 @@ class Line:
         return False
 
     def receive(self) -> object:
-        """Return it."""
         return self._answers.popleft()[1]
 
     def printed(self) -> list[str]:
-        """Return what the crate has printed."""
         return self.output
 
 

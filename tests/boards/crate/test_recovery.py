@@ -25,7 +25,6 @@ RESTART_TICKS = 200
 
 
 def faulty(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
-    """Return the config with these faults."""
     return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
 
 

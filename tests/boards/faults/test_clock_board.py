@@ -97,7 +97,6 @@ class Site:
         ]
 
     def advance(self, *ticks: int) -> list[tuple[Alarm, int, int, float]]:
-        """Do these ticks; return the alarms."""
         for tick in ticks:
             self.stage.advance(tick)
         return self.alarms()

@@ -135,18 +135,6 @@ def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> 
         assert rack.watch(0.02)
 
 
-def test_a_run_ends_when_the_level_that_ends_it_falls_silent(config: MakeConfig) -> None:
-    slow = FOLLOWED.replace("rate_hz = 400", "rate_hz = 40").replace("rate_hz = 50", "rate_hz = 5")
-    fault = FaultConfig(kind="mute", board="watch", tick=FIRST)
-    with Rack(
-        config("clock.period_ms=25", text=slow).model_copy(update={"fault": (fault,)})
-    ) as rack:
-        outcome = rack.run()
-    assert (outcome.cause, outcome.worked) == ("task failed", False)
-    assert outcome.reason.startswith("'watch.status' has not been written for 30.")
-    assert outcome.ticks < FIRST + 31 * 40
-
-
 @pytest.mark.parametrize("kind", [kind for kind in OTHERS if kind.where == "start"])
 def test_a_rack_whose_start_fails_does_not_arm(config: MakeConfig, kind: Kind) -> None:
     with pytest.raises(LaunchError, match="wave"), rack_with(config, kind, {}):

@@ -44,7 +44,6 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 def forge(rack: Link, tick: int) -> None:
-    """Publish a forged message from another process."""
     assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 

@@ -106,7 +106,6 @@ class Level:
         self.injected: list[Fault] = []
 
     def inject(self, faults: list[Fault]) -> None:
-        """Note them."""
         self.injected = faults
 
 
@@ -117,7 +116,6 @@ class Writes:
         self.applied: list[str] = []
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
-        """Note their kinds."""
         self.applied = [kind_of(entry).name for entry in faults]
 
 

@@ -75,7 +75,6 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 
 
 def status(segment: Segment, board: str = "bridge") -> object:
-    """Return the newest status of a board."""
     return open_observer(segment, f"{board}.status").peek().value
 
 
@@ -172,40 +171,6 @@ def test_a_daemon_in_a_session_of_its_own_ends_with_its_host_board(
         # Another one ends with the rack.
         wait_until(lambda: rack.watch(0.01) and len(daemons(rack)) == 2)
     assert not runs(daemons(rack)[1])
-
-
-@pytest.mark.slow
-def test_output_without_end_is_cut_and_counted_and_hides_no_other_board(config: MakeConfig) -> None:
-    text = others(loud="Printing", long="Printing", failed="Failing")
-    settings = [
-        "clock.mode=realtime",
-        "board.bridge.ends_run=false",
-        "host.program.program=host_programs:Console",
-    ]
-    settings += ["host.loud.params.length=10", "host.long.params={ length = 3000000, once = true }"]
-
-    def printed(word: str) -> list[str]:
-        return [
-            event.text for event in rack.events if event.kind == "printed" and word in event.text
-        ]
-
-    with Rack(config(*settings, text=text)) as rack:
-        rack.start()
-        watch(
-            rack,
-            lambda: (
-                len(printed("dropped")) > 3
-                and printed("'failed': ValueError")
-                and len(printed("xx" * 99)) > 2999
-            ),
-        )
-        memory = os.fstat(rack._line._printed).st_size
-    assert printed("host board 'loud': ")[0].endswith(
-        " lines dropped so far; a run keeps the first 10000"
-    )
-    assert len([line for line in printed("x") if line == "x" * 10]) == 10_000
-    assert {len(line) for line in printed("xx" * 99)} == {1000}
-    assert memory < 5_000_000
 
 
 @pytest.mark.slow

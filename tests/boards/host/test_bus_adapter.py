@@ -62,7 +62,6 @@ class Site:
         self.adapter = self.started()
 
     def cycle(self) -> None:
-        """Do the next cycle."""
         self.tick += EVERY
         self.inputs.read(self.tick)
         self.adapter.process(self.inputs.values, self.outputs.messages, self.tick)
@@ -70,7 +69,6 @@ class Site:
 
     @property
     def status(self) -> Any:
-        """The newest status."""
         return open_observer(self.segment, "bridge.status").peek().value
 
     def count(self, port: str) -> dict[str, int]:
@@ -90,7 +88,6 @@ MakeSite = Callable[..., Site]
 
 @pytest.fixture
 def make_site(config: MakeConfig) -> Iterator[MakeSite]:
-    """Make the one site of a test."""
     with ExitStack() as stack:
 
         def make(*settings: str) -> Site:
@@ -108,7 +105,6 @@ def make_site(config: MakeConfig) -> Iterator[MakeSite]:
 
 @pytest.fixture
 def open_bus() -> Iterator[Callable[[Site], HostBus]]:
-    """Open the program's end of a site."""
     with ExitStack() as stack:
 
         def open_it(site: Site) -> HostBus:
@@ -285,7 +281,6 @@ class Out:
         self.sent: list[tuple[int, int]] = []
 
     def send(self, basis: int) -> None:
-        """Note it."""
         self.sent.append((self.raw[0], basis))
 
 

@@ -30,11 +30,9 @@ class Extremes(Executor):
 
     @classmethod
     def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
-        """Return the port that sends."""
         return MadePorts(outputs={params["port"]: Output(message_type(params["type"]))})
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Write the next one."""
         at = min(tick // self.context.every, len(self._rows) - 1)
         getattr(write, self.context.params["port"]).raw[:] = self._rows[at]
 
@@ -68,7 +66,6 @@ def cases(kind: MessageType, base: Mapping[str, Any]) -> Iterator[Case]:
 
 
 def filled(kind: MessageType, base: Mapping[str, Any]) -> Message:
-    """Return a message with these fields."""
     message = Message(kind.dtype({}))
     for name, value in base.items():
         if isinstance(value, Mapping):

@@ -33,15 +33,12 @@ class Session:
         self._take: Callable[[Any], None]
 
     def liveliness(self) -> Session:
-        """Return what tokens are subscribed to with."""
         return self
 
     def declare_subscriber(self, key: str, handler: Any, history: bool = False) -> None:
-        """Note where what comes is taken."""
         self._take = handler.callback
 
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends to nobody."""
         return lambda payload, envelope: None
 
     def bring(self, rack: str, cycle: int, *keys: str) -> None:
@@ -70,7 +67,6 @@ def segment(rack_name: str) -> Iterator[Segment]:
 
 
 def opened(segment: Segment) -> tuple[Barrier, Session]:
-    """Return a barrier with the two others."""
     barrier, session = Barrier(segment, "lan", OTHERS, ()), Session(segment.rack)
     barrier.open(session, LAUNCH)  # type: ignore[arg-type]
     return barrier, session

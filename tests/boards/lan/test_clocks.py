@@ -257,11 +257,9 @@ class Wire:
         self.peers["b"].comes(OTHER, 0)
 
     def on(self, key: str, callback: Any) -> None:
-        """Note who listens."""
         self._heard[key] = callback
 
     def publish(self, key: str) -> Any:
-        """Keep what is sent."""
         return lambda payload, envelope: self.sent.append(Arrived(key, envelope, payload))
 
     def answer(self, rack: str, ping: Arrived, **more: Any) -> None:

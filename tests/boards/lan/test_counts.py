@@ -16,7 +16,6 @@ def head(number: int, launch: int = 7, serial: int = 0) -> Envelope:
 
 
 def order() -> tuple[MessageOrder, ImportCount]:
-    """Return an order and its counts."""
     count = ImportCount()
     return MessageOrder(count), count
 

@@ -37,7 +37,6 @@ class Line:
         self._number = 0
 
     def answer(self, key: str, unread: int) -> Callable[[], Iterator[Question]]:
-        """Return a function that takes what waits."""
         assert key == estop_key("*", self.rack)
         self.most = unread
 
@@ -63,7 +62,6 @@ class Line:
         self.put(asker, self.sealer.seal(sealed_for or key, head, payload), payload)
 
     def put(self, asker: str, envelope: bytes | None, payload: bytes = b"") -> None:
-        """Send anything."""
 
         def reply(payload: bytes, envelope: bytes) -> None:
             head = self.sealer.opened(estop_answer_key(self.rack, asker), envelope, payload)
@@ -96,12 +94,10 @@ class Bench:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether the emergency stop is set."""
         return bool(self.segment.words[System.EMERGENCY_STOP])
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Requests answered, refused and dropped."""
         return tuple(vars(self.desk.count).values())
 
 

@@ -82,7 +82,6 @@ class Importing:
         )
 
     def cycle(self, tick: int) -> None:
-        """Do the adapter's cycle of `tick`."""
         self.entry.look(tick)
         self.entry.exchange(self.port.message, tick)
         self.port.write(tick, None)
@@ -95,13 +94,11 @@ class Importing:
         return reading.verdict, reading.value.count, reading.is_lost
 
     def counts(self) -> dict[str, int]:
-        """Return the counts that are not 0."""
         return {name: number for name, number in vars(self.entry.count).items() if number}
 
 
 @pytest.fixture
 def importing(segment: Segment) -> Importing:
-    """Its import; the other rack is there."""
     found = Importing(segment)
     found.peer.comes(LAUNCH, 0)
     found.peer.offset_ns = 0

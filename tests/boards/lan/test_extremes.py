@@ -69,7 +69,6 @@ class Stream(NamedTuple):
         return sum(cycles for cycles, (_, _, is_permitted) in self.rows if not is_permitted)
 
     def text(self, slot: int) -> str:
-        """Return its board and its export."""
         board, port = self.mailbox.split(".")
         # The plain one last: it is sent until all have ended.
         rows = [[cycles, message.hex()] for cycles, (_, message, _) in (*self.rows, self.rows[0])]
@@ -94,11 +93,9 @@ class Sender(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """Simulated time of all that it sends."""
         return max(sum(cycles for cycles, _ in one.rows) / one.rate_hz for one in self.streams)
 
     def text(self, port: int, peer: str, peers: Sequence[int]) -> str:
-        """Return its config."""
         return f"""
 format = 2
 name = "{self.rack}"

@@ -64,7 +64,6 @@ def test_a_new_launch_replaces_one_whose_token_has_not_expired() -> None:
 
 
 def taken(changes: list[tuple[str, int, bool]]) -> Iterator[tuple[str, int, bool]]:
-    """Take the changes out of a list."""
     while changes:
         yield changes.pop(0)
 

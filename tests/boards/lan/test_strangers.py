@@ -38,7 +38,6 @@ ROUNDS = 10
 
 
 def pulse(name: str) -> str:
-    """Return the key of a rack's pulse."""
     return out_key(name, "pulse.status")
 
 
@@ -53,7 +52,6 @@ class Program:
         self.pid = self._process.pid
 
     def state(self) -> dict[str, Any]:
-        """Return what it has got so far."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write("\n")
@@ -103,7 +101,6 @@ class Site:
         return self._over(protocol, {})
 
     def seals(self, name: str, folder: str = "set") -> tuple[str, str]:
-        """Return whose seals a session has."""
         return str(self.folder / folder), name
 
     def _over(self, protocol: str, tls: dict[str, Any]) -> dict[str, Any]:

@@ -46,7 +46,6 @@ class Bench:
         self.segment.words[System.EPOCH_NS] = time.monotonic_ns() - tick * HOUR_NS - HOUR_NS // 2
 
     def task(self, name: str) -> VirtualControlLoop | PlannerLoop:
-        """Return a task, ready to cycle."""
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == name)
         if name.endswith(".planner"):
             return PlannerLoop(

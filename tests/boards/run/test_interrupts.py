@@ -70,7 +70,6 @@ class Heard(NamedTuple):
 
 
 def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()) -> Heard:
-    """Run the rack for `TICKS`."""
     found = config(*settings, text=RACK).model_copy(update={"fault": faults})
     with Rack(found) as rack:
         outcome = rack.run(SECONDS)
@@ -135,15 +134,6 @@ def test_runs_with_a_full_inbox_and_killed_boards_repeat(
     assert first.digest == second.digest
     # At most as old as a full inbox is long.
     assert first.cycle[-1].max() > TICKS - 10
-
-
-def test_a_restarted_reader_finds_its_inbox_as_it_was(config: MakeConfig) -> None:
-    killed = (FaultConfig(kind="kill", board="hub", tick=31),)
-    calm = run(config, SMALL, "supervision.lockstep_restart_s=0.02")
-    back = run(config, SMALL, "supervision.lockstep_restart_s=0.02", faults=killed)
-    ticks = back.written.messages["hub.status"]["tick"]
-    assert len(ticks) < TICKS
-    assert (back.cycle[ticks > 40] == calm.cycle[ticks[ticks > 40]]).all()
 
 
 def test_messages_that_faults_strike_cost_the_same_on_every_run(config: MakeConfig) -> None:

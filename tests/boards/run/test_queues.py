@@ -71,7 +71,6 @@ class QueueLink:
         self._trace.write(*record.values())
 
     def read(self, tick: int) -> Reading:
-        """Do the reader's cycle."""
         self.reads.read(tick)
         reading: Reading = self.reads.values.point
         if reading.is_new:
@@ -96,7 +95,6 @@ class QueueLink:
         return [Alarm(row["code"]) for row in self._rings[name].drain().rows]
 
     def fault(self, kind: str, *parameters: float) -> FaultEntry:
-        """Write with this fault from now on."""
         values = [p.default or 0.0 for p in KINDS[kind].parameters]
         entry = FaultTable(self.segment).add(
             Injection(
@@ -111,7 +109,6 @@ class QueueLink:
         return entry
 
     def close(self) -> None:
-        """Give the bus back."""
         for writer in self.ports.writers.values():
             writer.close()
         for reader in self.reads.readers.values():
@@ -242,7 +239,6 @@ def test_a_fault_that_nothing_would_show_does_not_strike_a_queue(
 
 
 def forge(rack: QueueLink, tick: int) -> None:
-    """Publish a forged message from another process."""
     assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 

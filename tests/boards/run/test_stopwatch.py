@@ -52,7 +52,6 @@ class Site:
         return dict(zip(row.dtype.names, row.tolist(), strict=True))
 
     def counts(self, *words: int) -> list[int]:
-        """Return words of the control block."""
         return [self.block[word] for word in words]
 
 
@@ -68,7 +67,6 @@ def site(make_bus: MakeBus) -> Site:  # noqa: F811
 
 @pytest.fixture
 def stepped(site: Site) -> Site:
-    """The same in lockstep."""
     site.segment.words[System.LOCKSTEP] = 1
     alarms = AlarmWriter(site.segment, "level")
     for writer in site.outputs.writers.values():

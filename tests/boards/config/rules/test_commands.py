@@ -29,7 +29,6 @@ def gentle() -> RackConfig:
 
 
 def mistakes(config: RackConfig, broken: frozenset[str] = frozenset(), **given: Any) -> list[str]:
-    """Return what is wrong with a command."""
     levels = publish(config).levels
     return [str(found) for found in command_mistakes([("", asked(given))], config, levels, broken)]
 

@@ -16,14 +16,6 @@ MISTAKES = {
         ["host.program.rate_hz=10"],
         "host.program.rate_hz = 10: unknown key; known: program, external, below",
     ),
-    "no program": (
-        ["host.program.program=host_programs:Adder"],
-        "has no HostProgram named 'Adder'; it has: Console, ",
-    ),
-    "the name of a board": (
-        [f"host.adder={{ program = '{IDLE}' }}"],
-        "host.adder: board.adder has this name",
-    ),
     "where determinism is demanded": (
         ["protocol.strict=true"],
         (

@@ -24,17 +24,6 @@ MISTAKES = {
             " the adapter; nearest: 12.5 Hz (every 4 cycles), 16.67 Hz (every 3 cycles)"
         ),
     ),
-    "a rate of which one neighbour is beyond 50 Hz": (
-        [
-            "adapter.lan.rate_hz=66.67",
-            "adapter.lan.import.other.rate_hz=45",
-            "adapter.lan.export.pulse.rate_hz=33.33",
-        ],
-        (
-            "adapter.lan.import.other.rate_hz = 45.0: exchange: 45 Hz does not divide the"
-            " 66.6667 Hz of the adapter; nearest: 33.33 Hz (every 2 cycles)"
-        ),
-    ),
     "the adapter's rate": (
         [
             "adapter.lan.rate_hz=33",
@@ -135,10 +124,6 @@ MISTAKES = {
             " levels may read"
         ),
     ),
-    "an export twice": (
-        ["adapter.lan.export.again={ from = 'pulse.status' }"],
-        'adapter.lan.export = "pulse.status": listed 2 times: pulse, again',
-    ),
     "a port of the adapter's own": (
         [
             "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms ="
@@ -156,10 +141,6 @@ MISTAKES = {
             'board.net.executor = "rack.boards.lan.adapter:LanAdapter": permitted: [adapter.lan],'
             " which makes its board"
         ),
-    ),
-    "a slot that is taken": (
-        ["adapter.lan.slot=2"],
-        "adapter.lan.slot = 2: already taken by board.pulse.slot",
     ),
     "a priority below a neighbour's": (
         ["clock.mode=realtime", "adapter.lan.priority=40", "board.pulse.priority=40"],

@@ -15,7 +15,6 @@ Write = Callable[[str, str], Path]
 
 
 def mistakes(name: str | Path, *settings: str) -> list[Mistake]:
-    """Return everything wrong with a config."""
     with pytest.raises(ConfigError) as error:
         resolve(load(name, settings))
     return error.value.mistakes
@@ -97,14 +96,9 @@ MISTAKES = {
         "board.upper.executor=two_levels:Stateless",
         "board.upper.ends_run = true: its status has no field 'state' of State",
     ),
-    "no class name": ("board.upper.executor=two_levels", "package.module:Class"),
     "moving what is not there": (
         "scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]",
         "no such obstacle",
-    ),
-    "pushing what is not there": (
-        "scene.push=[{ body = 'bar', at = 1, seconds = 1, force = [0, 0, 1] }]",
-        "no such object",
     ),
     "no module": (
         "board.upper.executor='no_levels:Upper'",
