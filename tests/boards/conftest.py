@@ -10,6 +10,7 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
+from tests.backplane.conftest import make_bus  # noqa: F401  a fixture
 from tests.processes import named, wait_until
 
 CLOCK = f"""

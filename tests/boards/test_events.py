@@ -27,7 +27,7 @@ from rack.boards.events import (
 )
 from rack.levels.tables import GoalConfig
 from tests.backplane.bus import CLOCK_NS, task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 
 SILENT = 40
 STATUS = status("level_status", 1, Field("moves", "u2", "1", "of its program"))
@@ -55,7 +55,7 @@ def box(name: str, kind: MessageType, writer: str) -> MailboxSpec:
 
 
 @pytest.fixture
-def bus(make_bus: MakeBus) -> Segment:  # noqa: F811
+def bus(make_bus: MakeBus) -> Segment:
     return make_bus(
         task("upper"),
         task("lower"),

@@ -17,6 +17,7 @@ import pytest
 
 from rack.backplane.errors import SegmentError
 from rack.backplane.lines import UtilityLines
+from rack.backplane.process import LATENCY_REQUEST
 from rack.backplane.segment import Segment, racks, shm_path, unlink
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards import Rack
@@ -26,6 +27,7 @@ from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.processes import (
     RACK,
+    named,
     parent_of,
     wait_until,
 )
@@ -89,10 +91,20 @@ def test_a_run_of_given_length_ends_at_its_exact_tick(
     assert rack.segment.block("wave")[Block.CYCLES] == ticks
 
 
+def holders(rack: Rack) -> list[int]:
+    """Return which of a rack's processes hold idle cores awake."""
+    held = {
+        pid: [one.readlink() for one in Path(f"/proc/{pid}/fd").iterdir()]
+        for pid in named(f"{rack.config.name}:")
+    }
+    return [pid for pid, files in held.items() if LATENCY_REQUEST in files]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
 def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -> None:
-    with Rack(config(f"clock.mode={mode}", "protocol.default=lock")) as rack:
+    settings = (f"clock.mode={mode}", "protocol.default=lock", "clock.idle_cores=awake")
+    with Rack(config(*settings), share=True) as rack:
         # Ready before the clock runs, and only the segment has a name.
         tasks = [rack.segment.block(task.name) for task in rack.segment.layout.tasks]
         words = rack.segment.words
@@ -102,6 +114,10 @@ def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -
         own = shm_path(rack.config.name)
         assert [p for p in own.parent.iterdir() if rack.config.name in p.name] == [own]
         rack.start()
+        wait_until(lambda: rack.watch(0.01) and words[System.TICK] > 2)
+        # In real time the clock, and no other process, holds idle cores awake.
+        holding = mode == "realtime" and os.access(LATENCY_REQUEST, os.W_OK)
+        assert holders(rack) == [words[System.CLOCK_PID]] * holding
         Segment.attach(rack.config.name).words[System.STOP_REQUEST] = 1
         while rack.watch(0.5):
             pass

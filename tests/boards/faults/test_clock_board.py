@@ -22,7 +22,7 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME, mailbox, task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -31,7 +31,7 @@ CYCLE_S = 0.05
 """Longer than the clock takes for all ticks of the slow task's period."""
 
 
-def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:  # noqa: F811
+def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
     segment = make_bus(task("writer", every=8), mailbox(every=8, delay=8))
     segment.words[System.LOCKSTEP] = 1
     table = FaultTable(segment)
@@ -103,7 +103,7 @@ class Site:
 
 
 @pytest.fixture
-def site(make_bus: MakeBus) -> Site:  # noqa: F811
+def site(make_bus: MakeBus) -> Site:
     return Site(
         make_bus(
             task("writer"),

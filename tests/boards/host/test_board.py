@@ -124,7 +124,7 @@ def test_hung_dead_failed_and_finished_programs_leave_the_real_time_side_as_it_i
     # It may fail again before the Rack has seen its new process.
     failed = [code for code in codes(rack, "failed") if code != "rejoined"]
     assert failed == ["died", "restart", "died", "given_up"]
-    line = inspect.getsourcelines(Failing.run)[1] + 2
+    line = inspect.getsourcelines(Failing.run)[1] + 1
     printed = [event.text for event in rack.events if event.kind == "printed"]
     assert (
         printed

@@ -85,16 +85,6 @@ def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(
         assert [strike.tick for strike in strikes(rack.segment, ())] == [-1]
 
 
-@pytest.mark.parametrize(("computing", "arrived"), [(0, 4), (100, 40), (102.5, 44)])
-def test_what_a_program_sends_is_taken_once_its_computing_is_over(
-    config: MakeConfig, computing: float, arrived: int
-) -> None:
-    settings = ("host.program.params.count=1", f"host.program.computing_ms={computing}")
-    with Rack(config(*settings, text=HOSTED)) as rack:
-        assert rack.run().cause == "task done"
-        assert status(rack.segment).numbers["arrived"] == arrived
-
-
 def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: MakeConfig) -> None:
     settings = (
         "host.program.program=host_programs:Deaf",

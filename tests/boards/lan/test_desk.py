@@ -169,14 +169,6 @@ def test_nobody_asks_in_the_name_of_another(bench: Bench, tmp_path: Path) -> Non
     assert bench.is_stopped
 
 
-def test_a_desk_that_nobody_may_ask_takes_no_requests(bench: Bench) -> None:
-    desk = Desk(bench.segment, OwnGrid(bench.segment, 8), {}, [])
-    bench.line.most = 0
-    desk.open(bench.line, LAUNCH)  # type: ignore[arg-type]
-    desk.answer(48)
-    assert bench.line.most == 0
-
-
 def test_a_desk_counts_on_from_its_predecessor_and_in_lockstep_shows_nothing(
     bench: Bench,
 ) -> None:

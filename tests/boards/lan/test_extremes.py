@@ -55,9 +55,10 @@ PLANNED = 14
 """Cycles at 10 Hz in which an order is rehearsed."""
 
 
-class Stream(NamedTuple):
-    """What a rack that stands in for another sends in one mailbox: cycles and case."""
+class Sender(NamedTuple):
+    """A rack that stands in for one: what it sends in one mailbox, by cycles and case."""
 
+    rack: str
     mailbox: str
     type: str
     rate_hz: int
@@ -68,34 +69,11 @@ class Stream(NamedTuple):
         """How many of its messages no rack may take."""
         return sum(cycles for cycles, (_, _, is_permitted) in self.rows if not is_permitted)
 
-    def text(self, slot: int) -> str:
+    def text(self, peer: str, listen: int) -> str:
+        """Return its config; it connects to the port at which the peer listens."""
         board, port = self.mailbox.split(".")
         # The plain one last: it is sent until all have ended.
         rows = [[cycles, message.hex()] for cycles, (_, message, _) in (*self.rows, self.rows[0])]
-        return f"""
-[board.{board}]
-slot = {slot}
-rate_hz = {self.rate_hz}
-executor = "tests.boards.lan.extreme_levels:Extremes"
-params = {{ port = "{port}", type = "{self.type}", cases = {json.dumps(rows)} }}
-
-[adapter.lan.export.{board}]
-from = "{self.mailbox}"
-rate_hz = {self.rate_hz}
-"""
-
-
-class Sender(NamedTuple):
-    """A rack that stands in for one."""
-
-    rack: str
-    streams: Sequence[Stream]
-
-    @property
-    def seconds(self) -> float:
-        return max(sum(cycles for cycles, _ in one.rows) / one.rate_hz for one in self.streams)
-
-    def text(self, port: int, peer: str, peers: Sequence[int]) -> str:
         return f"""
 format = 2
 name = "{self.rack}"
@@ -108,11 +86,20 @@ mode = "lockstep"
 [adapter.lan]
 slot = 2
 rate_hz = 50
-listen = ["tcp/127.0.0.1:{port}"]
 insecure = true
-connect = {json.dumps([f"tcp/127.0.0.1:{at}" for at in peers])}
+connect = ["tcp/127.0.0.1:{listen}"]
 peers = ["{peer}"]
-{"".join(one.text(slot) for slot, one in enumerate(self.streams, 3))}"""
+
+[adapter.lan.export.{board}]
+from = "{self.mailbox}"
+rate_hz = {self.rate_hz}
+
+[board.{board}]
+slot = 3
+rate_hz = {self.rate_hz}
+executor = "tests.boards.lan.extreme_levels:Extremes"
+params = {{ port = "{port}", type = "{self.type}", cases = {json.dumps(rows)} }}
+"""
 
 
 def real(file: str, name: str, folder: Path, listen: int) -> RackConfig:
@@ -133,10 +120,10 @@ def run(rack: RackConfig, listen: int, senders: Sequence[Sender], folder: Path) 
     found = [rack]
     for k, sender in enumerate(senders):
         path = folder / f"sender-{k}.toml"
-        path.write_text(sender.text(free_port(), rack.name, [listen]))
+        path.write_text(sender.text(rack.name, listen))
         found.append(load(path))
-    seconds = max(sender.seconds for sender in senders) + 1.0
-    return run_together(found, [seconds] * len(found))[0]
+    lasts = [sum(cycles for cycles, _ in sender.rows) / sender.rate_hz for sender in senders]
+    return run_together(found, [max(lasts) + 1.0] * len(found))[0]
 
 
 def check(found: Ended, counts: Mapping[str, int]) -> None:
@@ -166,8 +153,8 @@ def orders_and_bodies(
     """Return the racks that stand in for those from which the PUMA imports."""
     plain = [(1, next(cases(CELL_ORDER, {})))], [(1, next(cases(SHARED_BODIES, {})))]
     return [
-        Sender(name, [Stream("task.order_puma", ORDER, 10, orders or plain[0])]),
-        Sender(f"{name}-k1607", [Stream("servo.shared", BODIES, 50, bodies or plain[1])]),
+        Sender(name, "task.order_puma", ORDER, 10, orders or plain[0]),
+        Sender(f"{name}-k1607", "servo.shared", BODIES, 50, bodies or plain[1]),
     ]
 
 
@@ -183,7 +170,7 @@ def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
             orders.append((PLANNED if is_of_action and case[2] else 1, case))
     listen, senders = free_port(), orders_and_bodies(rack_name, orders, ())
     found = run(real("puma", rack_name, tmp_path, listen), listen, senders, tmp_path)
-    check(found, {"orders": senders[0].streams[0].refused, "shared": 0})
+    check(found, {"orders": senders[0].refused, "shared": 0})
 
 
 @pytest.mark.slow
@@ -205,7 +192,7 @@ def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_
     )
     listen, senders = free_port(), orders_and_bodies(rack_name, (), [(5, one) for one in tried])
     ended = run(real("puma", rack_name, tmp_path, listen), listen, senders, tmp_path)
-    check(ended, {"orders": 0, "shared": senders[1].streams[0].refused})
+    check(ended, {"orders": 0, "shared": senders[1].refused})
 
 
 @pytest.mark.slow
@@ -222,9 +209,9 @@ def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Pat
     refusal = {**answer, "response": Response.REFUSED, "error": Error.NO_PATH, "reason": b"no"}
     rows += sorted(cases(CELL_REPORT, refusal), key=lambda case: case[0] != "error = 65535")
     senders = [
-        Sender(f"{rack_name}-{arm}", [Stream("task.report", REPORT, 10, [(2, c) for c in rows])])
+        Sender(f"{rack_name}-{arm}", "task.report", REPORT, 10, [(2, case) for case in rows])
         for arm in ("puma", "k1607")
     ]
     found = run(cell, listen, senders, tmp_path)
-    refused = senders[0].streams[0].refused
+    refused = senders[0].refused
     check(found, {"puma": refused, "k1607": refused})

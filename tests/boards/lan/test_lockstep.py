@@ -180,12 +180,3 @@ def test_racks_of_different_clocks_say_so_and_end(
     assert first.outcome.cause == "board lost"
     assert text.format(names[1]) in first.texts
     assert "restart" not in first.texts
-
-
-def test_a_rack_that_others_do_not_wait_for_says_so(names: list[str], tmp_path: Path) -> None:
-    a, b, c = names
-    texts = ring_texts(names, {a: [b], b: [a], c: [b]})
-    found = run_together(configs(texts, tmp_path, STEPPED), [0.5, 0.5, 0.5])
-    # Each imports from the one before it; the second one waits for the first alone.
-    assert [one.outcome.cause for one in found] == ["board lost", "time over", "board lost"]
-    assert f"rack '{b}' does not wait for '{c}' in lockstep" in found[2].texts

@@ -14,7 +14,7 @@ from rack.boards import Rack
 from rack.boards.faults.config import FaultConfig
 from rack.boards.run.task import ClockGuard
 from tests.backplane.bus import task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 from tests.boards.conftest import MakeConfig
 
 PERIOD_NS = 20_000_000
@@ -32,9 +32,7 @@ def rung(segment: Segment) -> list[tuple[int, int, float]]:
     return [(int(row["tick"]), int(row["since"]), float(row["value"])) for row in rows]
 
 
-def test_a_skip_is_reported_in_the_first_cycle_released_after_it(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_skip_is_reported_in_the_first_cycle_released_after_it(make_bus: MakeBus) -> None:
     segment = make_bus(task("level", every=4))
     guard, driver = guard_of(segment), RealtimeDriver(segment, lambda _: None)
     driver.count_skipped(5, 2)
@@ -50,9 +48,7 @@ def test_a_skip_is_reported_in_the_first_cycle_released_after_it(
     assert rung(segment)[1:] == [(12, 12, 2.0)]
 
 
-def test_a_restarted_guard_reports_what_was_skipped_while_it_was_away(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_restarted_guard_reports_what_was_skipped_while_it_was_away(make_bus: MakeBus) -> None:
     segment = make_bus(task("level", every=4))
     guard, driver = guard_of(segment), RealtimeDriver(segment, lambda _: None)
     driver.count_skipped(1, 1)
@@ -64,7 +60,7 @@ def test_a_restarted_guard_reports_what_was_skipped_while_it_was_away(
 
 
 def test_ticks_that_a_late_clock_skips_are_reported_with_the_first_of_them(
-    make_bus: MakeBus,  # noqa: F811
+    make_bus: MakeBus,
 ) -> None:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = PERIOD_NS
@@ -101,11 +97,7 @@ def test_a_skip_while_the_guard_is_lost_is_seen_when_it_is_back(config: MakeConf
 
 
 @pytest.mark.parametrize(("part", "count"), [(0.4, 0), (0.6, 1)])
-def test_a_clock_is_late_from_half_a_tick_on(
-    part: float,
-    count: int,
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_clock_is_late_from_half_a_tick_on(part: float, count: int, make_bus: MakeBus) -> None:
     segment = make_bus(task("level", every=4))
     segment.words[System.PERIOD_NS] = PERIOD_NS
     guard = guard_of(segment)

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from rack.backplane import semaphores
-from rack.backplane.errors import MailboxError
 from rack.backplane.fault_table import FaultTable, Injection, Stage
-from rack.backplane.mailbox.protocols import MailboxLock, open_writer
+from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import Flag, trace_ring
@@ -182,15 +181,6 @@ def test_a_release_without_a_plan_is_traced_after_skipped_ones(
         5,
         1,
     ]
-
-
-def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:
-    rack = bench()
-    writer = open_writer(rack.segment, "wave.status")
-    with pytest.raises(MailboxError, match=r"'wave\.status' has a writer already"):
-        rack.task("wave")
-    writer.close()
-    rack.task("wave")
 
 
 def test_a_pause_in_reading_is_noted_in_a_cycle_that_begins_late(bench: MakeBench) -> None:

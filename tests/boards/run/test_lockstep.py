@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
-from rack.backplane.layout import PROTOCOLS, Protocol
+from rack.backplane.layout import PROTOCOLS, Protocol, Wake
 from rack.backplane.trace import Flag
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, PLAIN, PLANNED, MakeConfig
 from tests.boards.messages import Written
+from tests.machine import needs_two_cores
 
 SECONDS = 0.25
 TICKS = 100
@@ -191,4 +194,27 @@ def test_speed_scales_the_grid_but_not_the_run(config: MakeConfig) -> None:
     assert rack.outcome.ticks == 100
     period_ns = 2_500_000 / speed
     assert (np.diff(cycles["release_ns"]) == np.diff(cycles["tick"]) * period_ns).all()
+    assert (cycles["start_ns"] >= cycles["release_ns"]).all()
+
+
+@needs_two_cores
+@pytest.mark.slow
+@pytest.mark.parametrize("protocol", ["time-slice", "lock"])
+def test_boards_write_the_same_however_they_wait(config: MakeConfig, protocol: str) -> None:
+    settings = [
+        (f"board.wave.wake={one}", f"protocol.default={protocol}") for one in get_args(Wake)
+    ]
+    assert len({digest(Rack(config(*given, text=PLAIN))) for given in settings}) == 1
+
+
+@needs_two_cores
+@pytest.mark.slow
+@pytest.mark.parametrize("wake", get_args(Wake))
+def test_a_board_keeps_the_grid_in_real_time(config: MakeConfig, wake: Wake) -> None:
+    with Rack(config(f"board.wave.wake={wake}", *SLOW, text=PLAIN)) as rack:
+        assert rack.run(SECONDS).ticks == TICKS
+        block = rack.segment.block("wave")
+        # A board whose core was taken away during the very last cycles does not see those any more.
+        assert TICKS - 8 <= block[Block.CYCLES] + block[Block.SKIPPED] <= TICKS
+        cycles = Written.on(rack.segment).cycles["wave"]
     assert (cycles["start_ns"] >= cycles["release_ns"]).all()

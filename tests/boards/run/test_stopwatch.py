@@ -16,7 +16,7 @@ from rack.backplane.words import Block, System
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.boards.run.stopwatch import BUS_COUNT_CYCLES, Stopwatch
 from tests.backplane.bus import NAME, mailbox, task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 from tests.boards.test_events import box
 
 PERIOD_NS = 2_500_000
@@ -56,7 +56,7 @@ class Site:
 
 
 @pytest.fixture
-def site(make_bus: MakeBus) -> Site:  # noqa: F811
+def site(make_bus: MakeBus) -> Site:
     segment = make_bus(
         task("level"), task("writer"), mailbox(), box("level.status", STATUS, "level")
     )
@@ -100,9 +100,7 @@ def test_a_cycle_is_traced_with_its_grid_point_and_its_own_processor_time(site: 
     assert site.counts(Block.CYCLES, Block.DONE) == [2, 11]
 
 
-def test_a_cycle_beyond_its_deadline_is_missed_and_one_that_ends_with_it_is_not(
-    site: Site,
-) -> None:
+def test_a_cycle_beyond_its_deadline_is_missed_and_one_that_ends_with_it_is_not(site: Site) -> None:
     site.cycle(1000, ends_after_ns=PERIOD_NS)
     assert (site.traced()["flags"], site.counts(Block.MISSED)) == (0, [0])
     site.cycle(1001, ends_after_ns=PERIOD_NS + 1)
@@ -120,9 +118,7 @@ def test_skipped_releases_are_counted_and_stand_in_the_flags(site: Site) -> None
     assert site.counts(Block.SKIPPED) == [5]
 
 
-def test_a_cycle_is_late_if_it_is_the_first_follows_skipped_ones_or_begins_late(
-    site: Site,
-) -> None:
+def test_a_cycle_is_late_if_it_is_the_first_follows_skipped_ones_or_begins_late(site: Site) -> None:
     ahead = (time.monotonic_ns() - site.segment.words[System.EPOCH_NS]) // PERIOD_NS + 1000
     site.watch.start(ahead, 0)
     assert site.watch.is_late
