@@ -12,9 +12,9 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
 from tests.boards.arm_racks import APART, TOGETHER, arm_rack, named, without
 from tests.boards.conftest import MakeConfig
+from tests.boards.runs import faulty, kill
 
 KILLED_AT = 301
 DEATH_BOUND = 4
@@ -61,8 +61,7 @@ def test_joints_without_one_board_are_refused_in_one_line(config: MakeConfig, ca
 def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats(
     config: MakeConfig,
 ) -> None:
-    killed = FaultConfig(kind="kill", board="servo_j3", tick=KILLED_AT)
-    given = config(text=arm_rack(APART)).model_copy(update={"fault": (killed,)})
+    given = faulty(config(text=arm_rack(APART)), kill("servo_j3", KILLED_AT))
     digests = []
     for _ in range(2):
         with Rack(given) as rack:
@@ -85,8 +84,7 @@ def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats
 def test_brakes_that_engaged_while_the_arms_board_was_away_have_the_tick_at_which_they_did(
     config: MakeConfig,
 ) -> None:
-    killed = FaultConfig(kind="kill", board="arm", tick=KILLED_AT)
-    given = config(text=arm_rack(TOGETHER)).model_copy(update={"fault": (killed,)})
+    given = faulty(config(text=arm_rack(TOGETHER)), kill("arm", KILLED_AT))
     with Rack(given) as rack:
         outcome = rack.run(0.6)
         events = rack.events

@@ -24,11 +24,12 @@ from rack.boards.config import wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
-from rack.boards.faults.config import FaultConfig
 from rack.boards.operator import message_of
 from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
+from tests.boards.runs import faulty
+from tests.boards.runs import kill as kill_at
 from tests.processes import FORKS, forked, kill, wait_until
 
 HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
@@ -117,11 +118,7 @@ def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_value
 def test_a_restarted_board_has_its_live_params_as_they_were_set(
     commanded: Callable[..., RackConfig],
 ) -> None:
-    config = commanded(SET)
-    config = config.model_copy(
-        update={"fault": (FaultConfig(kind="kill", board="lower", tick=250),)}
-    )
-    outcome, events, boxes = run(config, 2.0)
+    outcome, events, boxes = run(faulty(commanded(SET), kill_at("lower", 250)), 2.0)
     assert outcome.worked
     assert [event.board for event in events if event.code == "rejoined"] == ["lower"]
     assert np.diff(boxes["lower.status"]["message"]["count"])[-50:].tolist() == [2] * 50
@@ -165,8 +162,7 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     # The lower level never takes a goto: its config would refuse it, an intruder in the table may
     # say it all the same.
     config = commanded(commands(f"level='{board}', what='hold', tick=50"))
-    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
-    with Rack(config) as rack:
+    with Rack(faulty(config, kill_at(board, 100))) as rack:
         hold = OperatorTable(rack.segment).entries[0]
         message = message_of(hold, rack.segment.layout)
         message.what, message.goal = Operation.GOTO, Goal.HOME

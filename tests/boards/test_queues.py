@@ -16,8 +16,8 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
 from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.runs import faulty, kill, stop
 
 QUEUES = f"""{CLOCK}
 [board.upper]
@@ -67,13 +67,8 @@ def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str
 
 @pytest.mark.slow
 def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> None:
-    faults = tuple(
-        FaultConfig(kind="kill", board=board, tick=tick)
-        for board, tick in (("upper", 97), ("lower", 501))
-    )
-    found = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES).model_copy(
-        update={"fault": faults}
-    )
+    plain = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES)
+    found = faulty(plain, kill("upper", 97), kill("lower", 501))
     digests = set()
     for _ in range(2):
         with Rack(found) as rack:
@@ -142,9 +137,7 @@ def settle(rack: Rack, board: str) -> dict[str, int]:
     while block[Block.LOST]:
         assert rack.watch(0.01)
     assert rack.watch(0.3)
-    rack.stop("the test has seen enough")
-    while rack.watch(0.1):
-        continue
+    stop(rack)
     return counts(rack, board)
 
 

@@ -13,11 +13,11 @@ from rack.boards.config import rack_timing, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.recovery import Supervision
 from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.command_path import command_paths
 from rack.levels.timing.system_response import mailboxes_along
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import faulty, kill
 from tests.boards.vector_racks import JOINTED
 
 SECONDS, TICKS = 0.5, 200
@@ -31,9 +31,7 @@ def jointed(config: MakeConfig) -> MakeConfig:
 
 def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, Written]:
     """Run the rack; return its digest and everything that it wrote."""
-    with Rack(
-        config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
-    ) as rack:
+    with Rack(faulty(config, *faults)) as rack:
         digest = rack.run(SECONDS).digest
         return digest, Written.on(rack.segment)
 
@@ -59,10 +57,9 @@ def test_a_message_that_rests_on_many_rests_on_the_oldest_of_them(jointed: MakeC
 
 @pytest.mark.slow
 def test_a_reader_of_many_sees_which_of_them_is_lost(jointed: MakeConfig) -> None:
-    kill = {"kind": "kill", "board": "joint2", "tick": 60}
-    settings = ("supervision.lockstep_restart_s=0.2",)
-    digest, written = run(jointed(*settings), kill)
-    assert run(jointed(*settings), kill)[0] == digest
+    killed = jointed("supervision.lockstep_restart_s=0.2"), kill("joint2", 60)
+    digest, written = run(*killed)
+    assert run(*killed)[0] == digest
     for mailbox, ticks in (("arm.status", (70, 160)), ("path.status", (80, 160))):
         rows = written.messages[mailbox]
         while_lost, after = (at(rows, tick)["message"]["lost"].tolist() for tick in ticks)

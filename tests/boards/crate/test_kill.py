@@ -15,10 +15,10 @@ from rack.backplane.segment import Segment, racks
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.crate.clean import remove_dead
-from rack.boards.events import Outcome
 from tests.boards.conftest import LOOSE, NEVER, MakeConfig
 from tests.boards.programs import launcher
-from tests.processes import BOUND_S, children_of, named, parent_of, runs, wait_until
+from tests.boards.runs import end_of
+from tests.processes import children_of, named, parent_of, runs, wait_until
 
 REALTIME = "clock.mode=realtime"
 TASKS = ("wave", "wave.planner", "watch")
@@ -40,14 +40,6 @@ def process_of(rack: Rack, name: str) -> int:
     return (
         crate if name == "crate" else next(pid for pid in children_of(crate) if pid not in boards)
     )
-
-
-def end_of(rack: Rack) -> Outcome:
-    deadline = time.monotonic() + BOUND_S
-    while rack.watch(0.5):
-        assert time.monotonic() < deadline
-    assert rack.outcome is not None
-    return rack.outcome
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
+from tests.boards.runs import end_of
 from tests.processes import (
     RACK,
     named,
@@ -119,10 +119,8 @@ def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -
         holding = mode == "realtime" and os.access(LATENCY_REQUEST, os.W_OK)
         assert holders(rack) == [words[System.CLOCK_PID]] * holding
         Segment.attach(rack.config.name).words[System.STOP_REQUEST] = 1
-        while rack.watch(0.5):
-            pass
-    assert rack.outcome is not None
-    assert (rack.outcome.cause, rack.outcome.worked) == ("stopped", False)
+        outcome = end_of(rack)
+    assert (outcome.cause, outcome.worked) == ("stopped", False)
     assert {task[Block.STATE] for task in tasks} == {TaskState.ENDED}
     assert rack.config.name not in racks()
 
@@ -136,13 +134,10 @@ def test_a_run_that_its_crate_cuts_short_ends_in_the_tick_that_it_had_begun(
         wait_until(lambda: words[System.TICK] > 20)
         before = words[System.TICK]
         os.kill(parent_of(block[Block.PID]), signal.SIGKILL)
-        deadline = time.monotonic() + BOUND_S
-        while rack.watch(0.5):
-            assert time.monotonic() < deadline
-        assert rack.outcome is not None
+        outcome = end_of(rack)
         # The clock may outlive the crate by a moment, in which it begins further ticks, or obeys
         # the Rack, which has seen that the crate is gone.
-        assert before + 1 <= rack.outcome.ticks <= words[System.TICK] + 1
+        assert before + 1 <= outcome.ticks <= words[System.TICK] + 1
 
 
 @pytest.mark.slow
@@ -154,10 +149,7 @@ def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConf
             match=f"rack '{first.config.name}' is already running, launched by process",
         ):
             Rack(config()).launch()
-        while first.watch(0.5):
-            pass
-    assert first.outcome is not None
-    assert first.outcome.cause == "time over"
+        assert end_of(first).cause == "time over"
 
 
 @pytest.mark.slow

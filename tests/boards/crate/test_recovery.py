@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Sequence
-from typing import Any
 
 import pytest
 
@@ -15,17 +14,13 @@ from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
-from rack.boards.faults.config import FaultConfig
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import end_of, faulty, kill
 
 TASKS = ("wave", "wave.planner", "watch")
 RESTART_TICKS = 200
 """Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
-
-
-def faulty(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
-    return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
 
 
 def run(config: RackConfig, seconds: float = 2.0) -> tuple[Outcome, list[Event]]:
@@ -61,9 +56,7 @@ def test_a_lost_board_is_back_on_the_grid_at_its_tick(
 
 @pytest.mark.slow
 def test_a_run_with_its_faults_repeats(config: MakeConfig) -> None:
-    faults = [
-        {"kind": "kill", "board": victim, "tick": 90 + 150 * k} for k, victim in enumerate(TASKS)
-    ]
+    faults = [kill(victim, 90 + 150 * k) for k, victim in enumerate(TASKS)]
     faults += [
         {"kind": "hang", "board": "watch", "tick": 600},
         {"kind": "clock-skip", "board": "clock", "tick": 650},
@@ -73,7 +66,7 @@ def test_a_run_with_its_faults_repeats(config: MakeConfig) -> None:
 
 
 def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeConfig) -> None:
-    with Rack(faulty(config(), {"kind": "kill", "board": "wave", "tick": 100})) as rack:
+    with Rack(faulty(config(), kill("wave", 100))) as rack:
         rack.run(1.0)
         rows = Written.on(rack.segment).messages["wave.status"]
     assert rows["serial"].tolist() == list(range(1, len(rows) + 1))
@@ -84,7 +77,7 @@ def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeCon
 @pytest.mark.slow
 def test_a_killed_clock_continues_with_the_tick_it_died_in(config: MakeConfig) -> None:
     plain, _ = run(config())
-    killed, events = run(faulty(config(), {"kind": "kill", "board": "clock", "tick": 300}))
+    killed, events = run(faulty(config(), kill("clock", 300)))
     assert of(events, "recovery", "rejoined")[0].board == "clock"
     assert killed.digest == plain.digest
 
@@ -92,7 +85,7 @@ def test_a_killed_clock_continues_with_the_tick_it_died_in(config: MakeConfig) -
 def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(
     config: MakeConfig,
 ) -> None:
-    faults = [{"kind": "kill", "board": "wave", "tick": 50 + 250 * k} for k in range(3)]
+    faults = [kill("wave", 50 + 250 * k) for k in range(3)]
     with Rack(faulty(config("supervision.restarts=2"), *faults)) as rack:
         outcome = rack.run(5.0)
         assert rack.segment.words[System.EMERGENCY_STOP] == 1
@@ -110,7 +103,7 @@ def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(
 
 @pytest.mark.slow
 def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
-    faults = [{"kind": "kill", "board": "wave", "tick": 50 + 400 * k} for k in range(4)]
+    faults = [kill("wave", 50 + 400 * k) for k in range(4)]
     settings = ("supervision.restarts=1", "supervision.within_s=0.9")
     outcome, _ = run(faulty(config(*settings), *faults), 5.0)
     assert outcome.cause == "time over"
@@ -122,7 +115,7 @@ def test_a_loss_demands_of_the_arm_as_configured(
     config: MakeConfig, on_loss: str, demand: list[float]
 ) -> None:
     settled = config(f"board.wave.on_loss={on_loss}")
-    _, events = run(faulty(settled, {"kind": "kill", "board": "wave", "tick": 100}))
+    _, events = run(faulty(settled, kill("wave", 100)))
     found = [event for event in events if event.code == "demand"]
     assert [event.value for event in found] == demand
     assert [event.tick for event in found] == [100, 300][: len(demand)]
@@ -140,11 +133,8 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
             words[System.CLOCK_PID] if victim == "clock" else rack.segment.block(victim)[Block.PID]
         )
         os.kill(pid, signal.SIGKILL)
-        while rack.watch(0.1):
-            continue
-    assert rack.outcome is not None
-    assert rack.outcome.cause == "time over"
-    assert rack.outcome.worked
+        outcome = end_of(rack)
+    assert (outcome.cause, outcome.worked) == ("time over", True)
     assert [event.board for event in of(rack.events, "died")] == [victim]
     assert [event.board for event in of(rack.events, "recovery", "rejoined")] == [victim]
 
@@ -176,8 +166,7 @@ def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: Make
         AlarmWriter(rack.segment, "watch").ring(
             words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 200
         )
-        while rack.watch(0.1):
-            continue
+        end_of(rack)
     assert "watch" in [event.board for event in of(rack.events, "detection", "clock_stopped")]
     assert [event.board for event in of(rack.events, "died")] == ["clock"]
 
@@ -201,8 +190,7 @@ def test_a_latch_set_while_running_brakes_until_it_is_reset(config: MakeConfig) 
             while words[System.TICK] < tick + 40:
                 assert rack.watch(0.02)
             demands.append(words[System.DEMAND])
-        while rack.watch(0.1):
-            continue
+        end_of(rack)
     assert demands == [2, 0]
     assert [event.kind for event in rack.events if event.code == "demand"] == [
         "reaction",

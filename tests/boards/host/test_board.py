@@ -20,6 +20,7 @@ from rack.boards.config import resolve
 from rack.boards.host.bus import HostBus
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.host_programs import Failing
+from tests.boards.runs import end_of, stop
 from tests.processes import BOUND_S, runs, wait_until
 
 HOSTED = f"""{CLOCK}
@@ -69,9 +70,7 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
         return condition()
 
     wait_until(holds, BOUND_S)
-    rack.stop("the test has seen enough")
-    while rack.watch(0.5):
-        continue
+    stop(rack)
 
 
 def status(segment: Segment, board: str = "bridge") -> object:
@@ -195,10 +194,7 @@ def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConf
         with pytest.raises(AttributeError, match="no field 'valu'; fields: id, value, colour"):
             second.send("numbers", valu=1)
         second.finish()
-        while rack.watch(0.5):
-            continue
-        assert rack.outcome is not None
-        assert rack.outcome.cause == "task done"
+        assert end_of(rack).cause == "task done"
         assert second.is_over
         assert not second.wait(60.0)
         second.close()

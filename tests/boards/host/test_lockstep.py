@@ -15,6 +15,7 @@ from rack.boards.host.bus_adapter import LONGEST_S
 from rack.tools.faults.ending import strikes
 from tests.boards.conftest import MakeConfig
 from tests.boards.host.test_board import ENDS, HOSTED, codes, status, watch
+from tests.boards.runs import stop
 from tests.processes import wait_until
 
 pytestmark = pytest.mark.thorough
@@ -106,11 +107,7 @@ def test_a_stop_ends_the_wait_for_a_program(config: MakeConfig) -> None:
         block = rack.segment.block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
         began = time.monotonic()
-        rack.stop("the test has seen enough")
-        while rack.watch(0.5):
-            continue
-        assert rack.outcome is not None
-        assert rack.outcome.cause == "stopped"
+        assert stop(rack).cause == "stopped"
     assert time.monotonic() - began < LONGEST_S / 2
 
 

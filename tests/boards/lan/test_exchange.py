@@ -34,6 +34,7 @@ from tests.boards.lan.racks import (
     rack_text,
     started,
 )
+from tests.boards.runs import stop
 from tests.machine import needs_fifo
 from tests.processes import BOUND_S, wait_until
 
@@ -227,9 +228,7 @@ max_age_ms = 1000
 
         wait_until(goes_on)
         rows = written(rack.segment, "lan.status")
-        rack.stop("the test has seen enough")
-        while rack.watch(0.1):
-            continue
+        stop(rack)
     refused = np.diff(rows["import_other"]["refused"].astype(int))
     assert refused.max() == UNREAD
     assert (refused >= 0).all()

@@ -11,11 +11,11 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, System
 from rack.boards import Rack
-from rack.boards.faults.config import FaultConfig
 from rack.boards.run.task import ClockGuard
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 from tests.boards.conftest import MakeConfig
+from tests.boards.runs import faulty, kill
 
 PERIOD_NS = 20_000_000
 
@@ -85,9 +85,8 @@ def test_ticks_that_a_late_clock_skips_are_reported_with_the_first_of_them(
 
 @pytest.mark.slow
 def test_a_skip_while_the_guard_is_lost_is_seen_when_it_is_back(config: MakeConfig) -> None:
-    kill = FaultConfig(kind="kill", board="wave", tick=100)
-    skip = FaultConfig(kind="clock-skip", board="clock", tick=150, ticks=3)
-    with Rack(config().model_copy(update={"fault": (kill, skip)})) as rack:
+    skip = {"kind": "clock-skip", "board": "clock", "tick": 150, "ticks": 3}
+    with Rack(faulty(config(), kill("wave", 100), skip)) as rack:
         rack.run(1.0)
         reported = rack.segment.block("wave")[Block.CLOCK_SKIPPED]
     (found,) = [event for event in rack.events if event.code == "clock_skipped"]

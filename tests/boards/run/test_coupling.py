@@ -10,6 +10,7 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import stop
 from tests.machine import needs_fifo
 from tests.processes import wait_until
 
@@ -41,10 +42,7 @@ def test_executor_and_planner_are_two_processes(
         rack.start()
         # Others of this machine may have the core for a while.
         wait_until(lambda: rack.segment.block("wave.planner")[Block.PLANS] > 0)
-        rack.stop("it plans")
-        wait_until(lambda: not rack.watch(0.0))
-        assert rack.outcome is not None
-        assert rack.outcome.cause == "stopped"
+        assert stop(rack).cause == "stopped"
 
 
 def test_a_plan_takes_effect_at_the_end_of_its_slice(config: MakeConfig) -> None:

@@ -13,10 +13,10 @@ from rack.boards import Rack
 from rack.boards.config import resolve
 from rack.boards.errors import ConfigError
 from rack.boards.exchange import PortAge
-from rack.boards.faults.config import FaultConfig
 from rack.tools.live.snapshot import RackMonitor
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import faulty, kill
 
 WAVE, NOTES = (2, 1), (3, 2)
 """Period and phase of the writer and of the reader, ticks."""
@@ -160,10 +160,7 @@ def test_a_queue_is_not_read_asynchronously(config: MakeConfig) -> None:
 def killed(config: MakeConfig, victim: str) -> Any:
     """Return the rows of the reader's record and status after the death of a board at tick 41."""
     plain = config("supervision.lockstep_restart_s=0.1", text=TEXT)
-    rack = Rack(
-        plain.model_copy(update={"fault": (FaultConfig(kind="kill", board=victim, tick=41),)})
-    )
-    return written(rack, 2 * SECONDS).messages
+    return written(Rack(faulty(plain, kill(victim, 41))), 2 * SECONDS).messages
 
 
 @pytest.mark.slow

@@ -11,10 +11,10 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.config.timing import rack_timing
-from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.schedule import simulate
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import faulty, kill
 
 BOARD = """
 [board.{name}]
@@ -101,8 +101,7 @@ def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(
 @pytest.mark.slow
 def test_a_restart_keeps_the_phase(config: MakeConfig) -> None:
     plain = config("supervision.lockstep_restart_s=0.06", text=cyclic())
-    kill = FaultConfig(kind="kill", board="left", tick=42)
-    rack = Rack(plain.model_copy(update={"fault": (kill,)}))
+    rack = Rack(faulty(plain, kill("left", 42)))
     ticks = written(rack, 0.5).cycles["left"]["tick"].tolist()
     every, phase, _ = MINOR["left"]
     assert ticks[0] == phase
