@@ -20,7 +20,6 @@ from rack.boards.events import (
     Ending,
     Event,
     Journal,
-    Outcome,
     braked_text,
     brakings,
     statuses,
@@ -196,22 +195,6 @@ def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
     (end,) = ending(bus).ends({1: goal})
     assert (end.object, end.off_mm, end.tolerance_mm) == ("block", 4.0, 5.0)
     assert str(end) == "object 'block' ended 4 mm from its goal (tolerance 5 mm)"
-
-
-@pytest.mark.parametrize(
-    ("cause", "faults", "worked"),
-    [
-        ("task done", (), True),
-        ("time over", (), True),
-        ("task done", ("late",), False),
-        ("stopped", (), False),
-        ("task failed", (), False),
-    ],
-)
-def test_a_run_has_worked_without_faults_and_uncut(
-    cause: Any, faults: tuple[str, ...], worked: bool
-) -> None:
-    assert Outcome(cause, 1, "", "", "", faults).worked is worked
 
 
 def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:

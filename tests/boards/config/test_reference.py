@@ -139,20 +139,6 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
         reference(path)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "found"),
-    [
-        ("clock", ["clock"]),
-        ("[board.servo.budget]", ["board.budget"]),
-        ("board.servo.params", ["board.servo.params"]),
-        ("task", ["task.action.goto", "task.action.home", "task.action.transfer"]),
-    ],
-)
-def test_tables_are_found_by_the_names_that_a_config_uses(name: str, found: list[str]) -> None:
-    assert [table.name for table in find_tables(name, load("nasrem"))] == found
-
-
 def test_an_unknown_table_is_refused_with_the_known_tables() -> None:
     with pytest.raises(LookupError, match=r"no such table; tables: rack, clock, protocol, .*task"):
         find_tables("bord", load("nasrem"))

@@ -47,17 +47,6 @@ def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
     assert not [note for note in stepped.notes(segment) if "SCHED_FIFO" in note]
 
 
-def test_a_launch_says_what_has_changed_since_an_older_format(
-    memory: tuple[Resolved, Segment], config: MakeConfig
-) -> None:
-    _, segment = memory
-    counts = {}
-    for given in (1, 2):
-        notes = resolve(config(f"format={given}")).notes(segment)
-        counts[given] = [note.startswith("config format 1, ") for note in notes].count(True)
-    assert counts == {1: 1, 2: 0}
-
-
 def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
     plan = resolve(config("supervision.lockstep_restart_s=0.25"))
     clock = plan.clock(0.5)

@@ -14,11 +14,10 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import racks
 from rack.backplane.words import Block, TaskState
 from rack.boards import Rack
-from rack.boards.crate.line import CrateLine
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event
 from tests.boards.conftest import PLAIN, PLANNED, MakeConfig
-from tests.processes import children_of, descriptors, open_files, runs, wait_until
+from tests.processes import children_of, descriptors, open_files, wait_until
 from tests.warm import programs
 
 
@@ -112,19 +111,6 @@ def test_a_launch_reports_what_it_waits_for(
     # Without the report nobody opens the FIFO, and the launch never ends.
     with Rack(config("board.watch.executor=wave_levels:SlowlyPreloaded", text=PLAIN), let_it_load):
         assert waits[0].startswith("preloading 'wave_levels:SlowlyPreloaded'")
-
-
-@pytest.mark.slow
-def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(
-    config: MakeConfig,
-) -> None:
-    with CrateLine() as crate:
-        with Rack(config(text=PLAIN), crate=crate) as rack:
-            boards = [
-                rack.segment.block(task.name)[Block.PID] for task in rack.segment.layout.tasks
-            ]
-            assert set(boards) <= set(children_of(crate.pid))
-        assert not runs(crate.pid)
 
 
 @pytest.mark.slow

@@ -153,20 +153,6 @@ def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConf
 
 
 @pytest.mark.slow
-def test_racks_running_together_do_not_affect_each_other(
-    config: MakeConfig, rack_name: str
-) -> None:
-    alone = run(Rack(config()), 0.5)
-    pair = [Rack(config(f"name={rack_name}-{end}")) for end in ("a", "b")]
-    with pair[0], pair[1]:
-        for rack in pair:
-            rack.start(0.5)
-        while pair[0].watch(0.02) | pair[1].watch(0.02):
-            pass
-    assert [rack.outcome and rack.outcome.digest for rack in pair] == [alone.digest] * 2
-
-
-@pytest.mark.slow
 def test_a_removed_rack_frees_its_memory(config: MakeConfig) -> None:
     rack = Rack(config())
     run(rack, 0.0025)

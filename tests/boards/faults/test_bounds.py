@@ -63,28 +63,6 @@ def test_a_slow_planner_is_detected_after_its_slice_and_one_release(config: Make
     assert bound(config, fault, None, "board.wave.rate_hz=200") == 4 * 2 + 2
 
 
-@pytest.mark.parametrize(("kind", "ticks"), [("actuator-off", 13), ("actuator-saturated", 30)])
-def test_a_motor_of_a_fast_board_is_detected_within_a_time(
-    config: MakeConfig, kind: str, ticks: int
-) -> None:
-    rates = [f"board.{name}.rate_hz=1000" for name in ("wave", "watch", "driven")]
-    assert (
-        bound(config, {"kind": kind, "board": "driven"}, None, "clock.period_ms=1.0", *rates)
-        == ticks
-    )
-
-
-@pytest.mark.parametrize(("ticks", "within"), [(1, 3), (3, 3), (4, 4)])
-def test_a_skip_is_found_in_the_next_cycle_of_the_fastest_boards(
-    config: MakeConfig, ticks: int, within: int
-) -> None:
-    rates = [f"board.{name}.rate_hz=100" for name in ("wave", "watch", "driven")]
-    assert (
-        bound(config, {"kind": "clock-skip", "board": "clock", "ticks": ticks}, None, *rates)
-        == within
-    )
-
-
 def test_a_held_lock_is_detected_within_the_bound_of_a_wait(config: MakeConfig) -> None:
     # 2 ms of 2.5 ms ticks, and the cycle of the first reader.
     assert (

@@ -77,15 +77,6 @@ def test_every_bundled_script_fits_the_nasrem_rack(name: str) -> None:
     assert loads(config.text()) == config
 
 
-def test_an_unknown_script_lists_the_known_scripts(small: Path) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, faults="unheard")
-    assert (
-        str(error.value)
-        == f'--faults = "unheard": no such file; by name: {", ".join(names(FAULTS))}; or a path'
-    )
-
-
 @pytest.mark.parametrize("text", ["[clock]\nspeed = 2\n", "fault = 3\n", 'name = "x"\n'])
 def test_a_script_holds_faults_and_nothing_else(small: Path, write: Write, text: str) -> None:
     with pytest.raises(

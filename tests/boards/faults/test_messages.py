@@ -101,18 +101,6 @@ def test_reads_with_a_fault_depend_on_ticks_alone(
     assert alarms == alarms_again or kind == "masquerade"
 
 
-def test_mute_writes_nothing_and_reports_success(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 8)
-    entry = rack.fault("mute")
-    assert all(rack.writer.cycle(tick) for tick in range(8, 12))
-    assert [tick for tick, *_ in rack.written()] == [*range(8)]
-    assert entry.count == 4
-    rack.heal()
-    rack.run(12, 16)
-    assert [tick for tick, *_ in rack.written()] == [*range(8), *range(12, 16)]
-
-
 def test_a_dropped_message_uses_a_serial_but_fills_no_slot(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 8)
@@ -173,14 +161,6 @@ def test_every_damage_is_detected(link: MakeLink, bits: int) -> None:
     rack.fault("corrupt", 1.0, bits)
     rack.run(0, 50)
     assert not any(seen.released >= 0 for seen in rack.reader.seen)
-
-
-def test_babble_writes_the_given_number_of_messages_per_cycle(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 4)
-    rack.fault("babble", 40)
-    rack.run(4, 6)
-    assert [tick for tick, *_ in rack.written()] == [0, 1, 2, 3] + [4] * 40 + [5] * 40
 
 
 def test_faults_of_one_mailbox_compose(link: MakeLink) -> None:

@@ -8,7 +8,7 @@ import pytest
 from rack.backplane.mailbox.mailbox import Verdict
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.message import Message
+from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
@@ -67,11 +67,18 @@ class Importing:
         self.entry.resume(self.status.import_other, tick)
 
     def send(
-        self, number: int, written: int, count: int | None = None, launch: int = LAUNCH, **head: int
+        self,
+        number: int,
+        written: int,
+        count: int | None = None,
+        launch: int = LAUNCH,
+        state: int = State.IDLE,
+        **head: int,
     ) -> None:
         """Let a message arrive, written there at the time of our tick `written`."""
         message = Message(message_dtype(self.spec.fields, self.spec.size))
         message.count = number if count is None else count
+        message.record["state"] = state
         time_ns = self.grid.time_ns(written)
         envelope = Envelope(self.kind, launch, number, number, written, time_ns, time_ns)._replace(
             **head
@@ -158,6 +165,8 @@ def test_what_is_no_message_of_this_mailbox_is_refused(importing: Importing) -> 
     importing.send(1, written=1, kind=1)
     importing.send(2, written=1, serial=1 << 63)
     importing.send(3, written=1, launch=1 << 63)
+    # A member that the enumeration of its type lacks.
+    importing.send(3, written=1, state=77)
     importing.send(4, written=1)
     good = importing.network.come[-1]
     importing.network.come += [
@@ -166,7 +175,7 @@ def test_what_is_no_message_of_this_mailbox_is_refused(importing: Importing) -> 
         good._replace(envelope=None),
     ]
     importing.cycle(8)
-    assert importing.counts() == {"refused": 6, "taken": 1}
+    assert importing.counts() == {"refused": 7, "taken": 1}
     assert importing.read(16) == (NEW, 4, False)
 
 

@@ -118,21 +118,6 @@ QUEUE = (
 
 
 @pytest.mark.slow
-def test_in_real_time_an_asynchronous_port_has_what_ticks_permit_or_newer(
-    config: MakeConfig,
-) -> None:
-    with Rack(config("clock.mode=realtime", text=TEXT)) as rack:
-        rack.run(SECONDS)
-        rows = Written.on(rack.segment).messages["notes.exchange"]
-        # All messages are whole, in order and in time, however early or late they are taken.
-        assert [event for event in rack.events if event.kind == "detection"] == []
-    made = {port: rows["tick"] - rows["message"][f"{port}_age"] for port in ("plain", "early")}
-    both = rows["message"]["plain_taken"] >= 0
-    assert both.any()
-    assert (made["early"][both] >= made["plain"][both]).all()
-
-
-@pytest.mark.slow
 def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(
     config: MakeConfig,
 ) -> None:

@@ -185,18 +185,6 @@ def test_a_slow_cycle_changes_nothing_in_lockstep(config: MakeConfig) -> None:
     assert counted(slow, Block.MISSED, Block.SKIPPED) == 0
 
 
-@pytest.mark.slow
-def test_speed_scales_the_grid_but_not_the_run(config: MakeConfig) -> None:
-    speed = 2.0
-    rack = Rack(config(REALTIME, f"clock.speed={speed}", text=PLAIN))
-    cycles = written(rack, 0.25).cycles["wave"]
-    assert rack.outcome is not None
-    assert rack.outcome.ticks == 100
-    period_ns = 2_500_000 / speed
-    assert (np.diff(cycles["release_ns"]) == np.diff(cycles["tick"]) * period_ns).all()
-    assert (cycles["start_ns"] >= cycles["release_ns"]).all()
-
-
 @needs_two_cores
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["time-slice", "lock"])
