@@ -3,9 +3,7 @@ sight has failed."""
 
 from __future__ import annotations
 
-import json
 import time
-from pathlib import Path
 
 import pytest
 
@@ -13,7 +11,6 @@ from rack.boards import Rack
 from rack.boards.events import NO_TORQUE, Event
 from tests.boards.arm_racks import TOGETHER, arm_rack
 from tests.boards.conftest import MakeConfig
-from tests.tools.command_line import rack as rack_command
 
 pytestmark = pytest.mark.thorough
 
@@ -60,28 +57,3 @@ def test_a_run_held_by_brakes_has_failed_and_says_so(config: MakeConfig) -> None
     (fault,) = outcome.faults
     assert fault.startswith(f"{HELD}, in 650 ms: brakes engaged 1 time, ")
     assert fault.endswith(" ms at tick 204: no torque (1)")
-
-
-@pytest.mark.slow
-def test_brakes_that_were_never_released_have_held_the_run(config: MakeConfig) -> None:
-    with Rack(config(text=stalling(stall=30, period=32))) as rack:
-        outcome = rack.run(0.4)
-        events = [event.code for event in rack.events if "brakes" in event.code]
-    assert (events, outcome.worked) == ([], False)
-    why = "stale torque from board 'servo': based on a status more than 7 ticks old"
-    times = "brakes engaged 1 time, 400 ms in all, longest 400 ms at tick 0"
-    assert outcome.faults == (f"{HELD}, in 400 ms: {times}: {why} (1)",)
-
-
-@pytest.mark.slow
-def test_the_command_ends_with_1_and_the_report_counts(tmp_path: Path, rack_name: str) -> None:
-    path = tmp_path / "arm.toml"
-    path.write_text(stalling(stall=400, period=600))
-    words = (path, "--set", f"name={rack_name}", "--seconds", 0.65)
-    recorded = rack_command("run", *words, "--out", tmp_path / "run")
-    assert recorded.returncode == 1
-    assert HELD in recorded.stderr
-    assert "brakes engaged 1 time, " in recorded.stdout
-    assert "\n- brakes engaged 1 time, " in (tmp_path / "run" / "report.md").read_text()
-    (braking,) = json.loads((tmp_path / "run" / "report.json").read_text())["outcome"]["brakings"]
-    assert (braking["why"], braking["lasted_ms"] > 390.0) == (NO_TORQUE, True)

@@ -48,17 +48,6 @@ def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -
 
 
 @pytest.mark.slow
-def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
-    statuses, _ = counted(
-        counter(commands(SWAP), 'fault=[{ kind = "kill", board = "counter", at = 0.15 }]'), 0.9
-    )
-    assert statuses["table"][-1] == b"slow"
-    assert [name.decode() for name in statuses["fired"][9:12]] == ["count up", "settle", "rest"]
-    assert set(statuses["fired"][11:].tolist()) == {b"rest"}
-    assert set(statuses["count"][10:].tolist()) == {10}
-
-
-@pytest.mark.slow
 def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(
     counter: MakeConfig, tmp_path: Path
 ) -> None:

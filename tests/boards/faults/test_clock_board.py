@@ -171,28 +171,6 @@ def test_a_restarted_clock_awaits_the_messages_that_its_predecessor_did(site: Si
     assert site.advance(6, 7) == [(Alarm.FLOWS, 7, 0, 2.0)]
 
 
-@pytest.mark.parametrize(
-    ("kind", "more", "next_ticks"),
-    [
-        ("drop", {"tick": 4, "ticks": 3, "mailbox": 0}, [4, 4, 7, 7]),
-        ("drop", {"ticks": 3, "mailbox": 0, "when": (1, 0, 7)}, [3, 4, 5, 6]),  # read in each tick
-        ("sensor-bias", {"tick": 4, "ticks": 3}, [4, 4, 7, 7]),
-        ("hang", {"tick": 4, "ticks": 3}, [4, 4, 5, 6]),  # may end early, with its process
-        ("babble", {"tick": 4, "ticks": 3}, [4, 4, 5, 6]),  # the recorder keeps up with each tick
-        ("clock-jitter", {"tick": 4, "ticks": 3, "task": -1}, [4, 4, 5, 6]),  # acts in each tick
-    ],
-)
-def test_ticks_in_which_no_fault_can_change_are_left_out(
-    site: Site, kind: str, more: dict[str, Any], next_ticks: list[int]
-) -> None:
-    site.add(kind, **more)
-    found = []
-    for tick in (2, 3, 4, 5):
-        site.advance(tick)
-        found.append(site.stage.next_tick)
-    assert found == next_ticks
-
-
 def test_a_condition_holds_as_of_the_tick_before(site: Site) -> None:
     entry = site.add("mute", when=(1, 0, 7), ticks=1)
     site.write_other.message.id = 6

@@ -5,10 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +24,16 @@ from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence
 from tests.boards.lan.racks import (
     LAUNCH_S,
-    ROOT,
     RackProcess,
     configs,
     endpoints,
     rack_text,
     started,
 )
+from tests.boards.lan.test_strangers import running
 from tests.boards.runs import stop
 from tests.machine import needs_fifo
-from tests.processes import BOUND_S, wait_until
+from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -184,21 +181,6 @@ def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(
             assert os.sched_getaffinity(thread) == {core}
 
 
-@contextmanager
-def flooding(name: str, endpoint: str, victim: str) -> Iterator[None]:
-    """Let a rack of that name flood another one, which listens at an endpoint."""
-    command = [sys.executable, "-m", "tests.boards.lan.flooder", name, endpoint, victim]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE) as process:
-        try:
-            yield
-        finally:
-            process.stdin.close()  # type: ignore[union-attr]
-            try:
-                process.wait(BOUND_S)
-            finally:
-                process.kill()
-
-
 @pytest.mark.alone
 def test_a_flood_costs_a_bounded_number_of_looks_and_other_entries_go_on(
     rack_name: str, tmp_path: Path
@@ -214,7 +196,7 @@ max_age_ms = 1000
     (config,) = configs(
         [rack_text(rack_name, at, [], "flood", lan="lease_ms = 1000") + calm], tmp_path
     )
-    with Rack(config) as rack, flooding("flood", at, rack_name):
+    with Rack(config) as rack, running("flooder", "flood", at, rack_name):
         rack.start(SECONDS)
 
         def goes_on() -> bool:

@@ -22,22 +22,6 @@ def alarms(peer: PeerRack) -> list[Alarm]:
     return [finding.alarm for finding in peer.findings]
 
 
-def test_a_rack_is_there_from_its_token_to_the_end_of_it() -> None:
-    peer = PeerRack("b")
-    assert peer.presence is Presence.AWAITED
-    peer.goes(OLD, 3)
-    assert peer.presence is Presence.AWAITED
-    peer.comes(OLD, 5)
-    assert (peer.presence, peer.since, peer.launches, alarms(peer)) == (Presence.THERE, 5, 1, [])
-    peer.goes(OLD, 9)
-    assert (peer.presence, peer.since, peer.losses, alarms(peer)) == (
-        Presence.LOST,
-        9,
-        1,
-        [Alarm.PEER_LOST],
-    )
-
-
 def test_a_partition_is_not_a_restart() -> None:
     peer = PeerRack("b")
     peer.comes(OLD, 5)

@@ -9,13 +9,10 @@ import pytest
 from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.words import Block, System
-from rack.boards import Rack
+from rack.backplane.words import System
 from rack.boards.run.task import ClockGuard
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.boards.conftest import MakeConfig
-from tests.boards.runs import faulty, kill
 
 PERIOD_NS = 20_000_000
 
@@ -81,18 +78,6 @@ def test_ticks_that_a_late_clock_skips_are_reported_with_the_first_of_them(
     # From the first one skipped up to the tick that follows.
     assert all(count == tick - first for tick, first, count in skips)
     assert sum(count for _, _, count in skips) == segment.words[System.CLOCK_SKIPPED] >= 2
-
-
-@pytest.mark.slow
-def test_a_skip_while_the_guard_is_lost_is_seen_when_it_is_back(config: MakeConfig) -> None:
-    skip = {"kind": "clock-skip", "board": "clock", "tick": 150, "ticks": 3}
-    with Rack(faulty(config(), kill("wave", 100), skip)) as rack:
-        rack.run(1.0)
-        reported = rack.segment.block("wave")[Block.CLOCK_SKIPPED]
-    (found,) = [event for event in rack.events if event.code == "clock_skipped"]
-    (back,) = [event for event in rack.events if event.code == "rejoined"]
-    assert (found.board, found.value, found.since, found.tick) == ("wave", 3.0, 150, back.tick)
-    assert reported == 3
 
 
 @pytest.mark.parametrize(("part", "count"), [(0.4, 0), (0.6, 1)])

@@ -161,22 +161,6 @@ def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come
     assert rack.words[System.STOP_TICK] == 14
 
 
-def test_the_controller_rests_until_the_run_may_end_unless_it_has_work(make_bus: MakeBus) -> None:
-    status = replace(box(TASK_STATUS, "task.status"), every=8, delay=8)
-    bus = make_bus(*BOARDS, task("task", every=8, slot=4), status)
-    rack = Controlled(bus, ends_run="task.status")
-    assert rack.controller.rests_until(0) == 1
-    rack.demand(0)
-    rack.end_of_run(3)
-    assert rack.controller.rests_until(3) == 9
-    rack.lose("left", 3)
-    rack.demand(4)
-    assert rack.controller.rests_until(4) == 5
-    rack.blocks["left"][Block.STATE] = TaskState.READY
-    rack.demand(5)
-    assert rack.controller.rests_until(5) == 9
-
-
 def ends_at(
     segment: Segment, state: State, written: int, until: int, **changed: object
 ) -> list[int | None]:
