@@ -9,10 +9,7 @@ import pytest
 from rack.backplane.fault_table import Injection
 from rack.backplane.message import State
 from rack.boards.config import wire
-from rack.boards.config.faults import injection, injections
-from rack.boards.config.published import publish
-from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
+from rack.boards.config.faults import injections
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
@@ -105,12 +102,3 @@ def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(
     assert injected(config, drop, drop)[1].seed == second.seed
     other = rack(config, drop, settings=("seed=1",))
     assert injections(other, wire(other))[0].seed != first.seed
-
-
-def test_a_fault_injected_live_is_checked_in_the_same_way(config: MakeConfig) -> None:
-    found = rack(config)
-    fault = FaultConfig.model_validate({"kind": "hang", "board": "wave", "for": 0.1, "size": 1})
-    with pytest.raises(
-        ConfigError, match=r"^size = 1: hang has no such parameter; parameters: none$"
-    ):
-        injection(fault, found, publish(found).levels, wire(found))

@@ -288,28 +288,3 @@ def test_a_friend_may_come_over_quic(tmp_path: Path) -> None:
                 lambda: all(others.state()["friend"][got] for got in ("heard", "answers", "tokens"))
             )
             wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
-
-
-@pytest.mark.slow
-def test_without_tls_keys_and_seals_remain(tmp_path: Path) -> None:
-    mole, lies = (
-        pulse("mole"),
-        [(out_key(name, "pulse.status"), 9, None) for name in ("nobody", "home")],
-    )
-    with at_home(tmp_path, "tcp") as site:
-        both = {
-            "friend": {**friend(site), "settings": site.bare("tcp")},
-            "mole": {"settings": site.bare("tcp"), "puts": [(mole, 9, mole), *lies]},
-        }
-        with running("strangers", json.dumps(both)) as others:
-            wait_until(
-                lambda: (
-                    site.home.state()["came"].get(mole, 0) > ROUNDS
-                    and others.state()["friend"]["answers"]
-                )
-            )
-            wait_until(lambda: site.home.state()["good"].get(pulse("friend")))
-            home = site.home.state()
-    assert set(home["came"]) == {mole, pulse("friend")}
-    assert home["good"][mole] == 0
-    assert home["flaws"]["UNSIGNED"] == home["came"][mole]

@@ -151,13 +151,6 @@ def test_a_modification_is_put_in_or_taken_out_by_its_name(gentle: RackConfig) -
     assert "name" in unnamed
 
 
-def test_every_mistake_of_a_command_is_said(nasrem: RackConfig) -> None:
-    found = mistakes(
-        nasrem, level="servo", what="setpoint", joints=[9.0, -9.0, *HOME[2:]], tick=4, at=1.0
-    )
-    assert len(found) == 3
-
-
 def test_of_a_broken_board_only_its_own_mistakes_are_said(nasrem: RackConfig) -> None:
     broken = frozenset({"task"})
     assert mistakes(nasrem, broken, level="task", what="goto") == []
