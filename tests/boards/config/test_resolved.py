@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
+from resource import RLIMIT_MEMLOCK, getrlimit
 
 import pytest
 
@@ -45,6 +47,21 @@ def test_a_priority_that_was_refused_is_noted_and_refuses_the_launch_if_asked(
     stepped = resolve(config("clock.on_no_realtime=refuse", "board.wave.priority=50"))
     stepped.check_realtime(segment)
     assert not [note for note in stepped.notes(segment) if "SCHED_FIFO" in note]
+
+
+def test_memory_that_could_not_be_locked_is_said_with_its_limit(
+    memory: tuple[Resolved, Segment], config: MakeConfig
+) -> None:
+    plan, segment = memory
+    for task in plan.layout.tasks:
+        # The test's own process, which locks none.
+        segment.block(task.name)[Block.PID] = os.getpid()
+    limit = getrlimit(RLIMIT_MEMLOCK)[0]
+    said = f"memory not locked for wave, wave.planner, watch: the limit is {limit} bytes, a board "
+    for found, count in ((plan, 1), (resolve(config()), 0)):
+        assert [note.startswith(said) for note in found.notes(segment) if "not locked" in note] == [
+            True
+        ] * count
 
 
 def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:

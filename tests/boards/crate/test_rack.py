@@ -21,7 +21,6 @@ from rack.backplane.segment import Segment, racks, shm_path, unlink
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards import Rack
 from rack.boards.config.resolved import resolve
-from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.boards.runs import end_of
@@ -38,7 +37,6 @@ SMALL = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o size=$0 tmpfs /dev
 """A command in a /dev/shm of its own, of the size that comes next."""
 TWO_MAY = 65_521
 """Users of nobody else: processes are counted by user, and tests run side by side."""
-PLAIN_ROOT = ("setpriv", "--bounding-set=-sys_nice,-ipc_lock", "--inh-caps=-sys_nice,-ipc_lock")
 """A command without the rights to real-time priorities and to locked memory."""
 as_root = pytest.mark.skipif(
     os.getuid() != 0 or not shutil.which("setpriv"), reason="needs root and util-linux"
@@ -170,18 +168,6 @@ def text_of(events: Sequence[Event], kind: str) -> str:
     return "\n".join(event.text for event in events if event.kind == kind)
 
 
-def run_limited(
-    config: RackConfig, folder: Path, *limits: str, seconds: str = "0.1"
-) -> subprocess.CompletedProcess[str]:
-    """Run a rack by the command line, under these limits."""
-    path = folder / "limited.toml"
-    path.write_text(config.text())
-    command = [*limits, *RACK, "run", str(path), "--seconds", seconds, "--no-record", "--share"]
-    return subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
-    )
-
-
 @pytest.mark.slow
 @as_root
 @pytest.mark.parametrize(
@@ -227,24 +213,18 @@ def test_a_limit_of_the_system_is_one_line_with_its_value(
     unlink(segment.rack)
     segment.close()
     sizes = {"half": str(size // mmap.PAGESIZE // 2 * mmap.PAGESIZE), "all": str(size)}
-    done = run_limited(plain, tmp_path, *(sizes.get(word, word) for word in limits))
+    path = tmp_path / "limited.toml"
+    path.write_text(plain.text())
+    command = [*(sizes.get(word, word) for word in limits), *RACK, "run", str(path)]
+    done = subprocess.run(
+        [*command, "--seconds", "0.1", "--no-record", "--share"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
     assert done.returncode == 1
     assert re.fullmatch(why, done.stderr.strip())
     # Racks of other tests may run beside it: it names them.
     assert not [line for line in done.stdout.splitlines() if not line.startswith("waiting: core ")]
-
-
-@pytest.mark.slow
-@as_root
-def test_memory_that_could_not_be_locked_is_said_with_its_limit(
-    config: MakeConfig, tmp_path: Path
-) -> None:
-    real_time = config("clock.mode=realtime", text=PLAIN)
-    done = run_limited(real_time, tmp_path, "prlimit", f"--memlock={8 << 20}", *PLAIN_ROOT)
-    assert (
-        done.stdout.count(
-            "memory not locked for wave, watch: the limit is 8388608 bytes, a board maps "
-        )
-        == 1
-    )
-    assert "memory not locked" not in run_limited(real_time, tmp_path).stdout

@@ -242,3 +242,12 @@ def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -
     assert entry.struck_ns >= site.segment.words[System.EPOCH_NS] + 5.9 * 2_500_000
     site.stage.within(6)
     assert entry.count == 1
+
+
+def test_a_babble_floods_the_rings_while_it_lasts(site: Site) -> None:
+    site.add("babble", tick=2, ticks=2)
+    flooded = []
+    for tick in range(1, 5):
+        site.advance(tick)
+        flooded.append(site.driver.is_flooded)
+    assert flooded == [False, True, True, False]

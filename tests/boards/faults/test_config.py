@@ -12,8 +12,6 @@ from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from tests import reference
-from tests.boards.conftest import MakeConfig
-from tests.boards.fault_racks import rack
 
 Write = Callable[[str, str], Path]
 SCRIPT = '[[fault]]\nkind = "kill"\nboard = "lower"\ntick = 8\n'
@@ -33,31 +31,6 @@ def test_a_duration_is_a_text_with_its_unit_or_a_number_of_seconds(
     assert FaultConfig.model_validate(
         {"kind": "mute", "board": "wave", "for": text}
     ).lasts == pytest.approx(seconds)
-
-
-def test_the_resolved_text_of_a_config_with_faults_loads_again(config: MakeConfig) -> None:
-    found = rack(
-        config,
-        {
-            "kind": "mute",
-            "board": "wave",
-            "for": "20ms",
-            "when": "wave.status.state == executing",
-            "seed": 3,
-        },
-        {
-            "kind": "sensor-bias",
-            "board": "driven",
-            "tick": 40,
-            "cycles": 5,
-            "phase": 0.25,
-            "size": 0.1,
-            "joint": -1,
-        },
-    )
-    again = loads(found.text())
-    assert again == found
-    assert (again.fault[0].lasts, again.fault[1].parameters) == (0.02, {"size": 0.1, "joint": -1.0})
 
 
 def test_the_faults_of_a_script_come_after_those_of_the_config(small: Path, write: Write) -> None:

@@ -163,6 +163,14 @@ def test_every_damage_is_detected(link: MakeLink, bits: int) -> None:
     assert not any(seen.released >= 0 for seen in rack.reader.seen)
 
 
+def test_babble_writes_the_given_number_of_messages_per_cycle(link: MakeLink) -> None:
+    rack = link()
+    rack.run(0, 4)
+    rack.fault("babble", 40)
+    rack.run(4, 6)
+    assert [tick for tick, *_ in rack.written()] == [0, 1, 2, 3] + [4] * 40 + [5] * 40
+
+
 def test_faults_of_one_mailbox_compose(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 32)

@@ -126,7 +126,7 @@ def test_a_program_that_stops_while_the_rack_waits_for_it_does_not_hold_the_rack
         "rejoined",
     ]
     said = [event.text for event in rack.events]
-    assert "'program' is not responding: stopped by a signal" in said
+    assert said.count("'program' is not responding: stopped by a signal") == 1
 
 
 def test_a_program_that_is_given_up_ends_the_run_at_the_same_tick(config: MakeConfig) -> None:

@@ -244,17 +244,3 @@ def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
         rack.segment.words[System.PEER_STOP] = switch(demand_from, is_on)
         rack.run(0.5)
     return [(event.tick, event.text) for event in rack.events if event.code == "demand"]
-
-
-def test_the_clock_follows_the_adapter_at_its_tick(rack_name: str) -> None:
-    text = (
-        rack_text(rack_name, "", [])
-        .partition("[adapter.lan]")[0]
-        .replace("[clock]", '[clock]\nmode = "lockstep"')
-    )
-    stop = "the arm must ramp to rest, then brake: a rack that it works with is lost"
-    assert words(100, True, Rack(loads(text))) == [(100, stop)]
-    assert words(100, False, Rack(loads(text))) == [
-        (0, stop),
-        (100, "arm released: no stop is requested"),
-    ]

@@ -18,7 +18,7 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.words import Block, Demand, System, TaskState
+from rack.backplane.words import Block, Demand, System, TaskState, switch
 from rack.boards.config.layout import field_specs
 from rack.boards.operator import hold
 from rack.boards.run.system_controller import EndOfRun, SystemController
@@ -99,6 +99,17 @@ def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> Non
     assert values == [Demand.STOP, Demand.BRAKE, 2, Demand.STOP, 6, Demand.NONE]
 
 
+def test_the_clock_follows_the_network_adapter_at_its_tick(make_bus: MakeBus) -> None:
+    rack = Controlled(make_bus(*BOARDS))
+    rack.words[System.PEER_STOP] = switch(5, True)
+    assert [rack.demand(tick) for tick in (4, 5, 6)] == [Demand.NONE, Demand.STOP, Demand.STOP]
+    rack.words[System.PEER_STOP] = switch(9, False)
+    assert rack.demand(8) is Demand.STOP
+    # A switch that lies ahead is waited for tick by tick.
+    assert rack.controller.rests_until(8) == 9
+    assert rack.demand(9) is Demand.NONE
+
+
 def test_a_command_whose_client_has_died_is_not_issued_and_says_so(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox(name="left.operator", writer="clock"), *BOARDS)
     rack, table = Controlled(segment), OperatorTable(segment)
@@ -159,6 +170,22 @@ def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come
     rack.blocks["right"][Block.STATE] = TaskState.GIVEN_UP
     rack.demand(7)
     assert rack.words[System.STOP_TICK] == 14
+
+
+def test_the_controller_rests_until_the_run_may_end_unless_it_has_work(make_bus: MakeBus) -> None:
+    status = replace(box(TASK_STATUS, "task.status"), every=8, delay=8)
+    bus = make_bus(*BOARDS, task("task", every=8, slot=4), status)
+    rack = Controlled(bus, ends_run="task.status")
+    assert rack.controller.rests_until(0) == 1
+    rack.demand(0)
+    rack.end_of_run(3)
+    assert rack.controller.rests_until(3) == 9
+    rack.lose("left", 3)
+    rack.demand(4)
+    assert rack.controller.rests_until(4) == 5
+    rack.blocks["left"][Block.STATE] = TaskState.READY
+    rack.demand(5)
+    assert rack.controller.rests_until(5) == 9
 
 
 def ends_at(
