@@ -34,5 +34,8 @@ def end_of(rack: Rack) -> Outcome:
 
 def stop(rack: Rack) -> Outcome:
     """Stop a rack of which a test has seen enough."""
-    rack.stop("the test has seen enough")
-    return end_of(rack)
+    why = "the test has seen enough"
+    rack.stop(why)
+    outcome = end_of(rack)
+    assert why in [event.text for event in rack.events if event.kind == "stop"]
+    return outcome

@@ -100,7 +100,9 @@ def holders(rack: Rack) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
-def test_a_stop_from_outside_is_reported_as_one(config: MakeConfig, mode: str) -> None:
+def test_boards_are_ready_before_the_clock_runs_and_a_stop_from_outside_ends_them(
+    config: MakeConfig, mode: str
+) -> None:
     settings = (f"clock.mode={mode}", "protocol.default=lock", "clock.idle_cores=awake")
     with Rack(config(*settings), share=True) as rack:
         # Ready before the clock runs, and only the segment has a name.

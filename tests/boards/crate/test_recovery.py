@@ -142,7 +142,7 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
 @pytest.mark.slow
 def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) -> None:
     outcome, events = run(
-        faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 120})
+        faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 40})
     )
     (stopped,) = of(events, "detection", "clock_stopped")
     assert stopped.board == "wave"
@@ -155,16 +155,16 @@ def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) ->
 @pytest.mark.slow
 def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
-        rack.start(2.0)
+        rack.start(1.5)
         words = rack.segment.words
-        while words[System.TICK] < 200:
+        while words[System.TICK] < 40:
             assert rack.watch(0.05)
         dead = words[System.CLOCK_PID]
         os.kill(dead, signal.SIGKILL)
         while not of(rack.events, "recovery", "rejoined"):
             assert rack.watch(0.05)
         AlarmWriter(rack.segment, "watch").ring(
-            words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 200
+            words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 40
         )
         end_of(rack)
     assert "watch" in [event.board for event in of(rack.events, "detection", "clock_stopped")]
