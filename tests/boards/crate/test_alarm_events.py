@@ -146,13 +146,6 @@ def test_an_alarm_has_names_and_units(
     assert (event.board, event.since, event.fault) == (owner, 360, -1)
 
 
-def test_subjects_have_names_for_programs_too(segment: Segment) -> None:
-    assert heard(segment, CLOCK, Alarm.LATE, 0).subject == "wave"
-    assert heard(segment, "watch", Alarm.GAP, 2).subject == "watch.status"
-    assert heard(segment, "driven", Alarm.ACTUATOR, 0).subject == "shoulder"
-    assert heard(segment, "wave", Alarm.CLOCK_STOPPED).subject == ""
-
-
 def test_a_rejoin_names_the_task(segment: Segment) -> None:
     event = heard(segment, CLOCK, Alarm.REJOINED, 2, 200)
     assert (event.board, event.subject, event.text) == (

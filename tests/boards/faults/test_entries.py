@@ -56,22 +56,6 @@ def test_a_fault_lasts_for_a_time_or_for_cycles_of_its_task(
     assert found.ticks == ticks
 
 
-def test_targets_are_places_in_the_layout(config: MakeConfig) -> None:
-    faults = [
-        {"kind": "mute", "board": "watch", "mailbox": "watch.status"},
-        {"kind": "clock-skip", "board": "clock", "ticks": 3},
-        {"kind": "mute", "board": "wave"},
-    ]
-    layout = wire(rack(config))
-    first, second, third = injected(config, *faults)
-    assert (layout.tasks[first.task].name, layout.mailboxes[first.mailbox].name) == (
-        "watch",
-        "watch.status",
-    )
-    assert (second.task, second.mailbox, second.parameters) == (-1, -1, (3.0,))
-    assert (layout.tasks[third.task].name, third.mailbox) == ("wave", -1)
-
-
 @pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
 def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, value: str) -> None:
     (found,) = injected(

@@ -20,15 +20,6 @@ def order() -> tuple[MessageOrder, ImportCount]:
     return MessageOrder(count), count
 
 
-def test_a_new_launch_begins_anew() -> None:
-    found, count = order()
-    assert found.admits(head(90))
-    assert found.admits(head(4, launch=8))
-    assert (found.launch, found.number, count.missing, count.repeated) == (8, 4, 0, 0)
-    assert found.admits(head(6, launch=8))
-    assert count.missing == 1
-
-
 def test_a_restarted_reader_takes_nothing_twice() -> None:
     found, count = order()
     found.resume(7, 20, 60)
