@@ -68,10 +68,7 @@ def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConf
         (int(row["tick"]), name) for name, rows in found.cycles.items() for row in rows
     )
     assert released == [(tick, ("wave", "left", "wave", "right")[tick % 4]) for tick in range(100)]
-
-
-def test_messages_are_visible_by_ticks_whatever_the_phases(config: MakeConfig) -> None:
-    found = written(Rack(config(text=cyclic())))
+    # Messages are visible by ticks, whatever the phases.
     for name, below in (("left", "wave"), ("right", "left")):
         made, seen = found.messages[f"{below}.status"], found.messages[f"{name}.status"]
         every = MINOR[below][0]
