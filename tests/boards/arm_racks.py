@@ -68,7 +68,6 @@ params = {{ {", ".join(f"{key} = {json.dumps(value)}" for key, value in params.i
 
 
 def without(board: str) -> dict[str, Mapping[str, Any]]:
-    """Return `APART` without a board."""
     return {name: params for name, params in APART.items() if name != board}
 
 

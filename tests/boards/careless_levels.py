@@ -38,7 +38,6 @@ class Careless(Executor):
         self._arm = SimulatedArm(cell, context.scene, context.clock_ns, context.every, context.seed)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Drive, whatever comes of it."""
         arm = self._arm
         if self._params.thrown and tick == 50:
             arm._data.qvel[arm.cell.dof[1]] = 3.0

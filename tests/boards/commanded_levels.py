@@ -28,7 +28,6 @@ class Upper(Executor):
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.HOME,)}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take commands and pass them down."""
         orders = self.orders
         orders.take(read.operator, self._judge)
         write.command.hold = orders.standing is Operation.HOLD
@@ -43,7 +42,6 @@ class Upper(Executor):
             self.orders.refuse("the way home is closed")
 
     def self_test(self) -> None:
-        """Begin without orders."""
         self.orders = Orders(self.commands)
 
 
@@ -77,7 +75,6 @@ class Lower(Executor):
         return ("twice",)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Take commands and count."""
         self.orders.take(read.operator, self._set)
         held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
         write.status.count += 0 if held else self.step * self.given.by
@@ -100,7 +97,6 @@ class Lower(Executor):
                 self.orders.refuse(why)
 
     def self_test(self) -> None:
-        """Begin without orders."""
         self.given = read_params(CountParams, self.context.params)
         self.orders = Orders(self.commands)
 

@@ -10,6 +10,7 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
+from tests.backplane.conftest import make_bus  # noqa: F401  a fixture
 from tests.processes import named, wait_until
 
 CLOCK = f"""
@@ -53,14 +54,6 @@ UNJUDGED = "supervision.max_missed_fraction=1"
 and in lockstep a board that is killed from outside loses many of a short run."""
 
 MakeConfig = Callable[..., RackConfig]
-
-
-@pytest.fixture
-def wave_file(tmp_path: Path) -> Path:
-    """The rack of waves with a planner, as a file."""
-    path = tmp_path / "waves.toml"
-    path.write_text(PLANNED)
-    return path
 
 
 @pytest.fixture

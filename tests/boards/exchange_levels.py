@@ -24,7 +24,6 @@ class Notes(Executor):
     outputs = {"status": NOTES}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Note every reading."""
         write.status.state = State.EXECUTING
         for at, port in enumerate(PORTS):
             reading = getattr(read, port)

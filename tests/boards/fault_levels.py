@@ -23,7 +23,6 @@ class Driven(Executor):
     faults = (SensorStep, MotorStep, CommandStep, TendonStep)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Report its position."""
         write.status.position = 0.5
 
 

@@ -28,7 +28,6 @@ class LoseEvery(MessageStep):
     """Loses every n-th message."""
 
     def send(self, message: Outgoing) -> None:
-        """Lose every n-th message."""
         if message.released // self.writer.spec.every % round(self.entry.parameters[0]) == 0:
             self.acts(message)
             self.writer.lose()
@@ -62,7 +61,6 @@ class Gauge(Executor):
     }
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Report the valve's state."""
         write.status.state = State.EXECUTING
         write.status.valve = Valve.OPEN if tick >= OPENS_AT else Valve.SHUT
 

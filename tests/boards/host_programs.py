@@ -66,7 +66,6 @@ class Counting(Host):
     """Sends 1, 2, ... `count`, and waits until all are added."""
 
     def run(self, bus: Bus) -> None:
-        """Send, wait, end."""
         count = self.context.params.get("count", 5)
         for value in range(1, count + 1):
             while not bus.send("numbers", value=value, colour=Colour.RED):
@@ -75,22 +74,10 @@ class Counting(Host):
             bus.wait(1.0)
 
 
-class Flooding(Host):
-    """Sends for ever more than the ring holds, and never reads."""
-
-    def run(self, bus: Bus) -> None:
-        """Send as often as it is let."""
-        while not bus.is_over:
-            for _ in range(200):
-                bus.send("numbers", value=1.0)
-            bus.wait(0.001)
-
-
 class Deaf(Host):
     """Blocks for ever in one call, and keeps out SystemExit."""
 
     def run(self, bus: Bus) -> None:
-        """Ignore all that could end it."""
         bus.send("numbers", value=1.0)
         if os.fork() == 0:
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -118,38 +105,10 @@ class Escaping(Host):
         super().run(bus)
 
 
-class Printing(Host):
-    """Prints without end, `length` bytes a line; the first that prints `once` prints them without a
-    newline, once."""
-
-    def run(self, bus: Bus) -> None:
-        """Print."""
-        text = "x" * self.context.params["length"]
-        if self.context.params.get("once"):
-            os.write(1, text.encode())
-            bus.send("numbers", value=1.0)
-            super().run(bus)
-        while not bus.is_over:
-            os.write(1, f"{text}\n".encode())
-
-
-class Improper(Host):
-    """Sends what no number may hold, then a proper one."""
-
-    def run(self, bus: Bus) -> None:
-        """Send NaN, an unknown colour, then 7."""
-        bus.send("numbers", value=float("nan"))
-        bus.send("numbers", value=1.0, colour=9)
-        bus.send("numbers", value=7.0)
-        while bus.read("sum").value.sum < 7.0:
-            bus.wait(1.0)
-
-
 class Silent(Host):
     """Blocks for ever, without a word."""
 
     def run(self, bus: Bus) -> None:
-        """Wait for what never comes."""
         time.sleep(3600)
 
 
@@ -157,7 +116,6 @@ class Waiting(Host):
     """Sends one number, and waits."""
 
     def run(self, bus: Bus) -> None:
-        """Send, and wait until the run ends."""
         bus.send("numbers", value=1.0)
         super().run(bus)
 
@@ -191,7 +149,6 @@ class HastyAdapter(BusAdapter):
     """A bus adapter that waits for a program for a second at most."""
 
     def attach(self, segment: Segment, entries: Entries | None) -> None:
-        """Shorten the bound."""
         bus_adapter.LONGEST_S = 1.0
         super().attach(segment, entries)
 
@@ -207,7 +164,6 @@ class Failing(Host):
     """Fails at once."""
 
     def run(self, bus: Bus) -> None:
-        """Raise an exception of two lines."""
         raise ValueError("no\nnumbers")
 
 

@@ -25,7 +25,6 @@ class Hub(Executor):
     outputs = {"status": HEARD, "command": ORDER}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Note every reading."""
         write.status.state = State.EXECUTING
         for at, reading in enumerate(read.status.values()):
             write.status.cycle[at] = reading.value.cycle if reading.is_there else -1

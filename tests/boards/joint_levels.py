@@ -62,14 +62,6 @@ class Swing(Executor):
         command.inertia = np.diagonal(inertia)
 
 
-class Waiting(Swing):
-    """Holds for ever."""
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Hold."""
-        write.status.state, write.status.reason = State.HOLDING, "it does not feel like it"
-
-
 class StallingParams(ArmParams):
     """The last `stall` of every `period` cycles are missed."""
 

@@ -13,7 +13,6 @@ class Lean(Modification):
     hook = Hook.AFTER
 
     def modify(self, sample: LawSample) -> None:
-        """Add it."""
         sample.torque += 4.0
 
 
@@ -23,11 +22,9 @@ class Breaks(Modification):
     hook = Hook.BEFORE
 
     def begin(self, sample: LawSample) -> None:
-        """Count anew."""
         self.left = 100
 
     def modify(self, sample: LawSample) -> None:
-        """Change nothing, or fail."""
         self.left -= 1
         if not self.left:
             sample.position[:] = np.nan

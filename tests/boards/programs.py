@@ -31,12 +31,10 @@ class Program:
         self.pid = self._process.pid
 
     def wait_for_launch(self) -> None:
-        """Wait until the rack runs."""
         assert self._process.stdout is not None
         assert self._process.stdout.readline() == "launched\n"
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal to the launcher alone."""
         self._process.send_signal(number)
 
     def ended(self) -> int:
@@ -58,11 +56,9 @@ class Program:
         return found
 
     def wait_for_descendants(self) -> None:
-        """Wait until none of them runs."""
         wait_until(lambda: not self.descendants)
 
     def close(self) -> None:
-        """Kill whatever still runs."""
         for pid in [self.pid, *self.descendants]:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)

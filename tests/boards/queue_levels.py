@@ -70,11 +70,9 @@ class Answering(Executor):
         self._has_begun = False
 
     def room(self, port: str) -> int:
-        """Take as many as the config says."""
         return int(self.context.params.get("most", 1 << 30))
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Check the ids of the requests taken."""
         if not self._has_begun:
             self._has_begun = True
             if read.own.is_there:
@@ -89,7 +87,6 @@ class Steady(Executor):
     outputs = {"status": TAKEN}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Count the steps of the plans."""
         if read.plan.is_new:
             write.status.taken += 1 + len(read.plan.earlier)
             write.status.newest = read.plan.value.id
@@ -101,7 +98,6 @@ class Stepping(Planner):
     output = Output(REQUEST, queued=True)
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Always."""
         return True
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
@@ -119,11 +115,9 @@ class Filing(Planner):
     output = TAKEN
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Want a plan for every request."""
         return bool(read.requests.is_new)
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Count the requests."""
         count(read.requests, write)
 
 
@@ -134,5 +128,4 @@ class Filed(Executor):
     outputs = {"status": TAKEN}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Copy the plan."""
         write.status.copy_from(read.plan.value)

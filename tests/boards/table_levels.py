@@ -37,12 +37,10 @@ class Counter(StateTableExecutor):
     count = 0
 
     def recall(self, read: Ports, write: Ports) -> None:
-        """Count on from the last status."""
         super().recall(read, write)
         self.count = read.last_status.value.count
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
-        """Return where the counter is."""
         return {"count": "low" if self.count <= 0 else "high" if self.count >= 10 else "between"}
 
     def do_count(self, way: str) -> None:
@@ -54,5 +52,4 @@ class Counter(StateTableExecutor):
         self.count = 0 if self.words[1] == "low" else 10
 
     def give(self, write: Ports, tick: int) -> None:
-        """Show the count."""
         write.status.count = self.count

@@ -12,9 +12,9 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
 from tests.boards.arm_racks import APART, TOGETHER, arm_rack, named, without
 from tests.boards.conftest import MakeConfig
+from tests.boards.runs import faulty, kill
 
 KILLED_AT = 301
 DEATH_BOUND = 4
@@ -36,17 +36,11 @@ WRONG: dict[str, tuple[Mapping[str, Mapping[str, Any]], str, str]] = {
         "board.arm.above",
         "the gripper must be commanded by one board; it is commanded by none",
     ),
-    "a gripper that two boards drive": (
-        APART | {"servo_j2": {"joints": ["j2"], "gripper": True}},
-        "board.arm.above",
-        "the gripper must be commanded by one board; it is commanded by 'servo_j2', 'servo_j6'",
-    ),
     "a joint that the arm lacks": (
         named(["j1", "j7"]),
         "board.servo_j1.params.joints",
         "the arm has no such joint; joints: j1, j2, j3, j4, j5, j6",
     ),
-    "a joint named twice": (named(["j1", "j1"]), "board.servo_j1.params.joints", "named twice"),
     "a board that drives nothing": (
         TOGETHER | {"idle": {"joints": []}},
         "board.idle.params.joints",
@@ -67,8 +61,7 @@ def test_joints_without_one_board_are_refused_in_one_line(config: MakeConfig, ca
 def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats(
     config: MakeConfig,
 ) -> None:
-    killed = FaultConfig(kind="kill", board="servo_j3", tick=KILLED_AT)
-    given = config(text=arm_rack(APART)).model_copy(update={"fault": (killed,)})
+    given = faulty(config(text=arm_rack(APART)), kill("servo_j3", KILLED_AT))
     digests = []
     for _ in range(2):
         with Rack(given) as rack:
@@ -91,8 +84,7 @@ def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats
 def test_brakes_that_engaged_while_the_arms_board_was_away_have_the_tick_at_which_they_did(
     config: MakeConfig,
 ) -> None:
-    killed = FaultConfig(kind="kill", board="arm", tick=KILLED_AT)
-    given = config(text=arm_rack(TOGETHER)).model_copy(update={"fault": (killed,)})
+    given = faulty(config(text=arm_rack(TOGETHER)), kill("arm", KILLED_AT))
     with Rack(given) as rack:
         outcome = rack.run(0.6)
         events = rack.events

@@ -3,19 +3,14 @@ sight has failed."""
 
 from __future__ import annotations
 
-import json
 import time
-from pathlib import Path
 
 import pytest
 
-from rack.backplane.lines import UtilityLines
 from rack.boards import Rack
-from rack.boards.events import NO_TORQUE, Braking, Event, braked_text, brakings
-from rack.boards.faults.config import FaultConfig
+from rack.boards.events import NO_TORQUE, Event
 from tests.boards.arm_racks import TOGETHER, arm_rack
 from tests.boards.conftest import MakeConfig
-from tests.tools.command_line import rack as rack_command
 
 pytestmark = pytest.mark.thorough
 
@@ -34,35 +29,13 @@ def change(tick: int, code: str, why: str, value: int = 0) -> Event:
     return Event(time.time_ns(), tick, "reaction", "arm", "", code, subject=why, value=value)
 
 
-def test_brakings_are_those_reported_as_over_and_the_one_that_lasts_to_the_end() -> None:
-    events = [
-        change(2, "brakes_opened", "", 2),  # of the start
-        change(50, "brakes_closed", NO_TORQUE, 7),
-        change(50, "brakes_opened", NO_TORQUE, 3),
-        change(80, "brakes_closed", "sensors"),
-        change(90, "brakes_opened", "sensors", 10),
-        change(150, "brakes_closed", NO_TORQUE, 4),
-    ]
-    found = brakings(events, 200, 2.0)
-    assert found == (
-        Braking(NO_TORQUE, 47, 6.0),
-        Braking("sensors", 80, 20.0),
-        Braking(NO_TORQUE, 150, 100.0),
-    )
-    told = (
-        "brakes engaged 3 times, 126 ms in all, longest 100 ms at tick 150: no torque (2),"
-        " sensors (1)"
-    )
-    assert braked_text(found) == told
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("stall", "count"), [(4, 0), (5, 4), (8, 4)])
+@pytest.mark.parametrize(("stall", "count"), [(4, 0), (5, 2)])
 def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
     config: MakeConfig, stall: int, count: int
 ) -> None:
     with Rack(config(text=stalling(stall=stall))) as rack:
-        outcome = rack.run(1.9)
+        outcome = rack.run(1.1)
     assert (outcome.faults, outcome.worked) == ((), True)
     assert [braking.why for braking in outcome.brakings] == [NO_TORQUE] * count
     for number, braking in enumerate(outcome.brakings, 1):
@@ -71,14 +44,6 @@ def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
         assert braking.since == 400 * number - stall - 1 + 5
         # The boards above must see that the arm was braked before it is released.
         assert stall - 4 < braking.lasted_ms < stall - 4 + 6
-
-
-@pytest.mark.slow
-def test_patience_is_a_setting(config: MakeConfig) -> None:
-    with Rack(config("robot.patience_ms=8", text=stalling(stall=6))) as rack:
-        assert rack.run(0.9).brakings == ()
-    with Rack(config("robot.patience_ms=2.9", text=stalling(stall=2))) as rack:
-        assert [braking.since for braking in rack.run(0.9).brakings] == [399, 799]
 
 
 HELD = "held without a cause in sight"
@@ -92,66 +57,3 @@ def test_a_run_held_by_brakes_has_failed_and_says_so(config: MakeConfig) -> None
     (fault,) = outcome.faults
     assert fault.startswith(f"{HELD}, in 650 ms: brakes engaged 1 time, ")
     assert fault.endswith(" ms at tick 204: no torque (1)")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sight", ["a fault", "an emergency stop"])
-def test_a_run_held_by_brakes_with_a_cause_in_sight_has_not_failed(
-    config: MakeConfig, sight: str
-) -> None:
-    killed = FaultConfig(kind="kill", board="swing", tick=101)
-    faulty = config(text=stalling(stall=400, period=600)).model_copy(update={"fault": (killed,)})
-    given = faulty if sight == "a fault" else config(text=arm_rack(TOGETHER))
-    with Rack(given) as rack:
-        if sight == "an emergency stop":
-            rack.start(0.4)
-            UtilityLines(rack.segment).latch_emergency_stop()
-            while rack.watch(0.5):
-                continue
-            outcome = rack.outcome
-            assert outcome is not None
-        else:
-            outcome = rack.run(0.65)
-    assert (outcome.cause, outcome.faults, outcome.worked) == ("time over", (), True)
-
-
-@pytest.mark.slow
-def test_brakes_that_were_never_released_have_held_the_run(config: MakeConfig) -> None:
-    with Rack(config(text=stalling(stall=30, period=32))) as rack:
-        outcome = rack.run(0.4)
-        events = [event.code for event in rack.events if "brakes" in event.code]
-    assert (events, outcome.worked) == ([], False)
-    why = "stale torque from board 'servo': based on a status more than 7 ticks old"
-    times = "brakes engaged 1 time, 400 ms in all, longest 400 ms at tick 0"
-    assert outcome.faults == (f"{HELD}, in 400 ms: {times}: {why} (1)",)
-
-
-@pytest.mark.slow
-def test_a_level_that_holds_to_the_end_for_more_than_5_s_has_held_the_run(
-    config: MakeConfig,
-) -> None:
-    waiting = arm_rack(TOGETHER).replace("joint_levels:Swing", "joint_levels:Waiting")
-    outcomes = []
-    for seconds in (4.9, 5.1):
-        with Rack(config(text=waiting)) as rack:
-            outcomes.append(rack.run(seconds))
-    assert [outcome.worked for outcome in outcomes] == [True, False]
-    assert outcomes[1].faults == (
-        f"level 'swing' held for 5100 ms {HELD[5:]}: it does not feel like it",
-    )
-
-
-@pytest.mark.slow
-def test_the_command_ends_with_1_and_the_report_counts(tmp_path: Path, rack_name: str) -> None:
-    path = tmp_path / "arm.toml"
-    path.write_text(stalling(stall=400, period=600))
-    words = (path, "--set", f"name={rack_name}", "--seconds", 0.65)
-    bare = rack_command("run", *words, "--no-record")
-    assert bare.returncode == 1
-    assert HELD in bare.stderr
-    assert "brakes engaged 1 time, " in bare.stdout
-    recorded = rack_command("run", *words, "--out", tmp_path / "run")
-    assert recorded.returncode == 1
-    assert "\n- brakes engaged 1 time, " in (tmp_path / "run" / "report.md").read_text()
-    (braking,) = json.loads((tmp_path / "run" / "report.json").read_text())["outcome"]["brakings"]
-    assert (braking["why"], braking["lasted_ms"] > 390.0) == (NO_TORQUE, True)

@@ -132,4 +132,7 @@ def test_the_command_and_its_report_say_that_torques_were_refused(
     report = json.loads((out / "report.json").read_text())
     assert report["motion"]["clipped_cycles"] == 5
     assert "brakes engaged 5 times" in done.stdout.partition("##")[0]
-    assert "commands refused or cut in 5 cycles" in (out / "report.md").read_text()
+    page = (out / "report.md").read_text()
+    assert "commands refused or cut in 5 cycles" in page
+    assert "\n- brakes engaged 5 times, " in page
+    assert len(report["outcome"]["brakings"]) == 5

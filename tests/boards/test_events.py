@@ -15,18 +15,18 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.config.layout import field_specs
 from rack.boards.events import (
     HELD_MS,
+    NO_TORQUE,
     Braking,
     Ending,
     Event,
     Journal,
-    Outcome,
     braked_text,
     brakings,
     statuses,
 )
 from rack.levels.tables import GoalConfig
 from tests.backplane.bus import CLOCK_NS, task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 
 SILENT = 40
 STATUS = status("level_status", 1, Field("moves", "u2", "1", "of its program"))
@@ -54,7 +54,7 @@ def box(name: str, kind: MessageType, writer: str) -> MailboxSpec:
 
 
 @pytest.fixture
-def bus(make_bus: MakeBus) -> Segment:  # noqa: F811
+def bus(make_bus: MakeBus) -> Segment:
     return make_bus(
         task("upper"),
         task("lower"),
@@ -68,7 +68,6 @@ def bus(make_bus: MakeBus) -> Segment:  # noqa: F811
 
 
 def write(segment: Segment, name: str, tick: int = 0, **fields: Any) -> None:
-    """Write a message at a tick."""
     writer = open_writer(segment, name)
     for field, value in fields.items():
         setattr(writer.message, field, value)
@@ -77,7 +76,6 @@ def write(segment: Segment, name: str, tick: int = 0, **fields: Any) -> None:
 
 
 def ending(segment: Segment, ends_run: str | None = "upper.status") -> Ending:
-    """Return what judges the end."""
     return Ending(segment, ends_run, SILENT)
 
 
@@ -97,30 +95,6 @@ def test_the_last_status_of_the_level_that_ends_a_run_is_its_cause(
     write(bus, "upper.status", 5, state=state, moves=moves, reason="so it is")
     assert ending(bus).cause() == cause
     assert ending(bus).final_state() == (state.name.lower(), "so it is")
-
-
-def test_an_error_of_a_level_that_counts_no_moves_is_a_failure(bus: Segment) -> None:
-    write(bus, "lower.status", 5, state=State.ERROR)
-    assert ending(bus, "lower.status").cause() == "task failed"
-
-
-def test_an_error_or_a_hold_of_a_level_without_a_reason_counts_as_any_other(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    kind = MessageType(
-        "terse", 1, (Field("state", "u1", State, ""), Field("error", "u2", "1", "code"))
-    )
-    bus = make_bus(task("upper"), box("upper.status", kind, "upper"))
-    write(bus, "upper.status", state=State.HOLDING, error=3)
-    bus.block("upper")[Block.LEVEL_STATE] = State.HOLDING
-    assert ending(bus, None).latched() == ["level 'upper': error 3"]
-    (held,) = ending(bus, None).held((), (), 2 * HELD_MS)
-    assert held.endswith("without a cause in sight: no reason given")
-
-
-def test_a_run_that_no_level_ends_is_over_in_time(bus: Segment) -> None:
-    assert ending(bus, None).cause() == "time over"
-    assert ending(bus, None).final_state() == ("", "")
 
 
 @pytest.mark.parametrize(("written", "at", "is_silent"), [(5, 45, False), (5, 46, True)])
@@ -223,45 +197,6 @@ def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
     assert str(end) == "object 'block' ended 4 mm from its goal (tolerance 5 mm)"
 
 
-def test_times_of_brakes_are_those_of_their_events() -> None:
-    def event(tick: int, code: str, why: str, value: float = 0.0) -> Event:
-        return Event(0, tick, "reaction", "servo", "", code, subject=why, value=value)
-
-    start = event(10, "brakes_opened", "", 10)
-    events = [
-        start,
-        event(40, "brakes_closed", "sensors"),
-        event(50, "brakes_opened", "sensors", 10),
-        event(90, "brakes_closed", "no torque"),
-    ]
-    assert brakings(events, 100, TICK_MS) == (
-        Braking("sensors", 40, 25.0),
-        Braking("no torque", 90, 25.0),
-    )
-    assert brakings([start], 100, TICK_MS) == ()
-    assert brakings([], 100, TICK_MS) == ()
-    assert braked_text(brakings(events, 120, TICK_MS)) == (
-        "brakes engaged 2 times, 100 ms in all, longest 75 ms at tick 90: sensors (1),"
-        " no torque (1)"
-    )
-
-
-@pytest.mark.parametrize(
-    ("cause", "faults", "worked"),
-    [
-        ("task done", (), True),
-        ("time over", (), True),
-        ("task done", ("late",), False),
-        ("stopped", (), False),
-        ("task failed", (), False),
-    ],
-)
-def test_a_run_has_worked_without_faults_and_uncut(
-    cause: Any, faults: tuple[str, ...], worked: bool
-) -> None:
-    assert Outcome(cause, 1, "", "", "", faults).worked is worked
-
-
 def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
     heard: list[Event] = []
     journal = Journal(heard.append)
@@ -279,3 +214,29 @@ def test_a_journal_stamps_what_happens_and_passes_it_on(bus: Segment) -> None:
     # At the machine's start, by CLOCK_MONOTONIC.
     assert heard[2].time_ns < heard[0].time_ns <= heard[1].time_ns <= heard[3].time_ns
     Journal(None).add("launch", "rack", "nobody listens")
+
+
+def test_brakings_are_those_reported_as_over_and_the_one_that_lasts_to_the_end() -> None:
+    def change(tick: int, code: str, why: str, value: int = 0) -> Event:
+        return Event(0, tick, "reaction", "arm", "", code, subject=why, value=value)
+
+    events = [
+        change(2, "brakes_opened", "", 2),  # of the start
+        change(50, "brakes_closed", NO_TORQUE, 7),
+        change(50, "brakes_opened", NO_TORQUE, 3),
+        change(80, "brakes_closed", "sensors"),
+        change(90, "brakes_opened", "sensors", 10),
+        change(150, "brakes_closed", NO_TORQUE, 4),
+    ]
+    found = brakings(events, 200, 2.0)
+    assert found == (
+        Braking(NO_TORQUE, 47, 6.0),
+        Braking("sensors", 80, 20.0),
+        Braking(NO_TORQUE, 150, 100.0),
+    )
+    told = (
+        "brakes engaged 3 times, 126 ms in all, longest 100 ms at tick 150: no torque (2),"
+        " sensors (1)"
+    )
+    assert braked_text(found) == told
+    assert brakings(events[:1], 200, 2.0) == brakings([], 200, 2.0) == ()

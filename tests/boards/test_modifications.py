@@ -78,9 +78,6 @@ SWITCHED = commands(
 )
 
 
-TUNED = commands("level='shoulder', what='set', name='bandwidth=90', tick=300")
-
-
 class Ran(NamedTuple):
     """A run: its digest, its events, and the statuses of the board of the shoulder by tick."""
 
@@ -162,18 +159,6 @@ def test_a_run_with_switches_repeats_and_equals_that_without_modifications_up_to
 
 
 @pytest.mark.slow
-def test_gains_of_some_joints_are_set_live_from_the_cycle_after_their_tick(
-    run: Callable[..., Ran], without: Ran
-) -> None:
-    tuned = run(TUNED, "board.shoulder.params.modifications={}")
-    differs = [
-        tick for tick in range(100, 400) if (without.torque(tick) != tuned.torque(tick)).any()
-    ]
-    assert differs[0] == 301
-    assert "set bandwidth=90, before 60.0 (command 1)" in [event.text for event in tuned.events]
-
-
-@pytest.mark.slow
 def test_one_that_fails_is_taken_out_with_its_reason_in_status_and_events_and_the_arm_goes_on(
     switched: Ran,
 ) -> None:
@@ -204,16 +189,6 @@ MISTAKES = {
         "board.shoulder.params.modifications.notch",
         "params.frequency = 600 Hz: permitted: below half the law's rate, 500 Hz",
     ),
-    "no class given": (
-        "modifications.notch={on=true}",
-        "board.shoulder.params.modifications.notch.class",
-        "missing",
-    ),
-    "no name": (
-        "modifications.No={class='law_modifications:Lean'}",
-        "board.shoulder.params.modifications",
-        "should match pattern",
-    ),
 }
 
 
@@ -227,20 +202,3 @@ def test_a_mistake_in_a_modification_is_one_line(
     assert len(caught.value.mistakes) == 1
     assert str(caught.value).startswith(place)
     assert why in str(caught.value)
-
-
-def test_a_name_given_twice_is_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "twice.toml"
-    table = '[board.shoulder.params.modifications.it]\nclass = "law_modifications:Lean"\n'
-    path.write_text(f"{TEXT}\n{table}{table}")
-    with pytest.raises(ConfigError) as caught:
-        load(path)
-    assert len(str(caught.value).splitlines()) == 1
-
-
-@pytest.mark.slow
-def test_a_command_names_a_modification_of_its_board(rack_of: Callable[..., RackConfig]) -> None:
-    with pytest.raises(ConfigError, match="modify of 'shoulder' knows: pd, lean, breaks"):
-        wire(rack_of(commands(switch("leans", True, 1))))
-    with pytest.raises(ConfigError, match="modify of 'wrist' knows: none"):
-        wire(rack_of(commands("level='wrist', what='modify', name='lean', on=true")))

@@ -20,15 +20,16 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.words import Run, System
 from rack.boards import Rack
-from rack.boards.config import load, wire
+from rack.boards.config import wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
-from rack.boards.faults.config import FaultConfig
 from rack.boards.operator import message_of
 from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
+from tests.boards.runs import faulty
+from tests.boards.runs import kill as kill_at
 from tests.processes import FORKS, forked, kill, wait_until
 
 HELD = commands("level='upper', what='hold', tick=101", "level='upper', what='resume', tick=203")
@@ -90,12 +91,6 @@ def test_a_command_is_issued_at_its_tick_and_passed_down_level_by_level(
     ]
 
 
-@pytest.mark.slow
-def test_a_run_with_its_commands_repeats_bit_for_bit(commanded: Callable[..., RackConfig]) -> None:
-    digests = [run(commanded(setting))[0].digest for setting in (HELD, HELD, "seed=0")]
-    assert digests[0] == digests[1] != digests[2]
-
-
 SET = commands(
     "level='lower', what='set', name='by=3', tick=101",
     "level='lower', what='set', name='by=2', tick=200",
@@ -123,11 +118,7 @@ def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_value
 def test_a_restarted_board_has_its_live_params_as_they_were_set(
     commanded: Callable[..., RackConfig],
 ) -> None:
-    config = commanded(SET)
-    config = config.model_copy(
-        update={"fault": (FaultConfig(kind="kill", board="lower", tick=250),)}
-    )
-    outcome, events, boxes = run(config, 2.0)
+    outcome, events, boxes = run(faulty(commanded(SET), kill_at("lower", 250)), 2.0)
     assert outcome.worked
     assert [event.board for event in events if event.code == "rejoined"] == ["lower"]
     assert np.diff(boxes["lower.status"]["message"]["count"])[-50:].tolist() == [2] * 50
@@ -155,35 +146,6 @@ def test_a_setting_that_cannot_be_is_one_line(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("protocol", ["double-buffer", "lock"])
-def test_commands_reach_their_level_under_any_protocol(
-    commanded: Callable[..., RackConfig], protocol: str
-) -> None:
-    config = commanded(HELD, f"protocol.default={protocol}")
-    # The clock must never wait.
-    assert wire(config).mailbox("upper.operator").protocol == "double-buffer"
-    _, _, boxes = run(config)
-    assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
-
-
-@pytest.mark.slow
-def test_serials_rise_over_all_levels_in_order_of_issue(
-    commanded: Callable[..., RackConfig],
-) -> None:
-    setting = commands(
-        "level='lower', what='hold', at=0.5",
-        "level='upper', what='hold', tick=50",
-        "level='lower', what='resume', at=0.5",
-    )
-    _, _, boxes = run(commanded(setting))
-    assert boxes["upper.operator"]["message"]["id"].tolist() == [1]
-    assert boxes["lower.operator"]["message"]["id"].tolist() == [2, 3]
-    assert boxes["lower.operator"]["tick"].tolist() == [200, 200]
-    # Of two for one level in one tick the newest counts.
-    assert set(boxes["lower.status"]["message"]["order"].tolist()) == {0, 3}
-
-
-@pytest.mark.slow
 def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., RackConfig]) -> None:
     _, _, boxes = run(commanded(commands("level='upper', what='goto', home=true, tick=50")))
     last = boxes["upper.status"]["message"][-1]
@@ -194,28 +156,13 @@ def test_a_refusal_is_answered_and_goes_no_further(commanded: Callable[..., Rack
 
 @pytest.mark.slow
 @pytest.mark.parametrize("board", ["upper", "lower"])
-def test_a_restarted_board_continues_with_its_last_command(
-    commanded: Callable[..., RackConfig], board: str
-) -> None:
-    config = commanded(commands(f"level='{board}', what='hold', tick=50"))
-    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
-    outcome, events, boxes = run(config, 2.0)
-    assert outcome.worked
-    assert [event.board for event in events if event.code == "rejoined"] == [board]
-    last = boxes[f"{board}.status"]["message"][-1]
-    assert (last["order"], last["standing"]) == (1, Operation.HOLD)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("board", ["upper", "lower"])
 def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     commanded: Callable[..., RackConfig], board: str
 ) -> None:
     # The lower level never takes a goto: its config would refuse it, an intruder in the table may
     # say it all the same.
     config = commanded(commands(f"level='{board}', what='hold', tick=50"))
-    config = config.model_copy(update={"fault": (FaultConfig(kind="kill", board=board, tick=100),)})
-    with Rack(config) as rack:
+    with Rack(faulty(config, kill_at(board, 100))) as rack:
         hold = OperatorTable(rack.segment).entries[0]
         message = message_of(hold, rack.segment.layout)
         message.what, message.goal = Operation.GOTO, Goal.HOME
@@ -229,65 +176,6 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
         Operation.HOLD,
         1,
     )
-
-
-@pytest.mark.slow
-def test_a_command_stays_in_force_when_the_next_one_is_refused(
-    commanded: Callable[..., RackConfig],
-) -> None:
-    # Both come within one cycle of the level.
-    setting = commands(
-        "level='upper', what='hold', tick=50", "level='upper', what='goto', home=true, tick=52"
-    )
-    _, _, boxes = run(commanded(setting))
-    told = boxes["upper.status"]["message"][["order", "answer"]].tolist()
-    # Each gets its answer; the hold's comes when the level below has followed.
-    assert list(dict.fromkeys(told)) == [
-        (0, Answer.NONE),
-        (1, Answer.TAKEN),
-        (2, Answer.REFUSED),
-        (1, Answer.DONE),
-    ]
-    assert boxes["upper.status"]["message"][-1]["standing"] == Operation.HOLD
-
-
-@pytest.mark.slow
-def test_a_setting_is_made_at_its_tick_and_leaves_the_command_in_force_as_it_is(
-    commanded: Callable[..., RackConfig],
-) -> None:
-    setting = commands(
-        "level='lower', what='modify', name='twice', on=true, tick=50",
-        "level='lower', what='hold', tick=60",
-        "level='lower', what='modify', name='twice', on=false, tick=70",
-        "level='lower', what='resume', tick=80",
-    )
-    _, events, boxes = run(commanded(setting))
-    rows = boxes["lower.status"]
-    counts = np.diff(rows["message"]["count"])
-    assert [counts[rows["tick"][1:] == tick].item() for tick in (50, 51, 60, 61, 80, 81)] == [
-        1,
-        2,
-        2,
-        0,
-        0,
-        1,
-    ]
-    at = rows["message"][rows["tick"] == 71]
-    assert (at["standing"], at["answer"], at["operator"]) == (Operation.HOLD, Answer.DONE, 3)
-    texts = [event.text for event in events if event.kind == "command" and event.code == "modify"]
-    assert texts == ["modify twice on (command 1)", "modify twice off (command 3)"]
-
-
-@pytest.mark.slow
-def test_a_restarted_clock_continues_the_serials(commanded: Callable[..., RackConfig]) -> None:
-    config = commanded(HELD)
-    config = config.model_copy(
-        update={"fault": (FaultConfig(kind="kill", board="clock", tick=150),)}
-    )
-    _, events, boxes = run(config)
-    assert [event.board for event in events if event.code == "rejoined"] == ["clock"]
-    assert boxes["upper.operator"]["message"]["id"].tolist() == [1, 2]
-    assert [first(boxes["upper.status"], serial) for serial in (1, 2)] == [104, 208]
 
 
 @pytest.mark.slow
@@ -331,15 +219,6 @@ def test_a_command_is_issued_only_while_its_client_lives(
         )
 
 
-@pytest.mark.slow
-def test_commands_of_a_program_must_fit_the_rack(commanded: Callable[..., RackConfig]) -> None:
-    with Rack(commanded()) as rack:
-        with pytest.raises(ConfigError, match="what = \"halt\": should be 'hold', 'resume'"):
-            rack.command("lower", "halt")
-        with pytest.raises(ConfigError, match="'lower' does not take goto; it takes: hold, resume"):
-            rack.command("lower", "goto", home=True)
-
-
 def await_giving(rack: Rack, entry: RequestEntry) -> None:
     watch(rack, lambda: entry.stage == RequestStage.GIVEN)
 
@@ -350,88 +229,6 @@ def answered(reading: Reading, serial: int) -> bool:
 
 def watch(rack: Rack, condition: Callable[[], bool]) -> None:
     wait_until(lambda: condition() or not rack.watch(0.001) or condition())
-
-
-MISTAKES = {
-    "no such level": (
-        "level='uper', what='hold'",
-        (
-            'command[0].level = "uper": no level of this name takes commands; levels that do:'
-            " upper, lower"
-        ),
-    ),
-    "not for this level": (
-        "level='lower', what='goto', home=true",
-        (
-            "command[0].what = \"goto\": 'lower' does not take goto; it takes: hold, resume, modify"
-            " on|off"
-        ),
-    ),
-    "no goal": (
-        "level='upper', what='goto'",
-        "command[0].goal: missing; goto of 'upper' takes one of: home",
-    ),
-    "another goal": (
-        "level='upper', what='goto', joints=[1.0]",
-        "command[0].joints: not a goal for goto of 'upper'; permitted: home",
-    ),
-    "two goals": (
-        "level='upper', what='goto', joints=[1.0], home=true",
-        "command[0].goal: several given: joints|home; goto of 'upper' takes one of: home",
-    ),
-    "a goal too much": (
-        "level='upper', what='hold', home=true",
-        "command[0].home: hold takes no goal; remove it",
-    ),
-    "a setting of nothing": (
-        "level='lower', what='modify', on=true",
-        "command[0].name: modify of 'lower' knows: twice",
-    ),
-    "a setting of something unknown": (
-        "level='lower', what='modify', name='thrice', on=true",
-        "command[0].name = \"thrice\": modify of 'lower' knows: twice",
-    ),
-    "a setting to nothing": (
-        "level='lower', what='modify', name='twice'",
-        "command[0].goal: missing; modify of 'lower' takes one of: on|off",
-    ),
-    "a name too much": (
-        "level='lower', what='hold', name='twice'",
-        'command[0].name = "twice": hold takes no name; remove it',
-    ),
-    "two times": (
-        "level='upper', what='hold', tick=3, at=1",
-        "command[0].at = 1.0: tick is also given",
-    ),
-    "unknown key": (
-        "level='upper', what='hold', tik=3",
-        "command[0].tik = 3: unknown key; did you mean 'tick'?",
-    ),
-}
-
-
-@pytest.mark.parametrize(("table", "expected"), MISTAKES.values(), ids=MISTAKES)
-def test_mistakes_of_a_command_name_place_value_and_what_is_permitted(
-    config: MakeConfig, table: str, expected: str
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        wire(config(commands(table), text=COMMANDED))
-    assert any(str(mistake).startswith(expected) for mistake in caught.value.mistakes), str(
-        caught.value
-    )
-
-
-def test_joints_beyond_their_range_are_a_mistake_with_joint_and_range() -> None:
-    robot = load("nasrem").robot
-    assert robot is not None
-    beyond = [*robot.home[:2], 9.0, *robot.home[3:]]
-    with pytest.raises(ConfigError) as caught:
-        wire(load("nasrem", [commands(f"level='servo', what='setpoint', joints={beyond}")]))
-    assert str(caught.value).startswith(
-        "command[0].joints = 9.0: out of range for joint 'j3'; permitted: "
-    )
-    with pytest.raises(ConfigError, match="2 values; permitted: 6, one per joint: j1, j2, "):
-        wire(load("nasrem", [commands("level='servo', what='setpoint', joints=[0.0, 0.0]")]))
 
 
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:

@@ -16,9 +16,8 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
-from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.conftest import CLOCK, MakeConfig
+from tests.boards.runs import faulty, kill, stop
 
 QUEUES = f"""{CLOCK}
 [board.upper]
@@ -67,27 +66,9 @@ def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str
 
 
 @pytest.mark.slow
-def test_a_slower_reader_gets_every_request_of_a_burst(config: MakeConfig) -> None:
-    with Rack(config("board.upper.params.until=360", text=QUEUES)) as rack:
-        rack.run(2.0)
-        assert counts(rack, "upper")["sent"] == 27
-        assert counts(rack, "lower") | {
-            "taken": 27,
-            "newest": 27,
-            "repeated": 0,
-            "missing": 0,
-        } == counts(rack, "lower")
-
-
-@pytest.mark.slow
 def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> None:
-    faults = tuple(
-        FaultConfig(kind="kill", board=board, tick=tick)
-        for board, tick in (("upper", 97), ("lower", 501))
-    )
-    found = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES).model_copy(
-        update={"fault": faults}
-    )
+    plain = config("protocol.depth={ 'upper.requests' = 7 }", text=QUEUES)
+    found = faulty(plain, kill("upper", 97), kill("lower", 501))
     digests = set()
     for _ in range(2):
         with Rack(found) as rack:
@@ -96,22 +77,6 @@ def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> 
             assert counts(rack, "lower")["repeated"] == 0
             assert [e.text for e in rack.events if e.code == "queue_full"]
     assert len(digests) == 1
-
-
-@pytest.mark.slow
-def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
-    depth = "protocol.depth={ 'upper.requests' = 7 }"
-    runs = []
-    for mode in ("lockstep", "realtime"):
-        with Rack(
-            config(f"clock.mode={mode}", "board.lower.params.most=4", depth, text=QUEUES)
-        ) as rack:
-            rack.run(1.0)
-            runs.append(Written.on(rack.segment))
-    exact, real = runs
-    same = real.first_miss(400)
-    assert same > 0
-    assert real.until(same) == exact.until(same)
 
 
 def kill_often(rack: Rack, board: str, times: int, rng: random.Random) -> None:
@@ -172,21 +137,8 @@ def settle(rack: Rack, board: str) -> dict[str, int]:
     while block[Block.LOST]:
         assert rack.watch(0.01)
     assert rack.watch(0.3)
-    rack.stop("the test has seen enough")
-    while rack.watch(0.1):
-        continue
+    stop(rack)
     return counts(rack, board)
-
-
-@pytest.mark.slow
-def test_a_plan_may_be_a_queue(config: MakeConfig) -> None:
-    digests = set()
-    for _ in range(2):
-        with Rack(config("protocol.depth={ 'wave.plan' = 8 }", text=PLANNING)) as rack:
-            digests.add(rack.run(1.0).digest)
-            found = counts(rack, "wave")
-            assert found["taken"] == found["newest"] > 50
-    assert len(digests) == 1
 
 
 @pytest.mark.slow
@@ -205,30 +157,6 @@ def test_a_planner_takes_every_request_between_its_plans(config: MakeConfig) -> 
                 0,
             )
     assert len(digests) == 1
-
-
-@pytest.mark.slow
-def test_a_mailbox_is_a_queue_if_the_config_says_so(config: MakeConfig) -> None:
-    with Rack(config("protocol.mailbox={ 'wave.status' = 'queue' }", text=PLAIN)) as rack:
-        rack.run(0.5)
-        taken = open_observer(rack.segment, "wave.status_taken").peek().value
-        box, position = (
-            rack.segment.layout.mailbox(name) for name in ("wave.status", "wave.status_taken")
-        )
-    assert (box.protocol, box.capacity) == ("queue", 32)
-    assert (position.writer, position.readers, position.every) == ("watch", ("wave",), 8)
-    # At tick 192 the messages of all earlier ticks were visible.
-    assert (taken.taken, taken.unread) == (192, 0)
-
-
-def test_a_queue_keeps_what_a_recorder_may_be_behind(config: MakeConfig) -> None:
-    box = wire(config("protocol.depth={ 'upper.requests' = 5 }", text=QUEUES)).mailbox(
-        "upper.requests"
-    )
-    # 40 ticks and 100 are the least time in which 5 messages can be sent and taken; 800 ticks are 2
-    # s.
-    assert box.depth >= 5 * (800 // 140 + 1)
-    assert box.capacity == 5
 
 
 @pytest.mark.parametrize(

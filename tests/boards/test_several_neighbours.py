@@ -13,11 +13,11 @@ from rack.boards.config import rack_timing, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.recovery import Supervision
 from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.command_path import command_paths
 from rack.levels.timing.system_response import mailboxes_along
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import faulty, kill
 from tests.boards.vector_racks import JOINTED
 
 SECONDS, TICKS = 0.5, 200
@@ -31,9 +31,7 @@ def jointed(config: MakeConfig) -> MakeConfig:
 
 def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, Written]:
     """Run the rack; return its digest and everything that it wrote."""
-    with Rack(
-        config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
-    ) as rack:
+    with Rack(faulty(config, *faults)) as rack:
         digest = rack.run(SECONDS).digest
         return digest, Written.on(rack.segment)
 
@@ -42,20 +40,6 @@ def at(rows: np.ndarray, tick: int) -> np.void:
     """Return the message of the cycle released at a tick."""
     (row,) = rows[rows["tick"] == tick]
     return row
-
-
-@pytest.mark.slow
-def test_each_joint_takes_its_part_and_the_level_below_has_the_whole_vector(
-    jointed: MakeConfig,
-) -> None:
-    digest, written = run(jointed())
-    assert run(jointed())[0] == digest
-    arm, path = written.messages["arm.status"], written.messages["path.status"]
-    # Commanded at 80, taken by the joints at 88, added up at 89, seen by them at 90.
-    assert at(arm, 88)["message"]["position"].tolist() == [72.0, 144.0, 216.0]
-    assert at(arm, 89)["message"]["position"].tolist() == [80.0, 160.0, 240.0]
-    assert at(path, 96)["message"]["position"].tolist() == [80.0, 160.0, 240.0]
-    assert not path["message"]["lost"].any()
 
 
 @pytest.mark.slow
@@ -73,10 +57,9 @@ def test_a_message_that_rests_on_many_rests_on_the_oldest_of_them(jointed: MakeC
 
 @pytest.mark.slow
 def test_a_reader_of_many_sees_which_of_them_is_lost(jointed: MakeConfig) -> None:
-    kill = {"kind": "kill", "board": "joint2", "tick": 60}
-    settings = ("supervision.lockstep_restart_s=0.2",)
-    digest, written = run(jointed(*settings), kill)
-    assert run(jointed(*settings), kill)[0] == digest
+    killed = jointed("supervision.lockstep_restart_s=0.2"), kill("joint2", 60)
+    digest, written = run(*killed)
+    assert run(*killed)[0] == digest
     for mailbox, ticks in (("arm.status", (70, 160)), ("path.status", (80, 160))):
         rows = written.messages[mailbox]
         while_lost, after = (at(rows, tick)["message"]["lost"].tolist() for tick in ticks)
@@ -112,18 +95,6 @@ def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
     ]
 
 
-def test_neighbours_are_the_same_whichever_of_them_names_the_other(jointed: MakeConfig) -> None:
-    both = jointed()
-    # The board of the arm is still above nobody, by what the joints say of it.
-    once = jointed(
-        "board.arm.reads.parts=['joint1.part', 'joint2.part', 'joint3.part']", "board.arm.above=[]"
-    )
-    found = [rack_timing(config, wire(config)) for config in (both, once)]
-    assert found[0].parallel == found[1].parallel
-    assert [chains.text for chains in found[0].parallel] == ["path > joint1 ... joint3 > arm"]
-    assert Supervision(once, wire(once)).must_wait("joint1", ["arm"])
-
-
 def test_information_is_followed_by_what_each_message_rests_on(jointed: MakeConfig) -> None:
     config = jointed()
     layout = wire(config)
@@ -141,8 +112,6 @@ def test_information_is_followed_by_what_each_message_rests_on(jointed: MakeConf
 
 CIRCLES = {
     "through many": ("board.arm.below=path", "board.arm.below", "path -> joint1 -> arm -> path"),
-    "by one of them": ("board.joint2.below=path", "board.joint2.below", "path -> joint2 -> path"),
-    "from above": ("board.path.above=arm", "board.path.above", "path -> joint1 -> arm -> path"),
     "two tables disagree": ("board.arm.below=joint3", "board.arm.below", "joint3 -> arm -> joint3"),
 }
 

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rack.backplane.message import State
 from rack.boards import Rack
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
-from rack.levels.operator import Answer
 from tests.boards.commanded_racks import commands
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
@@ -35,19 +33,7 @@ def counted(config: RackConfig, seconds: float = 0.25) -> tuple[np.ndarray, str]
 
 @pytest.fixture
 def counter(config: MakeConfig, tmp_path: Path) -> MakeConfig:
-    """Configs of the rack that counts."""
     return lambda *settings: config(*settings, text=counting(tmp_path))
-
-
-@pytest.mark.slow
-def test_the_status_shows_the_row_that_fired(counter: MakeConfig) -> None:
-    statuses, _ = counted(counter())
-    assert statuses["count"][:14].tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 9, 8, 7, 6]
-    assert statuses["row"][8:13].tolist() == [3, 3, 4, 5, 5]
-    assert [name.decode() for name in statuses["fired"][9:12]] == ["count up", "turn", "count down"]
-    assert [name.decode() for name in statuses["in_state"][9:12]] == ["up", "down", "down"]
-    assert set(statuses["table"].tolist()) == {b"saw"}
-    assert set(statuses["state"].tolist()) == {State.EXECUTING}
 
 
 @pytest.mark.slow
@@ -59,17 +45,6 @@ def test_tables_are_swapped_at_a_tick_and_every_run_alike(counter: MakeConfig) -
     # It stays where it was, and goes on from there.
     assert set(one["count"][10:15].tolist()) == {10}
     assert digest == other != counted(counter())[1]
-
-
-@pytest.mark.slow
-def test_a_swap_survives_a_restart_of_the_board(counter: MakeConfig) -> None:
-    statuses, _ = counted(
-        counter(commands(SWAP), 'fault=[{ kind = "kill", board = "counter", at = 0.15 }]'), 0.9
-    )
-    assert statuses["table"][-1] == b"slow"
-    assert [name.decode() for name in statuses["fired"][9:12]] == ["count up", "settle", "rest"]
-    assert set(statuses["fired"][11:].tolist()) == {b"rest"}
-    assert set(statuses["count"][10:].tolist()) == {10}
 
 
 @pytest.mark.slow
@@ -86,31 +61,6 @@ def test_a_restarted_board_reads_its_file_anew_and_goes_on_in_its_state(
     assert "up it goes" in names[10:]
     assert len(set(statuses["checksum"].tolist())) == 2
     assert np.abs(np.diff(statuses["count"])).max() == 1
-
-
-@pytest.mark.slow
-def test_an_operator_does_a_command_of_the_level_until_resume(counter: MakeConfig) -> None:
-    statuses, _ = counted(counter(commands(RESET, RESUME)))
-    assert statuses["fired"][5] == b"reset"
-    assert statuses["words"][5] == b"reset high"
-    assert statuses["count"][4:8].tolist() == [5, 10, 9, 8]
-    assert statuses["state"][5] == State.DONE
-    assert statuses["standing"][4:9].tolist() == [0, 6 + 1, 6 + 1, 6 + 1, 0]
-
-
-@pytest.mark.slow
-def test_an_operators_command_that_fails_is_refused_with_the_tables_reason(
-    counter: MakeConfig, tmp_path: Path
-) -> None:
-    given = counter(commands(RESET))
-    text = SAW.replace(
-        'do = ["take", "set"]\nstatus = "done"',
-        'do = ["take"]\nstatus = "error"\nreason = "no way"',
-    )
-    (tmp_path / "saw.toml").write_text(text)
-    statuses, _ = counted(given)
-    assert statuses["answer"][5:].tolist() == [Answer.REFUSED] * (len(statuses) - 5)
-    assert statuses["objection"][5] == b"no way"
 
 
 def test_a_table_with_a_hole_is_refused_with_its_state_and_case(

@@ -42,7 +42,6 @@ class PathLevel(Executor):
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
 
     def self_test(self) -> None:
-        """Begin without orders."""
         self.orders = Orders(self.commands)
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:

@@ -15,7 +15,6 @@ from typing import Any
 from rack.backplane.message import Field, Message, MessageType, State, status
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
-from rack.levels.messages import TASK_STATUS
 
 WAVE = status("wave", 1, Field("value", "f8", "1", "height of the wave"))
 GAIN = MessageType(
@@ -33,14 +32,12 @@ class Trouble:
         self._took_ns = params.get("ticks", 0) * context.clock_ns
 
     def self_test(self) -> None:
-        """Fail the self-test."""
         if self._kind == "refuse":
             raise LevelError("the wave is too high: 3 m; permitted: 2 m")
         if self._kind == "leave early":
             os._exit(0)
 
     def at(self, tick: int) -> None:
-        """Make the trouble due at a tick."""
         if self._kind == "print" and tick == self._at:
             print("a wave", tick)  # noqa: T201  output of boards is tested
         elif self._kind == "raise" and tick == self._at:
@@ -69,11 +66,9 @@ class Wave(Executor):
         self._final = State[context.params.get("final", "DONE")]
 
     def self_test(self) -> None:
-        """Fail if requested."""
         self.trouble.self_test()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Write the wave's height."""
         self.trouble.at(tick)
         write.status.state = self._final if tick >= self._done_at else State.EXECUTING
         write.status.reason = (
@@ -82,7 +77,6 @@ class Wave(Executor):
         write.status.value = 0.5 * tick * self.gain(read)
 
     def gain(self, read: Ports) -> float:
-        """Return the factor on the wave."""
         return 1.0
 
 
@@ -100,7 +94,6 @@ class Steady(PlannedWave):
     """A planned wave that leaves trouble to its planner."""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Write the wave's height."""
         write.status.state = State.EXECUTING
         write.status.value = 0.5 * tick * self.gain(read)
 
@@ -117,11 +110,9 @@ class GainPlanner(Planner):
         self._every = context.params.get("plan_every", 1)
 
     def wanted(self, read: Ports, tick: int) -> bool:
-        """Want a plan every `plan_every` ticks."""
         return tick % self._every == 0
 
     def plan(self, read: Ports, write: Message, tick: int) -> None:
-        """Plan a gain that follows the wave."""
         self.trouble.at(tick)
         write.gain = 1.0 + 1.0 / (1.0 + abs(read.status.value.value))
         write.made_at = tick
@@ -131,7 +122,6 @@ class BadPlanner(GainPlanner):
     """A planner that fails its self-test."""
 
     def self_test(self) -> None:
-        """Fail."""
         raise LevelError("no gain is known: 0 of 3")
 
 
@@ -142,28 +132,15 @@ class Watch(Executor):
     outputs = {"status": WAVE}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Copy the wave's status."""
         write.status.state = read.status.value.state
         write.status.reason = read.status.value.reason
         write.status.value = read.status.value.value
-
-
-class Program(Executor):
-    """Fails at tick 8, with `moves` moves."""
-
-    outputs = {"status": TASK_STATUS}
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Report progress, then the error."""
-        write.status.state = State.ERROR if tick >= 8 else State.EXECUTING
-        write.status.moves = self.context.params["moves"]
 
 
 class Endless(Watch):
     """A level whose self-test does not end."""
 
     def self_test(self) -> None:
-        """Wait forever."""
         while True:
             time.sleep(1)
 
@@ -176,11 +153,9 @@ class Preloaded(Watch):
 
     @classmethod
     def preload(cls) -> None:
-        """Note the process."""
         cls.preloaded_in.append(os.getpid())
 
     def self_test(self) -> None:
-        """Report the processes."""
         raise LevelError(f"preloaded in {self.preloaded_in}, forked by [{os.getppid()}]")
 
 
@@ -189,7 +164,6 @@ class Unpreloadable(Watch):
 
     @classmethod
     def preload(cls) -> None:
-        """Fail."""
         raise OSError("no room for\ncompiled code")
 
 
@@ -199,5 +173,4 @@ class SlowlyPreloaded(Watch):
 
     @classmethod
     def preload(cls) -> None:
-        """Wait for the other process."""
         os.close(os.open(os.environ["WAVE_MAY_LOAD"], os.O_RDONLY))

@@ -61,11 +61,6 @@ def expected(parts: Sequence[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("part", STAGES)
-def test_one_mistake_of_any_stage_is_one_line(small: Path, write: Write, part: str) -> None:
-    assert mistakes(small, write, [part], (), None) == [part]
-
-
-@pytest.mark.parametrize("part", STAGES)
 def test_two_mistakes_of_any_stages_are_two_lines(small: Path, write: Write, part: str) -> None:
     for pair in combinations(STAGES, 2):
         if part == pair[0]:

@@ -10,7 +10,6 @@ from rack.backplane.message import Message
 from rack.boards.config import RackConfig, load, wire
 from rack.boards.config.commands import DOWN, asked, request, takes
 from rack.boards.config.published import publish
-from rack.boards.errors import ConfigError
 from rack.levels.operator import Goal, Operation
 
 HOME = [0.1 * k for k in range(6)]
@@ -65,24 +64,6 @@ def test_a_quaternion_becomes_a_unit_one(nasrem: RackConfig) -> None:
     )
     assert message.goal == Goal.POSE
     assert message.quaternion.tolist() == pytest.approx([0.0, 0.6, 0.0, 0.8])
-
-
-def test_a_hold_is_nothing_but_a_hold(nasrem: RackConfig) -> None:
-    message, _ = message_of(nasrem, level="task", what="hold")
-    assert (message.what, message.goal, message.count, message.name) == (
-        Operation.HOLD,
-        Goal.NONE,
-        0,
-        "",
-    )
-
-
-def test_every_mistake_of_a_command_is_said(nasrem: RackConfig) -> None:
-    with pytest.raises(ConfigError, match="unknown key"):
-        asked({"level": "task", "what": "hold", "speed": 2})
-    levels = publish(nasrem).levels
-    with pytest.raises(ConfigError, match="primitive"):
-        request(asked({"level": "nobody", "what": "hold"}), nasrem, levels, wire(nasrem))
 
 
 def test_what_a_level_takes_has_the_names_that_it_knows(nasrem: RackConfig) -> None:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import rack.boards.config
-from rack.boards.config import CONFIGS, load, loads, names, resolve
+from rack.boards.config import CONFIGS, load, loads, names
 from rack.boards.config.files import assembled, named_classes
 from rack.boards.config.resolved import classes
 from rack.boards.errors import ConfigError
@@ -69,23 +68,6 @@ def test_an_unknown_name_gets_the_nearest_known_one() -> None:
     with pytest.raises(ConfigError) as error:
         load("nasrm")
     assert lines(error) == ["config = \"nasrm\": no such file; did you mean 'nasrem'?"]
-
-
-def test_text_that_is_not_toml_is_reported_with_its_line(write: Write) -> None:
-    with pytest.raises(ConfigError, match=r"broken.toml: not TOML: .*line 2"):
-        load(write("broken.toml", 'name = "x"\nclock = = 3\n'))
-
-
-def test_a_file_overrides_what_it_extends_key_by_key(small: Path, write: Write) -> None:
-    path = write(
-        "mine.toml", 'name = "mine"\nextends = ["small.toml"]\n[board.upper]\nrate_hz = 100\n'
-    )
-    config = load(path)
-    assert (config.name, config.board["upper"].rate_hz, config.board["upper"].slot) == (
-        "mine",
-        100,
-        2,
-    )
 
 
 def test_a_file_says_its_own_format_whatever_it_extends(small: Path, write: Write) -> None:
@@ -148,9 +130,7 @@ def test_an_incomplete_arm_is_reported_to_inherit_nothing(write: Write) -> None:
 
 DEEP = {
     "lists": "[task]\nx = " + "[" * 5000 + "]" * 5000,
-    "tables": "[task]\nx = " + "{ a = " * 3000 + "1" + " }" * 3000,
     "dotted keys": "[task]\n" + ".".join(["a"] * 3000) + " = 1",
-    "a heading": "[" + ".".join(["a"] * 3000) + "]\nx = 1",
     "just too deep": "[task]\nx = " + "[" * 31 + "]" * 31,
 }
 
@@ -167,7 +147,6 @@ def test_endless_nesting_is_refused_in_one_line(write: Write, text: str) -> None
 
 VALUES = {
     "6000 digits": ("9" * 6000, "integer too long; permitted: 64 bits"),
-    "4000 digits": ("9" * 4000, "task.x = 9999.*: integer too long; permitted: 64 bits"),
     "date": ("1990-03-01", 'task.x = "1990-03-01": dates and times are not permitted'),
     "NUL": ('"a\\u0000b"', r'task.x = "a\?b": text must not contain NUL'),
 }
@@ -202,14 +181,6 @@ def test_a_file_that_many_extend_is_read_once(small: Path, write: Write) -> None
     assert load(small.with_name("a0.toml")).name == "small"
 
 
-def test_a_file_too_large_to_be_a_config_is_not_read(write: Write) -> None:
-    with pytest.raises(
-        ConfigError,
-        match=r"large.toml: cannot be read: too large, 1000002 bytes; permitted: 1000000$",
-    ):
-        load(write("large.toml", "#" * 1_000_002))
-
-
 def test_a_fifo_or_a_device_in_place_of_a_file_is_refused_at_once(
     small: Path, write: Write, tmp_path: Path
 ) -> None:
@@ -227,9 +198,7 @@ def test_a_fifo_or_a_device_in_place_of_a_file_is_refused_at_once(
             assert lines(error) == [why]
 
 
-@pytest.mark.parametrize(
-    "name", ["~nosuchuser/x.toml", "a" * 5000, "a/" * 3000, "x" * 300 + ".toml", "a\0b.toml"]
-)
+@pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a/" * 3000, "a\0b.toml"])
 def test_an_impossible_file_name_is_reported_as_missing(
     small: Path, write: Write, name: str
 ) -> None:
@@ -251,42 +220,20 @@ def test_a_config_that_extends_itself_is_refused(write: Write) -> None:
         load(write("b.toml", 'extends = ["a.toml"]'))
 
 
-def test_every_missing_base_is_reported(write: Write) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(write("mine.toml", 'extends = ["no.toml", "nor.toml"]'))
-    assert [mistake.value for mistake in error.value.mistakes] == ["no.toml", "nor.toml"]
-
-
 @pytest.mark.parametrize(
     ("setting", "found"),
     [
         ("clock.mode=realtime", lambda c: c.clock.mode == "realtime"),
-        ("board.upper.every = 4", None),
-        (
-            'protocol.mailbox."lower.status"=lock',
-            lambda c: c.protocol.mailbox == {"lower.status": "lock"},
-        ),
         (
             " protocol . mailbox . 'lower.status' = lock",
             lambda c: c.protocol.mailbox == {"lower.status": "lock"},
         ),
         ('task."a = b"=1', lambda c: c.task == {"a = b": 1}),
-        ("seed=7", lambda c: c.seed == 7),
-        (
-            'protocol.mailbox={"lower.status" = "lock"}',
-            lambda c: c.protocol.mailbox == {"lower.status": "lock"},
-        ),
         ("board.lower.params.gains=[1, 2]", lambda c: c.board["lower"].params == {"gains": [1, 2]}),
     ],
 )
-def test_overrides_set_single_values(
-    small: Path, setting: str, found: Callable[..., bool] | None
-) -> None:
-    if found is not None:
-        assert found(load(small, [setting]))
-        return
-    with pytest.raises(ConfigError, match="every is also given"):
-        resolve(load(small, [setting]))
+def test_overrides_set_single_values(small: Path, setting: str, found: Callable[..., bool]) -> None:
+    assert found(load(small, [setting]))
 
 
 def test_an_override_reaches_into_a_list(small: Path) -> None:
@@ -318,16 +265,6 @@ def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
     boards = {"one": named, "two": {"executor": "mine:Arm"}, "odd": 3, "wrong": {"executor": 7}}
     assert named_classes({"board": boards}) == ("mine:Arm", "mine:Planner")
     assert named_classes({"board": [1]}) == named_classes({}) == ()
-
-
-def test_every_export_exists_once() -> None:
-    exported = rack.boards.config.__all__
-    assert len(exported) == len(set(exported))
-    assert all(hasattr(rack.boards.config, name) for name in exported)
-    with pytest.raises(
-        AttributeError, match=r"module 'rack\.boards\.config' has no attribute 'nothing'"
-    ):
-        rack.boards.config.nothing  # noqa: B018
 
 
 def test_a_name_may_be_that_of_a_config_in_the_current_folder(

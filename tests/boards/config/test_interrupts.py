@@ -14,7 +14,6 @@ from rack.boards.config.timing import without_interrupts
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError
 from rack.levels.timing.verdicts import INBOX, verdicts
-from tests.boards.lan.racks import rack_text
 from tests.boards.run.test_interrupts import BOARDS, RACK
 
 INTERRUPT = "protocol.default=interrupt"
@@ -57,41 +56,9 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
     assert plan.slots == ()
 
 
-def test_a_plan_is_sent_at_the_end_of_its_slice(small: Path) -> None:
-    layout = layout_of(small, *LOOSE)
-    planner, plan = layout.task("lower.planner"), layout.mailbox("lower.plan")
-    span = planner.every * planner.within_cycles
-    assert sent(plan) == (span * layout.clock_ns, span, span + 1)
-    assert plan.interrupt is not None
-    assert plan.interrupt.slots == (layout.task("lower").slot,)
-
-
-def test_operators_mailboxes_stay_as_they_are_under_a_default() -> None:
-    layout = wire(load("nasrem", [INTERRUPT]))
-    assert layout.mailbox("primitive.command").protocol == "interrupt"
-    assert {box.protocol for box in layout.mailboxes if box.writer == "clock"} == {"time-slice"}
-
-
-def test_the_protocol_passes_where_determinism_is_demanded(small: Path) -> None:
-    assert layout_of(small, "protocol.strict=true").mailbox("upper.command").is_repeatable
-
-
 @pytest.mark.parametrize(
     ("setting", "why"),
     [
-        (
-            "protocol.interrupt.fixed_us=-1",
-            "protocol.interrupt.fixed_us = -1: should be greater than or equal to 0",
-        ),
-        (
-            "protocol.interrupt.word_us=inf",
-            "protocol.interrupt.word_us = inf: should be a finite number",
-        ),
-        (
-            "protocol.interrupt.depth=0",
-            "protocol.interrupt.depth = 0: should be greater than or equal to 1",
-        ),
-        ("protocol.interrupt.slots=3", "protocol.interrupt.slots = 3: unknown key"),
         (
             "board.hub.exchange.status.asynchronous=true",
             (
@@ -105,18 +72,6 @@ def test_what_does_not_fit_is_refused(setting: str, why: str) -> None:
     with pytest.raises(ConfigError) as error:
         resolve(validated(override(parse(RACK), [setting])))
     assert why in str(error.value)
-
-
-def test_the_network_adapter_reads_without_interrupts() -> None:
-    layout = wire(
-        validated(
-            override(parse(rack_text("here", "tcp/127.0.0.1:7001", (), "there")), [INTERRUPT])
-        )
-    )
-    pulse = layout.mailbox("pulse.status")
-    assert pulse.interrupt is not None
-    assert pulse.interrupt.slots == ()
-    assert layout.mailbox("lan.other").protocol == "time-slice"
 
 
 def test_interrupts_are_part_of_reading_and_of_a_plan(small: Path) -> None:

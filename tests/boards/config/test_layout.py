@@ -8,13 +8,10 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.layout import depth_for
-from rack.backplane.mailbox.slots import message_dtype
 from rack.boards.config import load, resolve, shared_out, wire
 from rack.boards.config import resolved as resolved
-from rack.boards.config.layout import field_specs, obtained_core
+from rack.boards.config.layout import obtained_core
 from rack.boards.config.rules import broken_rules
-from rack.levels.level import Pace
-from rack.levels.messages import TASK_COMMAND, TASK_PLAN
 
 SIZES = {"joints": 6, "bodies": 3, "state": 120}
 
@@ -45,52 +42,6 @@ def test_mailboxes_keep_two_seconds_and_at_least_their_readers_slice(small: Path
     assert layout.mailbox("upper.command").depth == depth_for(9008, 8)
 
 
-def test_protocols_are_set_for_the_rack_and_for_one_mailbox(small: Path) -> None:
-    settings = ["protocol.default=double-buffer", "protocol.mailbox={ 'lower.plan' = 'lock' }"]
-    layout = wire(load(small, settings))
-    assert layout.mailbox("lower.plan").protocol == "lock"
-    assert layout.mailbox("upper.command").protocol == "double-buffer"
-
-
-def test_a_tight_planner_shares_its_executors_board(small: Path) -> None:
-    layout = wire(load(small, ["board.lower.priority=50"]))
-    executor, planner = layout.task("lower"), layout.task("lower.planner")
-    assert (planner.slot, planner.core) == (executor.slot, executor.core)
-    assert (executor.priority, planner.priority) == (50, 0)
-    assert (executor.within_cycles, planner.within_cycles) == (1, 4)
-
-
-def test_a_loose_planner_has_a_board_of_its_own(small: Path) -> None:
-    settings = [
-        "board.lower.coupling=loose",
-        "board.lower.planner_slot=9",
-        "board.lower.planner_priority=20",
-    ]
-    planner = wire(load(small, settings)).task("lower.planner")
-    assert (planner.slot, planner.priority) == (9, 20)
-
-
-def test_a_port_can_be_wired_to_another_mailbox(small: Path) -> None:
-    tasks = {
-        task.task: task
-        for task in resolve(load(small, ["board.lower.reads={ command = 'upper.command' }"])).tasks
-    }
-    assert tasks["lower"].inputs == {"command": "upper.command", "plan": "lower.plan"}
-
-
-@pytest.mark.parametrize("kind", [TASK_COMMAND, TASK_PLAN], ids=lambda kind: kind.name)
-def test_field_specs_describe_the_exact_bytes_of_a_message(kind) -> None:
-    dtype = kind.dtype(SIZES)
-    described = message_dtype(field_specs(kind, SIZES), dtype.itemsize)
-    assert described.itemsize == dtype.itemsize
-    for name in dtype.names:
-        assert described.fields[name][1] == dtype.fields[name][1]
-        assert described[name].shape == dtype[name].shape
-    assert (
-        described["moves"].base.fields["position"][1] == dtype["moves"].base.fields["position"][1]
-    )
-
-
 def test_missing_cores_are_replaced_and_reported(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,22 +50,6 @@ def test_missing_cores_are_replaced_and_reported(
     assert shared_out(
         load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])
     ) == ["core 5 is not available (available: 2, 3): core 3 runs upper"]
-
-
-def test_a_levels_context_describes_its_rack_in_ticks(small: Path) -> None:
-    upper, lower, _ = (
-        task.context for task in resolve(load(small, ["board.lower.params.gain=2", "seed=5"])).tasks
-    )
-    assert (lower.board, lower.every, lower.within_cycles, lower.clock_ns, lower.seed) == (
-        "lower",
-        1,
-        4,
-        2_500_000,
-        5,
-    )
-    assert (lower.above, lower.below) == ({"upper": Pace(8, 1)}, {})
-    assert upper.below == {"lower": Pace(1, 4)}
-    assert lower.params == {"gain": 2}
 
 
 def test_a_launch_resolves_and_checks_everything_once(

@@ -13,7 +13,6 @@ from rack.boards.config import CONFIGS, FAULTS, load, names
 from rack.boards.config.files import assembled, with_faults
 from rack.boards.config.reference import Key, find_tables, key_tables
 from rack.boards.errors import ConfigError
-from rack.levels.servo.control import ServoParams
 
 DIMENSIONLESS = {
     *(
@@ -116,20 +115,6 @@ def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
     assert {key for script in scripts for fault in script for key in fault} <= set(known)
 
 
-def test_ranges_and_defaults_are_those_of_the_models() -> None:
-    known = reference("nasrem")
-    assert known["board.<name>"]["slot"] == Key(
-        "slot", "integer", "", "2 to 21", "required", known["board.<name>"]["slot"].meaning
-    )
-    bandwidth = known["board.servo.params"]["bandwidth"]
-    declared = ServoParams.model_fields["bandwidth"]
-    assert (bandwidth.unit, bandwidth.default) == ("rad/s", str(declared.default))
-    assert bandwidth.permitted == "above 0, at most 400"
-    assert known["board.<name>"]["coupling"].permitted == '"tight", "loose", "none"'
-    assert known["robot"]["joints"].type == "list of strings"
-    assert known["fault"]["by"].unit == "cycles"
-
-
 def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
     path = small.with_name("own.toml")
     path.write_text('extends = ["small.toml"]\n[board.upper]\nexecutor = "two_levels:Programmed"\n')
@@ -137,23 +122,6 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
     path.write_text('extends = ["small.toml"]\n[board.upper]\nexecutor = "two_levels:Nobody"\n')
     with pytest.raises(ConfigError, match="has no class 'Nobody'"):
         reference(path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "found"),
-    [
-        ("clock", ["clock"]),
-        ("[board.servo.budget]", ["board.budget"]),
-        ("board.servo", ["board"]),
-        ("board.servo.params", ["board.servo.params"]),
-        ("board.servo.params.modifications", ["board.servo.params.modifications"]),
-        ("board.<name>", ["board"]),
-        ("task", ["task.action.goto", "task.action.home", "task.action.transfer"]),
-    ],
-)
-def test_tables_are_found_by_the_names_that_a_config_uses(name: str, found: list[str]) -> None:
-    assert [table.name for table in find_tables(name, load("nasrem"))] == found
 
 
 def test_an_unknown_table_is_refused_with_the_known_tables() -> None:

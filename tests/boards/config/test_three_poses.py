@@ -41,10 +41,3 @@ def test_every_form_of_the_motion_has_the_same_poses() -> None:
     ik = InverseKinematics(build_cell(config.robot, config.scene, config.clock_ns), 0)
     for name, pose in zip(order, np.array(POSES), strict=True):
         assert np.abs(ik.tool_at(pose).position - places[name]).max() < 1e-4
-
-
-def test_all_racks_move_the_same_arm_from_the_same_start_within_the_same_limits() -> None:
-    first = load("nasrem-three-poses").robot
-    for name in RACKS:
-        other = load(f"{name}/three-poses").robot
-        assert all(getattr(other, limit) == getattr(first, limit) for limit in LIMITS)

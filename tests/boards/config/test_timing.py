@@ -6,14 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.layout import TickGrid
 from rack.boards.config import budgets, load, loads, rack_timing, wire
 from rack.boards.config.timing import with_budgets
 from rack.boards.errors import ConfigError
 from rack.levels.timing.tasks import Budget, Part, Unit
-from tests.boards.run.test_exchange import NOTES, SPARSE
-from tests.boards.run.test_exchange import TEXT as EXCHANGE
-from tests.boards.test_queues import QUEUES
 
 MEASURED = Budget(
     read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11
@@ -70,34 +66,3 @@ def test_tasks_are_on_the_cores_that_the_config_asks_for(small: Path) -> None:
     assert {name: task.core for name, task in tasks.items()} == {"lower": 7, "lower.planner": 11}
     assert tasks["lower.planner"].parts == (Part(Unit.PLAN, 2_000_000),)
     assert (tasks["lower"].period_ns, tasks["lower.planner"].period_ns) == (2_500_000, 10_000_000)
-
-
-def test_each_board_has_the_grids_of_its_own_reads_by_writer() -> None:
-    # Another board reads the same mailbox in fewer cycles, and this one another mailbox in every
-    # cycle.
-    other = f"""{EXCHANGE}
-[board.slow]
-slot = 4
-every = 5
-below = "wave"
-executor = "exchange_levels:Notes"
-exchange = {{ sparse = {{ every = 7 }} }}
-"""
-    config = loads(other)
-    boards = rack_timing(config, wire(config)).boards
-    (every, phase), (period, first) = NOTES, SPARSE
-    assert boards["notes"].reads == {"wave": TickGrid(every * period, phase + every * first)}
-    assert boards["slow"].reads == {"wave": TickGrid(35, 0)}
-    assert boards["wave"].reads == {}
-
-
-def test_only_the_reader_of_a_queue_waits_for_it() -> None:
-    config = loads(QUEUES)
-    layout = wire(config)
-    queues = {name: board.queues for name, board in rack_timing(config, layout).boards.items()}
-    boxes = [box for box in layout.mailboxes if box.capacity]
-    assert boxes
-    assert queues == {
-        name: tuple(box.name for box in boxes if name in box.readers) for name in queues
-    }
-    assert {queue for found in queues.values() for queue in found} == {box.name for box in boxes}

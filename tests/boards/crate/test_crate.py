@@ -15,11 +15,10 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.crate import line as crate_line
 from rack.boards.crate.line import CrateLine, WarmCrate, received
 from rack.boards.crate.requests import Preload, Preloading
 from rack.boards.errors import LaunchError
-from tests.processes import children_of, descriptors, runs, wait_until
+from tests.processes import children_of, runs, wait_until
 
 PATH = (*sys.path, str(Path(__file__).parents[1]))
 
@@ -42,34 +41,11 @@ def test_a_line_says_when_its_other_end_is_gone_even_in_half_a_message() -> None
     assert received(ours) is None
 
 
-@pytest.mark.slow
-def test_the_crate_ends_when_its_line_is_closed() -> None:
-    before = descriptors()
-    line = CrateLine()
-    line.close(20.0)
-    assert not runs(line.pid)
-    assert descriptors() == before
-
-
 def test_a_crate_that_does_not_end_is_killed() -> None:
     line = CrateLine()
     os.kill(line.pid, signal.SIGSTOP)
     line.close(0.05)
     assert not runs(line.pid)
-
-
-def test_output_comes_line_by_line_and_once(line: CrateLine) -> None:
-    line.send(Preload(("wave_printer:Printer",), PATH))
-    found: list[str] = []
-    wait_until(lambda: found.extend(line.printed()) or len(found) == 2)
-    assert found == ["first", "second"]
-    assert line.printed() == []
-
-
-def test_the_crate_survives_a_module_that_cannot_be_imported(line: CrateLine) -> None:
-    line.send(Preload(("no_such_module:Level", "wave_printer:Printer"), PATH))
-    wait_until(line.printed)
-    assert runs(line.pid)
 
 
 def test_what_a_crate_has_preloaded_it_does_not_preload_again(line: CrateLine) -> None:
@@ -142,29 +118,6 @@ def test_a_warm_crate_that_is_killed_is_seen_and_over(
         assert rack.outcome.faults == ("the crate ended, and all boards with it",)
     assert warm.is_over
     assert not [path for path in SHM_FOLDER.iterdir() if rack_name in path.name]
-
-
-@pytest.mark.slow
-def test_a_warm_crate_serves_on_after_a_rack_that_was_refused(
-    small: Path, rack_name: str, warm: WarmCrate
-) -> None:
-    faulty = load(small, [f"name={rack_name}", 'fault=[{kind="self-test", board="lower"}]'])
-    with pytest.raises(LaunchError, match="self-test failed"):
-        Rack(faulty, crate=warm).launch()
-    with Rack(load(small, [f"name={rack_name}"]), crate=warm) as rack:
-        assert rack.run(0.2).worked
-        # Of the rack before nothing is printed.
-        assert not [event for event in rack.events if event.kind == "printed"]
-
-
-def test_a_warm_crate_that_does_not_leave_a_rack_is_ended(
-    warm: WarmCrate, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(crate_line, "LEAVE_S", 0.05)
-    os.kill(warm.pid, signal.SIGSTOP)
-    warm.close(0.0)
-    assert warm.is_over
-    assert not runs(warm.pid)
 
 
 @pytest.mark.slow

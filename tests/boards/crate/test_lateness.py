@@ -3,8 +3,6 @@ cycle, whatever the reason."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from rack.backplane.words import Block
@@ -12,8 +10,8 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.lateness import _permit
 from rack.boards.events import Event, Outcome
-from rack.boards.faults.config import FaultConfig
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
+from tests.boards.runs import faulty, kill
 
 JUDGED = "supervision.max_missed_fraction=0.05"
 SOON = "supervision.lockstep_restart_s=0.05"
@@ -36,25 +34,15 @@ def run(config: RackConfig, seconds: float) -> tuple[Outcome, list[Event], dict[
         return outcome, rack.events, counted
 
 
-def struck(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
-    """Return the config with these faults."""
-    return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
-
-
 @pytest.mark.parametrize(
     ("due", "fraction", "plan", "permitted"),
     [
         (800, 0.05, 1, 40),
-        (790, 0.05, 1, 40),
         (10, 0.05, 1, 1),
-        (2, 0.05, 1, 1),
         (1, 0.05, 1, 0),
-        (0, 0.05, 1, 0),
         (100, 0.0, 1, 0),
         (10, 0.99, 1, 9),
-        (10, 1.0, 1, 10),
         (400, 0.05, 8, 24),
-        (10, 0.05, 4, 4),
         (4, 0.05, 4, 3),
     ],
 )
@@ -91,12 +79,12 @@ def test_every_release_of_an_executor_is_a_cycle_or_a_skipped_one(
 ) -> None:
     # The last board is not back before the end of the run.
     faults = [
-        {"kind": "kill", "board": "wave", "tick": 30},
-        {"kind": "kill", "board": "wave", "tick": 60},
+        kill("wave", 30),
+        kill("wave", 60),
         {"kind": "clock-skip", "board": "clock", "tick": 100, "ticks": 7},
-        {"kind": "kill", "board": "watch", "tick": 150},
+        kill("watch", 150),
     ]
-    _, _, counted = run(struck(config(JUDGED, SOON, *coupling), *faults), 0.4)
+    _, _, counted = run(faulty(config(JUDGED, SOON, *coupling), *faults), 0.4)
     for name in ("wave", "watch"):
         cycles, missed, skipped, due = counted[name]
         assert (cycles + skipped, missed) == (due, 0), name
@@ -108,16 +96,16 @@ def test_every_release_of_an_executor_is_a_cycle_or_a_skipped_one(
 def test_lost_cycles_are_excused_by_an_injected_fault_as_far_as_it_can_have_cost_them(
     config: MakeConfig,
 ) -> None:
-    kill = {"kind": "kill", "board": "wave", "tick": 80}
-    outcome, _, counted = run(struck(config(JUDGED, SOON, text=PLAIN), kill), 0.8)
+    struck = kill("wave", 80)
+    outcome, _, counted = run(faulty(config(JUDGED, SOON, text=PLAIN), struck), 0.8)
     assert (outcome.worked, counted["wave"]) == (True, (300, 0, 20, 320))
     # Its tick, one cycle, 20 ticks for the restart, and 100 for the recovery.
     named = "122 of which were due during faults and recoveries: kill of wave"
     assert outcome.excused == (f"level 'wave' missed 0 and skipped 20 of its 320 cycles, {named}",)
     # What else is lost is not excused.
-    kill["board"] = "watch"
+    struck["board"] = "watch"
     named = "129 of which were due during faults and recoveries: kill of watch"
-    outcome, _, _ = run(struck(config(JUDGED, SOON, *CRASHES, text=PLAIN), kill), 0.8)
+    outcome, _, _ = run(faulty(config(JUDGED, SOON, *CRASHES, text=PLAIN), struck), 0.8)
     assert outcome.faults == (
         f"level 'wave' missed 0 and skipped 320 of its 320 cycles, {named}"
         " (100 %; at most 5 % permitted)",
@@ -125,7 +113,7 @@ def test_lost_cycles_are_excused_by_an_injected_fault_as_far_as_it_can_have_cost
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fraction", "worked"), [(0.05, False), (0.15, True), (1.0, True)])
+@pytest.mark.parametrize(("fraction", "worked"), [(0.05, False), (0.15, True)])
 def test_a_board_that_dies_by_itself_is_not_excused(
     config: MakeConfig, fraction: float, worked: bool
 ) -> None:

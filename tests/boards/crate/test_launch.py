@@ -14,11 +14,10 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import racks
 from rack.backplane.words import Block, TaskState
 from rack.boards import Rack
-from rack.boards.crate.line import CrateLine
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event
-from tests.boards.conftest import PLAIN, MakeConfig
-from tests.processes import children_of, descriptors, open_files, runs, wait_until
+from tests.boards.conftest import PLAIN, PLANNED, MakeConfig
+from tests.processes import children_of, descriptors, open_files, wait_until
 from tests.warm import programs
 
 
@@ -28,36 +27,36 @@ def refusal(rack: Rack) -> str:
     return str(error.value)
 
 
-@pytest.mark.slow
-def test_a_failed_self_test_is_the_launch_error(config: MakeConfig) -> None:
-    rack = Rack(config("board.wave.params.trouble=refuse", text=PLAIN))
-    assert refusal(rack) == "board 'wave': the wave is too high: 3 m; permitted: 2 m"
-    assert UtilityLines(rack.segment).sysfail == [2] or UtilityLines(rack.segment).sysfail == [2, 3]
-    assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
+FAILS = {
+    "self-test": (
+        "board.wave.params.trouble=refuse",
+        r"board 'wave': the wave is too high: 3 m; permitted: 2 m",
+    ),
+    "self-test of a planner": (
+        "board.wave.planner=wave_levels:BadPlanner",
+        r"board 'wave\.planner': no gain is known: 0 of 3",
+    ),
+    "not made": ("board.wave.params.final=NONE", r"board 'wave' failed(?s:.*)KeyError: 'NONE'"),
+    "left": ("board.wave.params.trouble='leave early'", r"board 'wave' ended: exit status 0"),
+    "not preloaded": (
+        "board.watch.executor=wave_levels:Unpreloadable",
+        r"'wave_levels:Unpreloadable' cannot be preloaded: OSError: no room for compiled code",
+    ),
+}
 
 
 @pytest.mark.slow
-def test_a_planner_that_fails_its_self_test_holds_its_boards_sysfail(config: MakeConfig) -> None:
-    rack = Rack(config("board.wave.planner=wave_levels:BadPlanner"))
-    assert refusal(rack) == "board 'wave.planner': no gain is known: 0 of 3"
-    assert 2 in UtilityLines(rack.segment).sysfail
-
-
-@pytest.mark.slow
-def test_a_level_that_cannot_be_made_is_reported_with_its_error(config: MakeConfig) -> None:
-    rack = Rack(config("board.wave.params.final=NONE"))
-    reason = refusal(rack)
-    assert "board 'wave' failed" in reason
-    assert "KeyError: 'NONE'" in reason
-    assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
-
-
-@pytest.mark.slow
-def test_a_board_that_exits_silently_fails_the_launch(config: MakeConfig) -> None:
-    assert (
-        refusal(Rack(config("board.wave.params.trouble='leave early'")))
-        == "board 'wave' ended: exit status 0"
-    )
+@pytest.mark.parametrize("case", FAILS)
+def test_the_reason_of_a_board_is_the_launch_error_and_holds_its_sysfail(
+    config: MakeConfig, case: str
+) -> None:
+    setting, reason = FAILS[case]
+    rack = Rack(config(setting, text=PLANNED if "planner" in case else PLAIN))
+    assert re.fullmatch(reason, refusal(rack))
+    if case not in ("not preloaded", "left"):
+        assert 2 in UtilityLines(rack.segment).sysfail
+    if case in ("self-test", "not made"):
+        assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
 
 
 @pytest.mark.slow
@@ -88,15 +87,6 @@ def test_a_level_is_preloaded_once_in_the_process_that_forks_its_boards(config: 
     assert int(preloaded) != os.getpid()
 
 
-@pytest.mark.slow
-def test_a_level_that_cannot_be_preloaded_fails_the_launch_in_one_line(config: MakeConfig) -> None:
-    reason = refusal(Rack(config("board.watch.executor=wave_levels:Unpreloadable", text=PLAIN)))
-    assert (
-        reason
-        == "'wave_levels:Unpreloadable' cannot be preloaded: OSError: no room for compiled code"
-    )
-
-
 def fifo(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the FIFO that a `SlowlyPreloaded` level waits for."""
     path = folder / "may-load"
@@ -124,37 +114,10 @@ def test_a_launch_reports_what_it_waits_for(
 
 
 @pytest.mark.slow
-def test_a_preload_that_does_not_end_is_named(
-    config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.boards.crate.rack.LAUNCH_S", 2.0)
-    fifo(tmp_path, monkeypatch)
-    reason = refusal(Rack(config("board.watch.executor=wave_levels:SlowlyPreloaded", text=PLAIN)))
-    assert reason.startswith("preloading 'wave_levels:SlowlyPreloaded'")
-    assert reason.endswith("not done within 2 s")
-
-
-@pytest.mark.slow
-def test_a_crate_that_was_started_early_is_the_one_that_is_used_and_closed(
-    config: MakeConfig,
-) -> None:
-    with CrateLine() as crate:
-        with Rack(config(text=PLAIN), crate=crate) as rack:
-            boards = [
-                rack.segment.block(task.name)[Block.PID] for task in rack.segment.layout.tasks
-            ]
-            assert set(boards) <= set(children_of(crate.pid))
-        assert not runs(crate.pid)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("trouble", ["refuse", "leave early"])
-def test_failed_launches_leave_no_file_open_and_no_process_running(
-    config: MakeConfig, trouble: str
-) -> None:
+def test_failed_launches_leave_no_file_open_and_no_process_running(config: MakeConfig) -> None:
     children, before = children_of(os.getpid()), descriptors()
     for _ in range(2):
-        refusal(Rack(config(f"board.wave.params.trouble='{trouble}'")))
+        refusal(Rack(config("board.wave.params.trouble=refuse")))
     wait_until(lambda: children_of(os.getpid()) == children)
     assert descriptors() == before
 

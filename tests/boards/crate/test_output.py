@@ -71,11 +71,3 @@ def test_a_run_keeps_the_first_lines_and_says_each_time_that_the_dropped_ones_ha
     assert said == [*kept, dropped(1), "", "", "", "", dropped(6), "", ""]
     printed.pass_on(is_over=True)
     assert capfd.readouterr().out == dropped(8)
-
-
-def test_of_a_board_that_printed_as_much_as_is_kept_nothing_is_dropped(
-    printed: HostOutput, capfd: pytest.CaptureFixture[str]
-) -> None:
-    os.write(printed.writer, b"line\n" * MOST)
-    printed.pass_on(is_over=True)
-    assert capfd.readouterr().out == "line\n" * MOST

@@ -31,7 +31,6 @@ class Clock:
         self.now = 1000.0
 
     def monotonic(self) -> float:
-        """Return it."""
         return self.now
 
 
@@ -43,7 +42,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def said(journal: Journal) -> list[str]:
-    """Return what was reported."""
     assert {event.kind for event in journal.events} <= {"waiting"}
     return [event.text for event in journal.events]
 
@@ -59,18 +57,6 @@ def test_a_wait_is_reported_each_time_it_has_doubled(clock: Clock) -> None:
     assert wait.left_s == pytest.approx(16.0 - 8.1)
 
 
-def test_a_wait_is_over_beyond_its_limit_which_can_begin_again(clock: Clock) -> None:
-    wait = Patience(Journal(None), LIMIT_S)
-    clock.now += LIMIT_S
-    assert (wait.is_over, wait.left_s) == (False, 0.0)
-    clock.now += 0.5
-    assert wait.is_over
-    wait.renew(10.0)
-    assert (wait.is_over, wait.limit_s) == (False, 10.0)
-    clock.now += 10.5
-    assert wait.is_over
-
-
 class Line:
     """A crate that answers at its times; each wait for it moves the clock on."""
 
@@ -81,7 +67,6 @@ class Line:
         self.output: list[str] = []
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait for the next answer."""
         if self._answers and self._answers[0][0] <= self._clock.now - 1000.0 + timeout_s:
             self._clock.now = max(self._clock.now, 1000.0 + self._answers[0][0])
             return True
@@ -89,11 +74,9 @@ class Line:
         return False
 
     def receive(self) -> object:
-        """Return it."""
         return self._answers.popleft()[1]
 
     def printed(self) -> list[str]:
-        """Return what the crate has printed."""
         return self.output
 
 
@@ -108,10 +91,6 @@ def opened(clock: Clock, *answers: tuple[float, object], output: str = "") -> tu
     except LaunchError as error:
         why = str(error)
     return said(journal), why
-
-
-def test_a_crate_that_opens_soon_is_not_spoken_of(clock: Clock) -> None:
-    assert opened(clock, (0.5, Preloading("a:B")), (1.9, Opened())) == ([], "")
 
 
 def test_each_class_has_its_own_time_limit_and_compiling_a_longer_one(clock: Clock) -> None:

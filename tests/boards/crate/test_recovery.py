@@ -6,27 +6,21 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Sequence
-from typing import Any
 
 import pytest
 
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
-from rack.boards.faults.config import FaultConfig
-from tests.boards.conftest import LOOSE, NEVER, PLAIN, MakeConfig
+from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import end_of, faulty, kill
 
 TASKS = ("wave", "wave.planner", "watch")
 RESTART_TICKS = 200
 """Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
-
-
-def faulty(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
-    """Return the config with these faults."""
-    return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
 
 
 def run(config: RackConfig, seconds: float = 2.0) -> tuple[Outcome, list[Event]]:
@@ -41,8 +35,9 @@ def of(events: Sequence[Event], kind: str, code: str = "") -> list[Event]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", TASKS)
-@pytest.mark.parametrize("kind", ["kill", "hang"])
+@pytest.mark.parametrize(
+    ("victim", "kind"), [("wave", "kill"), ("wave.planner", "kill"), ("watch", "hang")]
+)
 def test_a_lost_board_is_back_on_the_grid_at_its_tick(
     config: MakeConfig, victim: str, kind: str
 ) -> None:
@@ -60,22 +55,18 @@ def test_a_lost_board_is_back_on_the_grid_at_its_tick(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("coupling", [(), LOOSE], ids=["tight", "loose"])
-def test_a_run_with_its_faults_repeats(config: MakeConfig, coupling: tuple[str, ...]) -> None:
-    faults = [
-        {"kind": "kill", "board": victim, "tick": 90 + 150 * k} for k, victim in enumerate(TASKS)
-    ]
+def test_a_run_with_its_faults_repeats(config: MakeConfig) -> None:
+    faults = [kill(victim, 90 + 150 * k) for k, victim in enumerate(TASKS)]
     faults += [
         {"kind": "hang", "board": "watch", "tick": 600},
         {"kind": "clock-skip", "board": "clock", "tick": 650},
     ]
-    outcomes = [run(faulty(config(*coupling), *faults), 3.0)[0] for _ in range(3)]
-    assert len({outcome.digest for outcome in outcomes}) == 1
-    assert run(config(*coupling), 3.0)[0].digest != outcomes[0].digest
+    first, second = (run(faulty(config(*LOOSE), *faults), 2.2)[0].digest for _ in range(2))
+    assert first == second != run(config(*LOOSE), 2.2)[0].digest
 
 
 def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeConfig) -> None:
-    with Rack(faulty(config(), {"kind": "kill", "board": "wave", "tick": 100})) as rack:
+    with Rack(faulty(config(), kill("wave", 100))) as rack:
         rack.run(1.0)
         rows = Written.on(rack.segment).messages["wave.status"]
     assert rows["serial"].tolist() == list(range(1, len(rows) + 1))
@@ -86,7 +77,7 @@ def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeCon
 @pytest.mark.slow
 def test_a_killed_clock_continues_with_the_tick_it_died_in(config: MakeConfig) -> None:
     plain, _ = run(config())
-    killed, events = run(faulty(config(), {"kind": "kill", "board": "clock", "tick": 300}))
+    killed, events = run(faulty(config(), kill("clock", 300)))
     assert of(events, "recovery", "rejoined")[0].board == "clock"
     assert killed.digest == plain.digest
 
@@ -94,7 +85,7 @@ def test_a_killed_clock_continues_with_the_tick_it_died_in(config: MakeConfig) -
 def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(
     config: MakeConfig,
 ) -> None:
-    faults = [{"kind": "kill", "board": "wave", "tick": 50 + 250 * k} for k in range(3)]
+    faults = [kill("wave", 50 + 250 * k) for k in range(3)]
     with Rack(faulty(config("supervision.restarts=2"), *faults)) as rack:
         outcome = rack.run(5.0)
         assert rack.segment.words[System.EMERGENCY_STOP] == 1
@@ -112,75 +103,46 @@ def test_a_board_that_is_lost_too_often_is_given_up_and_the_latch_is_set(
 
 @pytest.mark.slow
 def test_restarts_are_counted_over_their_time_alone(config: MakeConfig) -> None:
-    faults = [{"kind": "kill", "board": "wave", "tick": 50 + 400 * k} for k in range(4)]
+    faults = [kill("wave", 50 + 400 * k) for k in range(4)]
     settings = ("supervision.restarts=1", "supervision.within_s=0.9")
     outcome, _ = run(faulty(config(*settings), *faults), 5.0)
     assert outcome.cause == "time over"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0]), ("brake", [2.0, 0.0])]
-)
+@pytest.mark.parametrize(("on_loss", "demand"), [("hold", []), ("stop", [1.0, 0.0])])
 def test_a_loss_demands_of_the_arm_as_configured(
     config: MakeConfig, on_loss: str, demand: list[float]
 ) -> None:
     settled = config(f"board.wave.on_loss={on_loss}")
-    _, events = run(faulty(settled, {"kind": "kill", "board": "wave", "tick": 100}))
+    _, events = run(faulty(settled, kill("wave", 100)))
     found = [event for event in events if event.code == "demand"]
     assert [event.value for event in found] == demand
     assert [event.tick for event in found] == [100, 300][: len(demand)]
 
 
-def test_two_boards_lost_at_once_come_back_lower_first(config: MakeConfig) -> None:
-    faults = [
-        {"kind": "kill", "board": victim, "tick": 100}
-        for victim in ("watch", "wave.planner", "wave")
-    ]
-    outcome, events = run(faulty(config(), *faults))
-    assert outcome.worked
-    back = of(events, "recovery", "rejoined")
-    assert sorted(event.board for event in back) == sorted(TASKS)
-    assert {event.tick for event in back} == {300}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", [*TASKS, "clock"])
+@pytest.mark.parametrize("victim", ["wave.planner", "clock"])
 def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim: str) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
-        rack.start(2.0)
+        rack.start(1.5)
         words = rack.segment.words
-        while words[System.TICK] < 200:
+        while words[System.TICK] < 40:
             assert rack.watch(0.05)
         pid = (
             words[System.CLOCK_PID] if victim == "clock" else rack.segment.block(victim)[Block.PID]
         )
         os.kill(pid, signal.SIGKILL)
-        while rack.watch(0.1):
-            continue
-    assert rack.outcome is not None
-    assert rack.outcome.cause == "time over"
-    assert rack.outcome.worked
+        outcome = end_of(rack)
+    assert (outcome.cause, outcome.worked) == ("time over", True)
     assert [event.board for event in of(rack.events, "died")] == [victim]
     assert [event.board for event in of(rack.events, "recovery", "rejoined")] == [victim]
 
 
 @pytest.mark.slow
-def test_a_stopped_board_in_real_time_is_detected_within_its_cycles(config: MakeConfig) -> None:
-    fault = {"kind": "hang", "board": "watch", "tick": 120, "phase": 0.4}
-    outcome, events = run(faulty(config("clock.mode=realtime"), fault))
-    (hang,) = of(events, "detection", "hang")
-    assert hang.subject == "watch"
-    # The watch cycles every 8 ticks; the clock itself may have been late with some of them.
-    skipped = sum(event.value for event in of(events, "miss", "clock_skipped"))
-    assert hang.tick - 120 <= (4 + 1) * 8 + skipped
-    assert outcome.worked
-
-
-@pytest.mark.slow
 def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) -> None:
     outcome, events = run(
-        faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 120})
+        faulty(config("clock.mode=realtime"), {"kind": "clock-stop", "board": "clock", "tick": 40})
     )
     (stopped,) = of(events, "detection", "clock_stopped")
     assert stopped.board == "wave"
@@ -193,19 +155,18 @@ def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) ->
 @pytest.mark.slow
 def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: MakeConfig) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
-        rack.start(2.0)
+        rack.start(1.5)
         words = rack.segment.words
-        while words[System.TICK] < 200:
+        while words[System.TICK] < 40:
             assert rack.watch(0.05)
         dead = words[System.CLOCK_PID]
         os.kill(dead, signal.SIGKILL)
         while not of(rack.events, "recovery", "rejoined"):
             assert rack.watch(0.05)
         AlarmWriter(rack.segment, "watch").ring(
-            words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 200
+            words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 40
         )
-        while rack.watch(0.1):
-            continue
+        end_of(rack)
     assert "watch" in [event.board for event in of(rack.events, "detection", "clock_stopped")]
     assert [event.board for event in of(rack.events, "died")] == ["clock"]
 
@@ -229,28 +190,12 @@ def test_a_latch_set_while_running_brakes_until_it_is_reset(config: MakeConfig) 
             while words[System.TICK] < tick + 40:
                 assert rack.watch(0.02)
             demands.append(words[System.DEMAND])
-        while rack.watch(0.1):
-            continue
+        end_of(rack)
     assert demands == [2, 0]
     assert [event.kind for event in rack.events if event.code == "demand"] == [
         "reaction",
         "recovery",
     ]
-
-
-@pytest.mark.slow
-def test_a_board_without_restarts_ends_the_run(config: MakeConfig) -> None:
-    outcome, events = run(faulty(config(NEVER), {"kind": "kill", "board": "watch", "tick": 100}))
-    assert outcome.cause == "board lost"
-    assert [event.board for event in of(events, "reaction", "given_up")] == ["watch"]
-
-
-@pytest.mark.slow
-def test_alarms_are_read_by_whoever_attaches(config: MakeConfig) -> None:
-    with Rack(faulty(config(), {"kind": "kill", "board": "wave", "tick": 20})) as rack:
-        rack.run(1.0)
-        codes = alarm_ring(rack.segment, "clock").drain().rows["code"].tolist()
-    assert codes == [1, 2, 4]
 
 
 @pytest.mark.slow

@@ -12,8 +12,6 @@ from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from tests import reference
-from tests.boards.conftest import MakeConfig
-from tests.boards.fault_racks import rack
 
 Write = Callable[[str, str], Path]
 SCRIPT = '[[fault]]\nkind = "kill"\nboard = "lower"\ntick = 8\n'
@@ -35,31 +33,6 @@ def test_a_duration_is_a_text_with_its_unit_or_a_number_of_seconds(
     ).lasts == pytest.approx(seconds)
 
 
-def test_the_resolved_text_of_a_config_with_faults_loads_again(config: MakeConfig) -> None:
-    found = rack(
-        config,
-        {
-            "kind": "mute",
-            "board": "wave",
-            "for": "20ms",
-            "when": "wave.status.state == executing",
-            "seed": 3,
-        },
-        {
-            "kind": "sensor-bias",
-            "board": "driven",
-            "tick": 40,
-            "cycles": 5,
-            "phase": 0.25,
-            "size": 0.1,
-            "joint": -1,
-        },
-    )
-    again = loads(found.text())
-    assert again == found
-    assert (again.fault[0].lasts, again.fault[1].parameters) == (0.02, {"size": 0.1, "joint": -1.0})
-
-
 def test_the_faults_of_a_script_come_after_those_of_the_config(small: Path, write: Write) -> None:
     own = 'fault=[{ kind = "hang", board = "upper" }]'
     path = write("mine.toml", small.read_text() + '\n[[fault]]\nkind = "hang"\nboard = "upper"\n')
@@ -77,68 +50,12 @@ def test_every_bundled_script_fits_the_nasrem_rack(name: str) -> None:
     assert loads(config.text()) == config
 
 
-def test_an_unknown_script_lists_the_known_scripts(small: Path) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, faults="unheard")
-    assert (
-        str(error.value)
-        == f'--faults = "unheard": no such file; by name: {", ".join(names(FAULTS))}; or a path'
-    )
-
-
 @pytest.mark.parametrize("text", ["[clock]\nspeed = 2\n", "fault = 3\n", 'name = "x"\n'])
 def test_a_script_holds_faults_and_nothing_else(small: Path, write: Write, text: str) -> None:
     with pytest.raises(
         ConfigError, match=r"script.toml: \w+: a fault script contains \[\[fault\]\] tables and"
     ):
         load(small, faults=write("script.toml", text))
-
-
-def test_supervision_has_defaults_and_each_board_its_own(small: Path) -> None:
-    plain = load(small)
-    assert (
-        plain.supervision.restarts,
-        plain.supervision.within_s,
-        plain.supervision.lockstep_restart_s,
-    ) == (
-        5,
-        10,
-        0.5,
-    )
-    assert (plain.board["lower"].restarts, plain.board["lower"].on_loss) == (None, "hold")
-    settings = ["supervision.restarts=2", "board.lower.restarts=0", "board.lower.on_loss=brake"]
-    config = load(small, settings)
-    assert (
-        config.supervision.restarts,
-        config.board["lower"].restarts,
-        config.board["lower"].on_loss,
-    ) == (
-        2,
-        0,
-        "brake",
-    )
-    assert loads(config.text()) == config
-
-
-@pytest.mark.parametrize(
-    ("setting", "expected"),
-    [
-        (
-            "supervision.restarts=-1",
-            "supervision.restarts = -1: should be greater than or equal to 0",
-        ),
-        ("supervision.within_s=0", "supervision.within_s = 0: should be greater than 0"),
-        ("supervision.lockstep_restart_s=inf", "should be a finite number"),
-        ("board.lower.on_loss=stay", "'hold', 'stop' or 'brake'"),
-        ("board.lower.restarts=1.5", "should be a valid integer"),
-        ("supervision.restart=1", "unknown key; did you mean 'restarts'?"),
-    ],
-)
-def test_load_reports_a_mistake_of_supervision(small: Path, setting: str, expected: str) -> None:
-    with pytest.raises(ConfigError) as error:
-        load(small, [setting])
-    assert expected in str(error.value)
-    assert len(error.value.mistakes) == 1
 
 
 def test_the_page_of_all_keys_has_those_of_faults() -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from itertools import pairwise
 from random import Random
 from typing import Any
 
 import pytest
 
-from rack.boards.faults.drawing import Drawing
+from rack.boards.faults.drawing import BEYOND, Drawing, swept
 from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.boards.faults.kinds import BUILT_IN
 from tests.snapshots import Snapshots
@@ -43,3 +44,24 @@ def test_a_kind_declares_what_it_did(kind: Kind) -> None:
 
 def test_every_kind_of_the_project_is_known() -> None:
     assert SNAPSHOTS.known.keys() == BUILT_IN
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_drawn_values_are_permitted_ones(kind: Kind) -> None:
+    for seed in range(40):
+        d = Drawing(Random(seed), cycle=2, reader=8, second=400.0, joints=6)
+        for parameter in kind.parameters:
+            if parameter.drawn is not None:
+                value = parameter.drawn(d)
+                assert parameter.least <= value <= parameter.most
+                assert value == int(value) or not parameter.is_whole
+                assert parameter is not kind.size or value >= 0.999 * (kind.visible_from or 0)
+        assert kind.lasts is None or kind.lasts(d) >= 1
+
+
+def test_a_sweep_goes_from_its_least_size_to_well_beyond_the_visible_one() -> None:
+    sizes = swept(0.001, 0.02, 5)
+    assert (sizes[0], sizes[-1]) == (0.001, pytest.approx(BEYOND * 0.02))
+    ratios = [after / before for before, after in pairwise(sizes)]
+    assert ratios == pytest.approx([ratios[0]] * 4, rel=1e-2)
+    assert swept(0.001, 0.02, 1) == [0.001]

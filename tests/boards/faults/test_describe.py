@@ -8,13 +8,13 @@ from rack.backplane.fault_table import NEVER, FaultTable, Injection, Stage
 from rack.boards.faults.describe import ALL_JOINTS, board_of, describe, document, subject_of
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME, mailbox, task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 
 JOINTS = ("j1", "j2")
 
 
 @pytest.fixture
-def table(make_bus: MakeBus) -> FaultTable:  # noqa: F811
+def table(make_bus: MakeBus) -> FaultTable:
     return FaultTable(make_bus(task("writer"), task("reader"), mailbox()))
 
 

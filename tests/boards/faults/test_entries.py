@@ -6,16 +6,10 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.fault_table import NEVER, FaultTable, Injection, Stage
+from rack.backplane.fault_table import Injection
 from rack.backplane.message import State
-from rack.backplane.segment import Segment, unlink
 from rack.boards.config import wire
-from rack.boards.config.faults import injection, injections
-from rack.boards.config.published import publish
-from rack.boards.errors import ConfigError
-from rack.boards.faults.config import FaultConfig
-from rack.boards.faults.describe import describe, document
-from rack.boards.faults.kind import KINDS
+from rack.boards.config.faults import injections
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
@@ -62,27 +56,6 @@ def test_a_fault_lasts_for_a_time_or_for_cycles_of_its_task(
     assert found.ticks == ticks
 
 
-def test_targets_are_places_in_the_layout(config: MakeConfig) -> None:
-    faults = [
-        {"kind": "mute", "board": "watch", "mailbox": "watch.status"},
-        {"kind": "clock-skip", "board": "clock", "ticks": 3},
-        {"kind": "mute", "board": "wave"},
-    ]
-    layout = wire(rack(config))
-    first, second, third = injected(config, *faults)
-    assert (layout.tasks[first.task].name, layout.mailboxes[first.mailbox].name) == (
-        "watch",
-        "watch.status",
-    )
-    assert (second.task, second.mailbox, second.parameters) == (-1, -1, (3.0,))
-    assert (layout.tasks[third.task].name, third.mailbox) == ("wave", -1)
-
-
-def test_a_forged_message_goes_to_the_first_mailbox_that_is_read(config: MakeConfig) -> None:
-    (found,) = injected(config, {"kind": "masquerade", "board": "wave.planner"})
-    assert wire(rack(config)).mailboxes[found.mailbox].name == "wave.plan"
-
-
 @pytest.mark.parametrize("value", ["done", "DONE", str(int(State.DONE))])
 def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, value: str) -> None:
     (found,) = injected(
@@ -96,25 +69,6 @@ def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, valu
         "state",
     )
     assert number == State.DONE
-
-
-def test_verbs_of_elemental_moves_have_names() -> None:
-    from rack.boards.config import load
-
-    setting = (
-        'fault=[{ kind = "kill", board = "servo", when = "elemental_move.status.verb == grasp" }]'
-    )
-    config = load("nasrem", [setting])
-    (found,) = injections(config, wire(config))
-    assert found.when is not None
-    assert found.when[2] == 4
-
-
-def test_parameters_stand_in_the_order_of_their_kind(config: MakeConfig) -> None:
-    (found,) = injected(config, {"kind": "sensor-bias", "board": "driven", "joint": 3})
-    assert found.parameters == (3.0, 0.02)
-    (found,) = injected(config, {"kind": "overrun", "board": "wave", "random": True})
-    assert found.parameters == (1.5, 1.0)
 
 
 def test_a_phase_is_rounded_down_to_thousandths_of_a_tick(config: MakeConfig) -> None:
@@ -132,50 +86,3 @@ def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(
     assert injected(config, drop, drop)[1].seed == second.seed
     other = rack(config, drop, settings=("seed=1",))
     assert injections(other, wire(other))[0].seed != first.seed
-
-
-def test_a_fault_injected_live_is_checked_in_the_same_way(config: MakeConfig) -> None:
-    found = rack(config)
-    fault = FaultConfig.model_validate({"kind": "hang", "board": "wave", "for": 0.1, "size": 1})
-    with pytest.raises(
-        ConfigError, match=r"^size = 1: hang has no such parameter; parameters: none$"
-    ):
-        injection(fault, found, publish(found).levels, wire(found))
-
-
-def test_the_fault_table_returns_the_faults_added(config: MakeConfig, rack_name: str) -> None:
-    faults = [
-        {
-            "kind": "corrupt",
-            "board": "wave",
-            "mailbox": "wave.status",
-            "tick": 8,
-            "cycles": 2,
-            "bits": 5,
-        },
-        {"kind": "sensor-bias", "board": "driven", "joint": 1, "size": 0.1},
-    ]
-    found = rack(config, *faults)
-    layout = wire(found)
-    segment = Segment.create(layout, found.text())
-    try:
-        table = FaultTable(segment)
-        entries = [table.add(each) for each in injections(found, layout)]
-        assert [entry.stage for entry in entries] == [Stage.WAITING] * 2
-        assert (entries[0].kind, entries[0].tick) == (KINDS["corrupt"].number, 8)
-        assert (
-            describe(entries[0], layout, ())
-            == "corrupt of wave (wave.status, probability 1, bits 5)"
-        )
-        assert describe(entries[1], layout, ("a", "b")) == "sensor-bias of driven (b, size 0.1 rad)"
-        assert document(entries[0], layout, ())["until"] is None
-        entries[1].stage, entries[1].until = Stage.ACTIVE, NEVER
-        entry = document(entries[1], layout, ("a", "b"))
-        assert (entry["stage"], entry["until"], entry["parameters"]) == (
-            "active",
-            None,
-            {"joint": 1.0, "size": 0.1},
-        )
-    finally:
-        segment.close()
-        unlink(rack_name)

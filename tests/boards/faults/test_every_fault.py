@@ -3,7 +3,6 @@ is latched."""
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -18,18 +17,17 @@ from rack.boards import Rack
 from rack.boards.config.faults import injections
 from rack.boards.errors import LaunchError
 from rack.boards.faults.bounds import cycle_ticks
-from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import FOLLOWED, LOCKED, PATIENCE_TICKS, TARGETS
-from tests.processes import BOUND_S
+from tests.boards.runs import faulty
+from tests.processes import BOUND_S, wait_until
 
 pytestmark = pytest.mark.thorough
 
 FIRST = 104
 LENGTHS: dict[str, dict[str, Any]] = {
     "one cycle": {"cycles": 1},
-    "25 cycles": {"cycles": 25},
     "beyond patience": {"for": 1.0},
 }
 OTHERS = [kind for kind in KINDS if kind.where != "arm"]
@@ -53,11 +51,7 @@ def rack_with(config: MakeConfig, kind: Kind, length: dict[str, Any]) -> Rack:
     settings = ["clock.mode=realtime"] if kind.realtime else []
     found = config(*settings, *([LOCKED] if kind.where == "lock" else []), text=FOLLOWED)
     tick = {} if kind.where == "start" else {"tick": FIRST}
-    return Rack(
-        found.model_copy(
-            update={"fault": (FaultConfig(kind=kind.name, board=board, **tick, **length),)}
-        )
-    )
+    return Rack(faulty(found, {"kind": kind.name, "board": board, **tick, **length}))
 
 
 @pytest.mark.parametrize(("kind", "length"), cases(realtime=False))
@@ -104,17 +98,18 @@ def test_a_fault_in_real_time_finally_ends_or_latches(
         rack.start()
         entry, watch = FaultTable(rack.segment).entries[0], rack.segment.block("watch")
         tasks = [rack.segment.block(task.name) for task in rack.segment.layout.tasks]
-        deadline = time.monotonic() + BOUND_S
-        while (entry.stage != Stage.OVER or any(task[Block.LOST] for task in tasks)) and rack.watch(
-            0.02
-        ):
-            assert time.monotonic() < deadline
+
+        def is_over() -> bool:
+            return entry.stage == Stage.OVER and not any(task[Block.LOST] for task in tasks)
+
+        wait_until(lambda: not rack.watch(0.02) or is_over(), BOUND_S)
         before = [task[Block.CYCLES] for task in tasks]
-        while (
-            any(task[Block.CYCLES] <= count for task, count in zip(tasks, before, strict=True))
-            or watch[Block.LEVEL_STATE] != State.EXECUTING
-        ) and rack.watch(0.02):
-            assert time.monotonic() < deadline
+
+        def goes_on() -> bool:
+            cycled = all(task[Block.CYCLES] > n for task, n in zip(tasks, before, strict=True))
+            return cycled and watch[Block.LEVEL_STATE] == State.EXECUTING
+
+        wait_until(lambda: not rack.watch(0.02) or goes_on(), BOUND_S)
         if rack.outcome is not None:
             assert rack.outcome.reason.startswith("nothing heard of the wave for")
         elif kind.where in ("clock", "lock"):
@@ -123,29 +118,13 @@ def test_a_fault_in_real_time_finally_ends_or_latches(
 
 
 def test_a_lock_is_held_by_a_slow_task_in_its_next_cycle(config: MakeConfig) -> None:
-    fault = FaultConfig(kind="lock-held", board="watch", tick=FIRST + 1)
-    found = config("clock.mode=realtime", LOCKED, text=FOLLOWED).model_copy(
-        update={"fault": (fault,)}
-    )
-    with Rack(found) as rack:
+    fault = {"kind": "lock-held", "board": "watch", "tick": FIRST + 1}
+    with Rack(faulty(config("clock.mode=realtime", LOCKED, text=FOLLOWED), fault)) as rack:
         rack.start()
-        entry, deadline = FaultTable(rack.segment).entries[0], time.monotonic() + BOUND_S
-        while entry.stage != Stage.OVER and rack.watch(0.02):
-            assert time.monotonic() < deadline
+        entry = FaultTable(rack.segment).entries[0]
+        wait_until(lambda: not rack.watch(0.02) or entry.stage == Stage.OVER)
         assert entry.struck_tick > FIRST + 1
         assert rack.watch(0.02)
-
-
-def test_a_run_ends_when_the_level_that_ends_it_falls_silent(config: MakeConfig) -> None:
-    slow = FOLLOWED.replace("rate_hz = 400", "rate_hz = 40").replace("rate_hz = 50", "rate_hz = 5")
-    fault = FaultConfig(kind="mute", board="watch", tick=FIRST)
-    with Rack(
-        config("clock.period_ms=25", text=slow).model_copy(update={"fault": (fault,)})
-    ) as rack:
-        outcome = rack.run()
-    assert (outcome.cause, outcome.worked) == ("task failed", False)
-    assert outcome.reason.startswith("'watch.status' has not been written for 30.")
-    assert outcome.ticks < FIRST + 31 * 40
 
 
 @pytest.mark.parametrize("kind", [kind for kind in OTHERS if kind.where == "start"])

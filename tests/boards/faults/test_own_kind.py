@@ -3,23 +3,18 @@ other change."""
 
 from __future__ import annotations
 
-import json
-import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.config.faults import injections
-from rack.boards.errors import ConfigError
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults.bounds import cycles
 from rack.tools.commands.inject import kinds_text
 from tests.boards.conftest import PLAIN, MakeConfig
-from tests.processes import RACK
 
 BOUND_S = 60
 MODULE = "gauge_levels"
@@ -49,15 +44,6 @@ def test_a_kind_of_a_users_own_is_listed_with_its_bound_and_parameters(config: M
     assert parameter == ["lose-every", "n", "messages", "4", "2 to 8", "the n"]
 
 
-def test_a_kind_of_a_users_own_is_checked_in_a_config(config: MakeConfig) -> None:
-    with pytest.raises(ConfigError) as error:
-        wire(config(fault("n = 9, cycles = 2, mailbox = 'sea'"), text=GAUGED))
-    assert [str(mistake) for mistake in error.value.mistakes] == [
-        "fault[0].n = 9: out of range; permitted: whole numbers 2 to 8; the n, messages",
-        "fault[0].mailbox = \"sea\": 'wave' does not write it; it writes: wave.status",
-    ]
-
-
 @pytest.mark.parametrize("valve", ["open", "OPEN", "3"])
 def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
     config: MakeConfig, valve: str
@@ -70,13 +56,6 @@ def test_a_fault_begins_when_a_field_has_a_value_of_a_users_own_enum(
         [field.name for field in layout.mailboxes[0].fields].index("valve"),
         3,
     )
-
-
-def test_a_value_that_a_users_own_enum_lacks_lists_those_it_has(config: MakeConfig) -> None:
-    with pytest.raises(
-        ConfigError, match="'ajar' is not a value of 'valve'; permitted: shut, open"
-    ):
-        wire(config(fault('when = "wave.status.valve == ajar"'), text=GAUGED))
 
 
 @pytest.mark.slow
@@ -92,34 +71,6 @@ def test_a_kind_of_a_users_own_acts_and_is_detected(config: MakeConfig) -> None:
     detected = next(event for event in events if event.kind == "detection")
     assert (detected.code, detected.subject) == ("gap", "wave.status")
     assert sum(event.kind == "fault" and "acted 20 time" in event.text for event in events) == 1
-
-
-@pytest.mark.slow
-def test_a_campaign_draws_and_judges_a_kind_of_a_users_own(tmp_path: Path) -> None:
-    path, out = tmp_path / "gauge.toml", tmp_path / "campaign"
-    path.write_text(GAUGED)
-    command = [
-        *RACK,
-        "campaign",
-        str(path),
-        "--lockstep",
-        "--injections",
-        "2",
-        "--kinds",
-        "lose-every",
-    ]
-    done = subprocess.run(
-        [*command, "--seconds", "6", "--out", str(out), "--json"],
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
-    report = json.loads(done.stdout)
-    assert (done.returncode, report["shortfalls"]) == (0, [])
-    figures = report["by_kind"]["lose-every"]
-    assert (figures["injected"], figures["detected"], figures["within_bound"]) == (2, 2, 2)
-    assert figures["bound"] == "1 write + 1 delivery"
 
 
 def test_two_kinds_of_one_name_are_refused() -> None:

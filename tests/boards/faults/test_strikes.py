@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from rack.boards.faults.config import FaultConfig
+from rack.boards import Rack
 from rack.boards.faults.kind import KINDS, Kind
-from tests.boards.conftest import MakeConfig
+from tests.boards.conftest import LOOSE, MakeConfig
 from tests.boards.fault_racks import DRIVEN, FOLLOWED, LOCKED, TARGETS
+from tests.boards.runs import faulty
 from tests.snapshots import Snapshots
 from tests.whole_runs import in_short, whole_run
 
@@ -26,18 +27,14 @@ BY_ORDER = ("mute", "masquerade")
 LOCKSTEP = [kind for kind in KINDS if not kind.realtime and kind.where != "start"]
 
 
-def faults(kind: Kind) -> tuple[FaultConfig, ...]:
+def faults(kind: Kind) -> list[dict[str, Any]]:
     """Return three faults of a kind, one after the other."""
     board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
     once = ("tick", "seed")
-    return tuple(
-        FaultConfig(
-            kind=kind.name,
-            board=board,
-            **{key: value for key, value in strike.items() if key in once or not kind.once},
-        )
-        for strike in STRIKES
-    )
+    keys = [
+        {key: strike[key] for key in strike if key in once or not kind.once} for strike in STRIKES
+    ]
+    return [{"kind": kind.name, "board": board, **strike} for strike in keys]
 
 
 RACKS = {"followed": FOLLOWED, "driven": DRIVEN}
@@ -51,16 +48,32 @@ CASES = [
 
 @pytest.mark.parametrize("kind", ["kill", "hang"])
 def test_a_fault_at_the_first_tick_strikes_as_later(kind: str, config: MakeConfig) -> None:
-    fault = FaultConfig(kind=kind, board="wave", tick=0)
-    struck = config(text=FOLLOWED).model_copy(update={"fault": (fault,)})
+    struck = faulty(config(text=FOLLOWED), {"kind": kind, "board": "wave", "tick": 0})
     SNAPSHOTS.check(f"{kind} at the first tick", in_short(whole_run(struck, SECONDS)))
 
 
 @pytest.mark.parametrize(("kind", "rack"), CASES)
 def test_a_fault_strikes_as_it_did(kind: Kind, rack: str, config: MakeConfig) -> None:
     settings = [LOCKED] if kind.where == "lock" else []
-    struck = config(*settings, text=RACKS[rack]).model_copy(update={"fault": faults(kind)})
+    struck = faulty(config(*settings, text=RACKS[rack]), *faults(kind))
     parts = dict(whole_run(struck, SECONDS))
     if kind.name in BY_ORDER:
         del parts["events"]
     SNAPSHOTS.check(f"{kind.name}, {rack}", in_short(parts))
+
+
+@pytest.mark.parametrize(
+    ("kind", "coupling"),
+    [("drop", ()), ("reorder", ()), ("delay", LOOSE), ("masquerade", LOOSE)],
+)
+def test_a_run_with_a_fault_of_a_planner_repeats(
+    kind: str, coupling: tuple[str, ...], config: MakeConfig
+) -> None:
+    lasts = {} if KINDS[kind].once else {"cycles": 80}
+    fault = {"kind": kind, "board": "wave.planner", "tick": 101, **lasts}
+    struck = faulty(config(*coupling), fault)
+    digests = []
+    for _ in range(2):
+        with Rack(struck) as rack:
+            digests.append(rack.run(1.0).digest)
+    assert digests[0] == digests[1]

@@ -27,7 +27,7 @@ from rack.boards.faults.tasks import (
 from rack.levels.faults import Fault
 from rack.levels.level import Executor
 from tests.backplane.bus import task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 from tests.machine import needs_fifo
 from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
 
@@ -38,9 +38,7 @@ LEAST_S = 0.5
 @pytest.mark.slow
 @needs_fifo
 @pytest.mark.filterwarnings(FORKS)
-def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(make_bus: MakeBus) -> None:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = 2_500_000
     segment.block("level")[Block.CORE] = 0
@@ -64,9 +62,7 @@ def load(segment: Segment, kind: str, until: LoadStep, *parameters: float) -> Ex
     )
 
 
-def test_extra_computing_takes_the_time_that_its_step_asks_for(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_extra_computing_takes_the_time_that_its_step_asks_for(make_bus: MakeBus) -> None:
     ends: list[int] = []
 
     def step(of: ExtraComputing, tick: int, now: int) -> int:
@@ -80,9 +76,7 @@ def test_extra_computing_takes_the_time_that_its_step_asks_for(
     assert (extra.entry.count, extra.entry.struck_tick) == (1, 20)
 
 
-def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(make_bus: MakeBus) -> None:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = period = 2_500_000
     segment.words[System.EPOCH_NS] = epoch = 1_000_000_000
@@ -106,7 +100,6 @@ class Level:
         self.injected: list[Fault] = []
 
     def inject(self, faults: list[Fault]) -> None:
-        """Note them."""
         self.injected = faults
 
 
@@ -117,13 +110,10 @@ class Writes:
         self.applied: list[str] = []
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
-        """Note their kinds."""
         self.applied = [kind_of(entry).name for entry in faults]
 
 
-def test_a_task_has_the_faults_that_are_active_by_its_tick(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_task_has_the_faults_that_are_active_by_its_tick(make_bus: MakeBus) -> None:
     segment = make_bus(task("level"), task("other"))
     table = FaultTable(segment)
     level = Level()

@@ -10,18 +10,13 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.words import Block, Head, System, TaskState
 from rack.boards.host.bus import WORD, HostBus
-from tests.boards.host.test_bus_adapter import (  # noqa: F401  fixtures
-    MakeSite,
-    OpenBus,
-    make_site,
-    open_bus,
-)
+from tests.boards.host.conftest import MakeSite, OpenBus
 from tests.processes import BOUND_S, in_thread, wait_until
 
 TICK_S = 0.0025
 
 
-def test_an_open_bus_has_claimed_its_board(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+def test_an_open_bus_has_claimed_its_board(make_site: MakeSite, open_bus: OpenBus) -> None:
     site = make_site()
     site.host[Block.WAITS_UNTIL] = 9
     bus = open_bus(site)
@@ -33,8 +28,7 @@ def test_an_open_bus_has_claimed_its_board(make_site: MakeSite, open_bus: OpenBu
 
 
 def test_no_fault_can_signal_a_program_of_another_pid_namespace(
-    make_site: MakeSite,  # noqa: F811
-    open_bus: OpenBus,  # noqa: F811
+    make_site: MakeSite, open_bus: OpenBus
 ) -> None:
     site = make_site()
     site.segment.words[Head.LAUNCHER_NAMESPACE] += 1
@@ -44,7 +38,7 @@ def test_no_fault_can_signal_a_program_of_another_pid_namespace(
         HostBus(site.segment, site.plan.hosts[0])
 
 
-def test_a_message_without_an_id_has_its_number(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+def test_a_message_without_an_id_has_its_number(make_site: MakeSite, open_bus: OpenBus) -> None:
     site = make_site()
     bus = open_bus(site)
     for value, given in ((1.5, {}), (2.5, {"id": 40}), (3.5, {})):
@@ -63,7 +57,7 @@ def test_a_message_without_an_id_has_its_number(make_site: MakeSite, open_bus: O
     assert bus.sent("numbers") == 3
 
 
-def test_unknown_ports_and_fields_are_named(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+def test_unknown_ports_and_fields_are_named(make_site: MakeSite, open_bus: OpenBus) -> None:
     bus = open_bus(make_site())
     with pytest.raises(AttributeError, match="no port 'number'; ports: numbers"):
         bus.send("number", value=1.0)
@@ -74,7 +68,7 @@ def test_unknown_ports_and_fields_are_named(make_site: MakeSite, open_bus: OpenB
     assert bus.sent("numbers") == 0
 
 
-def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bus: OpenBus) -> None:  # noqa: F811
+def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bus: OpenBus) -> None:
     site = make_site()
     bus = open_bus(site)
     assert bus.tasks == ["bridge", "adder"]
@@ -93,8 +87,7 @@ def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bu
 
 
 def test_in_real_time_a_program_waits_for_a_message_or_its_time(
-    make_site: MakeSite,  # noqa: F811
-    open_bus: OpenBus,  # noqa: F811
+    make_site: MakeSite, open_bus: OpenBus
 ) -> None:
     site = make_site("clock.mode=realtime")
     bus = open_bus(site)
@@ -114,10 +107,7 @@ def test_in_real_time_a_program_waits_for_a_message_or_its_time(
     assert done_semaphore(site.segment.rack, "program").value == 0
 
 
-def test_in_lockstep_time_is_that_of_its_turns(
-    make_site: MakeSite,  # noqa: F811
-    open_bus: OpenBus,  # noqa: F811
-) -> None:
+def test_in_lockstep_time_is_that_of_its_turns(make_site: MakeSite, open_bus: OpenBus) -> None:
     site = make_site("host.program.computing_ms=5")
     site.segment.words[System.LOCKSTEP] = 1
     site.host[Block.RELEASED] = 8
@@ -148,8 +138,7 @@ def test_in_lockstep_time_is_that_of_its_turns(
 
 
 def test_a_program_in_lockstep_runs_only_in_its_turn(
-    make_site: MakeSite,  # noqa: F811
-    open_bus: OpenBus,  # noqa: F811
+    make_site: MakeSite, open_bus: OpenBus
 ) -> None:
     site = make_site()
     site.segment.words[System.LOCKSTEP] = 1

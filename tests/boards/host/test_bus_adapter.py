@@ -3,123 +3,18 @@ counts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from typing import Any
-
 import pytest
 
-from rack.backplane import semaphores
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import State
-from rack.backplane.segment import Segment, unlink
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, System, TaskState
-from rack.boards.classes import find_class
-from rack.boards.config import resolve
-from rack.boards.config.resolved import Resolved
-from rack.boards.host.bus import HostBus
-from rack.boards.host.bus_adapter import BusAdapter, status_of
-from rack.boards.host.entries import ENTRY, NEVER, EntryConfig, Outward, Replayed
+from rack.boards.host.entries import NEVER, EntryConfig, Replayed
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Ports
-from tests.boards.conftest import MakeConfig
-from tests.boards.host.test_board import HOSTED
+from tests.boards.host.conftest import EVERY, MakeSite, OpenBus
 
-EVERY = 4
-"""Ticks of a cycle of the bridge."""
 NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
-
-
-class Site:
-    """A backplane with the bridge's adapter and its host board's program at their ends of it."""
-
-    def __init__(self, plan: Resolved, segment: Segment) -> None:
-        self.plan = plan
-        self.segment = segment
-        self.host = segment.block("program")
-        self.adapter = self.started()
-        self.tick = -EVERY
-
-    def started(self) -> BusAdapter:
-        """Return an adapter, as a board that begins has it, with its ports."""
-        (wiring,) = (task for task in self.plan.tasks if task.task == "bridge")
-        adapter = find_class(wiring.target, BusAdapter)(wiring.context)
-        adapter.attach(self.segment, None)
-        alarms = AlarmWriter(self.segment, "bridge")
-        self.inputs = InputPorts(self.segment, wiring.inputs, alarms)
-        self.outputs = OutputPorts(self.segment, wiring.outputs, alarms, self.inputs, wiring.sent)
-        return adapter
-
-    def restart(self) -> None:
-        """Replace the adapter, as after the end of its board's process."""
-        for writer in self.outputs.writers.values():
-            writer.close()
-        for _, entry in self.adapter._entries:
-            if isinstance(entry, Outward):
-                entry._writer.close()
-        self.adapter = self.started()
-
-    def cycle(self) -> None:
-        """Do the next cycle."""
-        self.tick += EVERY
-        self.inputs.read(self.tick)
-        self.adapter.process(self.inputs.values, self.outputs.messages, self.tick)
-        assert self.outputs.write(self.tick, None)
-
-    @property
-    def status(self) -> Any:
-        """The newest status."""
-        return open_observer(self.segment, "bridge.status").peek().value
-
-    def count(self, port: str) -> dict[str, int]:
-        """Return what the newest status counts of an entry, but for what is zero."""
-        record = getattr(self.status, port)
-        return {name: int(record[name]) for name in record.dtype.names if record[name]}
-
-    def crossed(self) -> list[float]:
-        """Return the numbers that are in the bridge's own mailbox, oldest first."""
-        reading = open_observer(self.segment, "bridge.numbers").peek()
-        values = [*reading.earlier, reading.value] if reading.is_there else []
-        return [message.value for message in values]
-
-
-MakeSite = Callable[..., Site]
-
-
-@pytest.fixture
-def make_site(config: MakeConfig) -> Iterator[MakeSite]:
-    """Make the one site of a test."""
-    with ExitStack() as stack:
-
-        def make(*settings: str) -> Site:
-            plan = resolve(config(*settings, text=HOSTED))
-            segment = Segment.create(plan.layout, "")
-            stack.callback(unlink, plan.layout.rack)
-            stack.callback(segment.close)
-            semaphores.create(plan.layout)
-            stack.callback(semaphores.unlink_all, plan.layout.rack)
-            semaphores.open_all(plan.layout)
-            return Site(plan, segment)
-
-        yield make
-
-
-@pytest.fixture
-def open_bus() -> Iterator[Callable[[Site], HostBus]]:
-    """Open the program's end of a site."""
-    with ExitStack() as stack:
-
-        def open_it(site: Site) -> HostBus:
-            bus = HostBus(site.segment, site.plan.hosts[0])
-            stack.callback(bus.close)
-            return bus
-
-        yield open_it
-
-
-OpenBus = Callable[[Site], HostBus]
 
 
 def test_each_message_crosses_once_and_in_order_as_many_as_a_cycle_may_take(
@@ -285,7 +180,6 @@ class Out:
         self.sent: list[tuple[int, int]] = []
 
     def send(self, basis: int) -> None:
-        """Note it."""
         self.sent.append((self.raw[0], basis))
 
 
@@ -308,13 +202,3 @@ def test_a_replay_gives_out_what_was_written_at_its_ticks(
         replayed.exchange(Ports(), Ports(port=out), tick)
         seen.append(list(out.sent) if is_sent else out.raw[0])
     assert seen == expected
-
-
-def test_the_status_has_a_group_of_counts_for_each_entry() -> None:
-    entry = EntryConfig.model_validate({"from": "a.b"})
-    found = status_of({"one": entry, "two": entry})
-    assert (found.name, found.version) == ("adapter_status", 1)
-    assert [field.name for field in found.fields][-2:] == ["one", "two"]
-    counts = ("passed", "refused", "superseded", "full", "waiting", "arrived", "age")
-    assert found.dtype({})["two"].names == counts
-    assert ENTRY.version == 1

@@ -15,6 +15,7 @@ from rack.boards.host.bus_adapter import LONGEST_S
 from rack.tools.faults.ending import strikes
 from tests.boards.conftest import MakeConfig
 from tests.boards.host.test_board import ENDS, HOSTED, codes, status, watch
+from tests.boards.runs import stop
 from tests.processes import wait_until
 
 pytestmark = pytest.mark.thorough
@@ -73,27 +74,16 @@ def test_a_run_repeats_however_long_its_program_takes(
     assert slow(config, 0.0, *settings) == slow(config, 0.03, *settings)
 
 
-@pytest.mark.parametrize("kind", ["kill", "hang"])
 def test_a_program_that_is_done_is_not_struck_though_its_process_is_still_there(
-    config: MakeConfig, kind: str
+    config: MakeConfig,
 ) -> None:
     settings = (
         "host.program.program=host_programs:Lingering",
-        f"fault=[{{ kind='{kind}', board='program', at=0.2 }}]",
+        "fault=[{ kind='kill', board='program', at=0.2 }]",
     )
     with Rack(config(*settings, "board.bridge.ends_run=false", text=HOSTED)) as rack:
         assert rack.run(0.5).cause == "time over"
         assert [strike.tick for strike in strikes(rack.segment, ())] == [-1]
-
-
-@pytest.mark.parametrize(("computing", "arrived"), [(0, 4), (100, 40), (102.5, 44)])
-def test_what_a_program_sends_is_taken_once_its_computing_is_over(
-    config: MakeConfig, computing: float, arrived: int
-) -> None:
-    settings = ("host.program.params.count=1", f"host.program.computing_ms={computing}")
-    with Rack(config(*settings, text=HOSTED)) as rack:
-        assert rack.run().cause == "task done"
-        assert status(rack.segment).numbers["arrived"] == arrived
 
 
 def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: MakeConfig) -> None:
@@ -117,29 +107,26 @@ def test_a_stop_ends_the_wait_for_a_program(config: MakeConfig) -> None:
         block = rack.segment.block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
         began = time.monotonic()
-        rack.stop("the test has seen enough")
-        while rack.watch(0.5):
-            continue
-        assert rack.outcome is not None
-        assert rack.outcome.cause == "stopped"
+        assert stop(rack).cause == "stopped"
     assert time.monotonic() - began < LONGEST_S / 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_program_that_dies_while_the_rack_waits_for_it_does_not_hold_the_rack(
-    config: MakeConfig, number: signal.Signals
+def test_a_program_that_stops_while_the_rack_waits_for_it_does_not_hold_the_rack(
+    config: MakeConfig,
 ) -> None:
     with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
         rack.start()
         block = rack.segment.block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
-        os.kill(block[Block.PID], number)
+        os.kill(block[Block.PID], signal.SIGSTOP)
         watch(rack, lambda: "rejoined" in codes(rack, "program"))
     assert [code for code in codes(rack, "program") if code in ENDS] == [
         "died",
         "restart",
         "rejoined",
     ]
+    said = [event.text for event in rack.events]
+    assert said.count("'program' is not responding: stopped by a signal") == 1
 
 
 def test_a_program_that_is_given_up_ends_the_run_at_the_same_tick(config: MakeConfig) -> None:

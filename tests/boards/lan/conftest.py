@@ -32,7 +32,6 @@ class Network:
         return lambda: iter([self.come.popleft() for _ in range(len(self.come))])
 
     def publish(self, key: str, reliable: bool = False) -> Any:
-        """Return a function that sends."""
         return lambda payload, envelope: self.sent.append((payload, envelope))
 
 

@@ -27,7 +27,6 @@ BURST = 64
 
 
 def main(name: str, endpoint: str, victim: str) -> None:
-    """Flood."""
     exports = {port: {"from": f"{port}.status"} for port in ("pulse", "calm")}
     link = LanLink(
         name,

@@ -100,12 +100,10 @@ class Forger:
         )
 
     def state(self) -> dict[str, int]:
-        """Return what it has done so far."""
         return dict(self._count)
 
 
 def main(folder: str, name: str, other: str, *endpoints: str) -> None:
-    """Forge."""
     forger = Forger(Path(folder), name, other, list(endpoints))
     serve(forger.cycle, forger.state, PERIOD_S)
 

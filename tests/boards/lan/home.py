@@ -48,7 +48,6 @@ class Home:
         self._sizes = defaultdict[str, set[int]](set)
 
     def cycle(self) -> None:
-        """Take what has come, and send."""
         sealer = self._link.sealer
         for take in self._arrived:
             for key, envelope, payload in take():
@@ -65,7 +64,6 @@ class Home:
         ]
 
     def state(self) -> dict[str, Any]:
-        """Return what has come so far."""
         flaws = {flaw.name: count for flaw, count in self._link.sealer.flaws.items()}
         sizes = {key: sorted(found) for key, found in self._sizes.items()}
         counts = {"came": self._came, "good": self._good, "asked": self._asked, "sizes": sizes}
@@ -88,7 +86,6 @@ def serve(cycle: Callable[[], None], state: Callable[[], dict[str, Any]], period
 
 
 def main(rack: str, table: str) -> None:
-    """Be at home."""
     home = Home(rack, LanTable.model_validate(json.loads(table)))
     serve(home.cycle, home.state, PERIOD_S)
 

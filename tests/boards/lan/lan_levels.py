@@ -23,7 +23,6 @@ class Pulse(Executor):
     outputs = {"status": PULSE}
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Count."""
         write.status.count = tick // self.context.every
 
 

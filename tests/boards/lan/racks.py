@@ -240,11 +240,9 @@ class RackProcess:
         raise AssertionError(f"no outcome: {self.events} {self._errors()}")
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal to its launcher."""
         self._process.send_signal(number)
 
     def end(self) -> None:
-        """Kill its launcher, if it still runs."""
         self._process.kill()
         self._errors()
 

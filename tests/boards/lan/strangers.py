@@ -74,7 +74,6 @@ class Stranger:
         self._got = {name: Counter[str]() for name in ("heard", "tokens", "answers")}
 
     def cycle(self) -> None:
-        """Send, ask, and take what has come."""
         for key, payload, attachment in self._puts:
             self._session.put(
                 key, payload, attachment=attachment, allowed_destination=zenoh.Locality.REMOTE
@@ -103,7 +102,6 @@ def _taken(channel: Any) -> Iterator[Any]:
 
 
 def main(sessions: str) -> None:
-    """Be all of them."""
     strangers = {name: Stranger(table) for name, table in json.loads(sessions).items()}
 
     def cycle() -> None:

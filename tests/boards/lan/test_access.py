@@ -40,22 +40,22 @@ def rules(
                                 yield flow, message, key, name
 
 
-def test_without_others_nothing_is_allowed() -> None:
-    assert list(rules(TLS)) == []
-
-
-def test_without_tls_anyone_may_see_that_it_is_there_and_compare_clocks() -> None:
+def test_without_tls_rules_are_for_anyone_and_over_tls_each_is_for_one_certificate() -> None:
     found = list(rules(TCP))
     assert {message for _, message, *_ in found} == {*WATCH_TOKENS, *TOKEN, *SUBSCRIBE, *PUT}
     keys = {key for _, message, key, _ in found if message in (*SUBSCRIBE, *PUT)}
     assert keys == {"rack/*/ping/home", "rack/*/pong/*", "rack/home/pong/*"}
-    assert {name for *_, name in found} == {"*"}
-
-
-def test_over_tls_every_rule_is_for_one_certificate() -> None:
-    tables = {"export": {"pulse": {"from": "pulse.status"}}, "estop_from": ["anyone"]}
-    names = {name for *_, name in rules(TLS, peers=("friend",), **tables)}
-    assert names == {"friend", "anyone"}
+    tables: dict[str, Any] = {
+        "export": {"pulse": {"from": "pulse.status"}},
+        "estop_from": ["anyone"],
+        "peers": ("friend",),
+    }
+    assert {name for *_, name in rules(TLS, **tables)} == {"friend", "anyone"}
+    assert {name for *_, name in rules(TCP, **tables)} == {"*"}
+    # They are the same but for what anyone may do.
+    known, unknown = ({rule[:3] for rule in rules(at, **tables)} for at in (TLS, TCP))
+    assert known <= unknown
+    assert unknown - known <= {rule[:3] for rule in found}
 
 
 def test_puts_come_from_a_rack_itself_and_only_what_is_imported() -> None:
@@ -94,29 +94,6 @@ def test_whoever_may_stop_it_may_do_nothing_else() -> None:
         (IN, "query", stop),
         (OUT, "reply", stop),
     }
-
-
-def test_no_message_deletes() -> None:
-    assert not [rule for rule in rules(TCP, peers=("friend",)) if rule[1] == "delete"]
-
-
-def test_without_tls_rules_hold_for_anyone_but_by_the_same_keys() -> None:
-    tables: dict[str, Any] = {
-        "export": {"pulse": {"from": "pulse.status"}},
-        "estop_from": ["viewer"],
-        "peers": ("friend",),
-    }
-    known, unknown = ({rule[:3] for rule in rules(at, **tables)} for at in (TLS, TCP))
-    assert known <= unknown
-    assert unknown - known <= {rule[:3] for rule in rules(TCP)}
-    assert {name for *_, name in rules(TCP, **tables)} == {"*"}
-
-
-def test_an_operator_sets_stops_and_sends_nothing_else() -> None:
-    found = list(rules(TLS, is_operator=True))
-    assert (OUT, "query", "rack/home/estop/*", "*") in found
-    assert (IN, "reply", "rack/home/estop/*", "*") in found
-    assert not [rule for rule in found if rule[1] in ("put", "declare_subscriber")]
 
 
 @pytest.mark.parametrize("cycle_ns", [0, 20_000_000])

@@ -117,31 +117,6 @@ def test_a_rack_that_comes_is_sent_everything_anew(make: MakeAdapter) -> None:
 
 SENT = MessageType("sent", 1, (Field("value", "f8", "1", "a number"),))
 IMPORTED = {"from": "b/pulse.status", "type": "lan_levels:PULSE", "rate_hz": 50, "max_age_ms": 100}
-EXPORTED = {"from": "pulse.status", "rate_hz": 50}
-
-
-@pytest.mark.parametrize(
-    ("exports", "imports", "is_whole"),
-    [
-        ({"out": EXPORTED}, {"other": IMPORTED}, True),
-        ({"out": {**EXPORTED, "from": "nobody.status"}}, {"other": IMPORTED}, False),
-        ({"out": EXPORTED}, {"other": {**IMPORTED, "type": "lan_levels:NOTHING"}}, False),
-    ],
-)
-def test_ports_are_whole_if_every_message_is_known(
-    exports: dict[str, object], imports: dict[str, object], is_whole: bool
-) -> None:
-    params = {
-        "listen": ["tcp/127.0.0.1:7447"],
-        "peers": ["b"],
-        "export": exports,
-        "import": imports,
-    }
-    made = LanAdapter.made_ports(params, {"pulse.status": SENT})
-    assert made.is_whole is is_whole
-    assert {"status", "peer_b"} <= set(made.outputs)
-    assert ("other" in made.outputs) == (imports["other"] is IMPORTED)
-    assert list(made.inputs) == (["out"] if exports["out"] is EXPORTED else [])
 
 
 def test_what_keeps_the_exchange_from_its_work_is_said(make: MakeAdapter) -> None:

@@ -1,4 +1,5 @@
-"""What the barrier passes on of a step: no more than its sender may export, and nothing twice."""
+"""The barrier of racks in lockstep: what it passes on of a step, how long it awaits a partner, and
+how a step is packed."""
 
 from __future__ import annotations
 
@@ -11,10 +12,21 @@ import pytest
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block
 from rack.boards.config.resolved import loads, wire
+from rack.boards.lan.awaited import Why, word_of
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.keys import out_key, step_key
 from rack.boards.lan.link import Arrived
-from rack.boards.lan.lockstep import STEP_KIND, Barrier, pack_step
+from rack.boards.lan.lockstep import (
+    NEVER,
+    STEP_KIND,
+    Barrier,
+    Partner,
+    Step,
+    StepFlag,
+    pack_step,
+    unpack_step,
+)
+from rack.boards.lan.peers import NONE
 from tests.boards.lan.conftest import EVERY, LAUNCH
 from tests.boards.lan.racks import rack_text
 
@@ -33,15 +45,12 @@ class Session:
         self._take: Callable[[Any], None]
 
     def liveliness(self) -> Session:
-        """Return what tokens are subscribed to with."""
         return self
 
     def declare_subscriber(self, key: str, handler: Any, history: bool = False) -> None:
-        """Note where what comes is taken."""
         self._take = handler.callback
 
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends to nobody."""
         return lambda payload, envelope: None
 
     def bring(self, rack: str, cycle: int, *keys: str) -> None:
@@ -70,7 +79,6 @@ def segment(rack_name: str) -> Iterator[Segment]:
 
 
 def opened(segment: Segment) -> tuple[Barrier, Session]:
-    """Return a barrier with the two others."""
     barrier, session = Barrier(segment, "lan", OTHERS, ()), Session(segment.rack)
     barrier.open(session, LAUNCH)  # type: ignore[arg-type]
     return barrier, session
@@ -97,3 +105,80 @@ def test_what_was_passed_on_before_a_restart_is_not_passed_on_again(segment: Seg
             session.bring(rack, cycle, KEYS[rack])
     assert barrier.meet(3 * EVERY)
     assert [one.payload for one in take()] == [b"two 3"]
+
+
+def step(time_ns: int, flags: int = 0) -> Step:
+    """Return a step of that time."""
+    return Step(launch=7, time_ns=time_ns, flags=flags, cycle_ns=8, racks=("a",), exports=())
+
+
+def test_steps_are_passed_on_once_and_up_to_a_time() -> None:
+    partner = Partner("b", 3)
+    for time_ns in (8, 16, 16, 8, 24):
+        partner.take(step(time_ns))
+    assert [passed.time_ns for passed in partner.passed(16)] == [8, 16]
+    assert [passed.time_ns for passed in partner.passed(16)] == []
+    assert [partner.has_reached(time_ns) for time_ns in (24, 25)] == [True, False]
+    assert [passed.time_ns for passed in partner.passed(100)] == [24]
+
+
+def test_a_rack_that_is_over_is_awaited_no_more_until_it_sends_again() -> None:
+    partner = Partner("b", 3)
+    partner.gone_s = 1.0
+    partner.take(step(8, StepFlag.OVER))
+    assert (partner.has_reached(1000), partner.gone_s) == (True, None)
+    partner.take(step(16))
+    assert not partner.has_reached(1000)
+
+
+def test_the_word_says_why_it_is_awaited() -> None:
+    partner = Partner("b", 3)
+    assert partner.word == word_of(3, Why.UNSEEN)
+    partner.launch = 7
+    assert partner.word == word_of(3, Why.SLOWER)
+    partner.gone_s = 1.0
+    assert partner.word == word_of(3, Why.GONE)
+
+
+def test_a_rack_that_is_forgotten_is_awaited_as_at_first() -> None:
+    partner = Partner("b", 3)
+    partner.launch = 7
+    partner.gone_s = 1.0
+    partner.is_there = True
+    partner.take(step(8, StepFlag.OVER))
+    partner.forget()
+    assert (partner.launch, partner.time_ns, partner.gone_s) == (NONE, NEVER, None)
+    assert not partner.steps
+    assert [partner.is_out, partner.is_there, partner.has_reached(0)] == [False] * 3
+
+
+HEAD = Envelope(STEP_KIND, 11, 1, 1, 40, 100_000_000, 0, StepFlag.OVER)
+EXPORTS = (
+    Arrived("a/first", b"head of one", b"payload"),
+    Arrived("b", b"", b""),
+    Arrived("c/third", b"h", b"x" * 300),
+)
+
+
+@pytest.mark.parametrize("count", range(4))
+def test_a_step_arrives_as_it_was_sent(count: int) -> None:
+    content = pack_step(5_000_000, ("puma", "k1607"), EXPORTS[:count])
+    expected = Step(11, 100_000_000, StepFlag.OVER, 5_000_000, ("puma", "k1607"), EXPORTS[:count])
+    assert unpack_step(HEAD, content) == expected
+
+
+def test_an_export_without_an_envelope_arrives_with_an_empty_one() -> None:
+    step = unpack_step(HEAD, pack_step(1, ("puma",), [Arrived("a", None, b"payload")]))
+    assert step is not None
+    assert step.exports == (Arrived("a", b"", b"payload"),)
+
+
+def test_what_is_cut_off_continued_or_of_another_kind_is_no_step() -> None:
+    content = pack_step(5_000_000, ("puma",), EXPORTS)
+    assert [
+        length for length in range(len(content)) if unpack_step(HEAD, content[:length]) is not None
+    ] == []
+    assert unpack_step(HEAD, content + b"x") is None
+    assert unpack_step(HEAD._replace(kind=STEP_KIND + 1), content) is None
+    # No text: a key of bytes that are no UTF-8.
+    assert unpack_step(HEAD, content.replace(b"a/first", b"\xff/first")) is None

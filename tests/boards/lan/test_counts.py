@@ -16,37 +16,8 @@ def head(number: int, launch: int = 7, serial: int = 0) -> Envelope:
 
 
 def order() -> tuple[MessageOrder, ImportCount]:
-    """Return an order and its counts."""
     count = ImportCount()
     return MessageOrder(count), count
-
-
-def test_messages_in_order_are_all_new() -> None:
-    found, count = order()
-    assert all(found.admits(head(number)) for number in range(5, 10))
-    assert count == ImportCount()
-
-
-def test_what_is_missing_is_counted_and_what_comes_late_is_disorder_once() -> None:
-    found, count = order()
-    assert [found.admits(head(number)) for number in (1, 4, 3, 3, 4, 5)] == [
-        True,
-        True,
-        False,
-        False,
-        False,
-        True,
-    ]
-    assert (count.missing, count.disordered, count.repeated) == (2, 1, 2)
-
-
-def test_a_new_launch_begins_anew() -> None:
-    found, count = order()
-    assert found.admits(head(90))
-    assert found.admits(head(4, launch=8))
-    assert (found.launch, found.number, count.missing, count.repeated) == (8, 4, 0, 0)
-    assert found.admits(head(6, launch=8))
-    assert count.missing == 1
 
 
 def test_a_restarted_reader_takes_nothing_twice() -> None:

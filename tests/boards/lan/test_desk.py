@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System
 from rack.boards.config import load, wire
 from rack.boards.lan.credentials import Credentials
-from rack.boards.lan.desk import CHECK, ESTOP_KIND, REQUESTS_A_CYCLE, Desk
+from rack.boards.lan.desk import CHECK, ESTOP_KIND, Desk
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
@@ -37,7 +37,6 @@ class Line:
         self._number = 0
 
     def answer(self, key: str, unread: int) -> Callable[[], Iterator[Question]]:
-        """Return a function that takes what waits."""
         assert key == estop_key("*", self.rack)
         self.most = unread
 
@@ -63,7 +62,6 @@ class Line:
         self.put(asker, self.sealer.seal(sealed_for or key, head, payload), payload)
 
     def put(self, asker: str, envelope: bytes | None, payload: bytes = b"") -> None:
-        """Send anything."""
 
         def reply(payload: bytes, envelope: bytes) -> None:
             head = self.sealer.opened(estop_answer_key(self.rack, asker), envelope, payload)
@@ -96,12 +94,10 @@ class Bench:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether the emergency stop is set."""
         return bool(self.segment.words[System.EMERGENCY_STOP])
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Requests answered, refused and dropped."""
         return tuple(vars(self.desk.count).values())
 
 
@@ -171,18 +167,6 @@ def test_nobody_asks_in_the_name_of_another(bench: Bench, tmp_path: Path) -> Non
     # The answer has the seal of the rack, which `Line` checks.
     assert len(bench.cycle()) == 1
     assert bench.is_stopped
-
-
-def test_a_cycle_looks_at_a_bounded_number_of_requests(bench: Bench) -> None:
-    assert bench.line.most == REQUESTS_A_CYCLE
-
-
-def test_a_desk_that_nobody_may_ask_takes_no_requests(bench: Bench) -> None:
-    desk = Desk(bench.segment, OwnGrid(bench.segment, 8), {}, [])
-    bench.line.most = 0
-    desk.open(bench.line, LAUNCH)  # type: ignore[arg-type]
-    desk.answer(48)
-    assert bench.line.most == 0
 
 
 def test_a_desk_counts_on_from_its_predecessor_and_in_lockstep_shows_nothing(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import rack.boards.lan
 from rack.boards.lan import credentials as files
-from rack.boards.lan.credentials import Credential, Credentials, KeyPair
+from rack.boards.lan.credentials import Credentials, KeyPair
 from rack.boards.lan.envelope import _HEAD, MOST_ENVELOPE, Envelope, Flaw, Sealer
 from rack.boards.lan.keys import (
     estop_answer_key,
@@ -206,15 +206,6 @@ def test_certificates_of_others_are_remembered_up_to_a_bound(
         assert identity is not None
         assert identity.name == f"rack-{at}"
         assert 0 < len(own._known) <= 2
-
-
-def test_a_chain_that_would_not_fit_is_refused(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    size = len(Credentials(folder, "cell").pair.chain)
-    monkeypatch.setattr(files, "MOST_CHAIN", size - 1)
-    with pytest.raises(Credential, match=f"cell.pem: {size} bytes; permitted: {size - 1}"):
-        Sealer(Credentials(folder, "cell"))
 
 
 def test_flaws_are_counted_by_cause(sealer: Sealer) -> None:

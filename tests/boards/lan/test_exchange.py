@@ -5,10 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +24,16 @@ from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence
 from tests.boards.lan.racks import (
     LAUNCH_S,
-    ROOT,
     RackProcess,
     configs,
     endpoints,
     rack_text,
     started,
 )
+from tests.boards.lan.test_strangers import running
+from tests.boards.runs import stop
 from tests.machine import needs_fifo
-from tests.processes import BOUND_S, wait_until
+from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 
@@ -183,21 +181,6 @@ def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(
             assert os.sched_getaffinity(thread) == {core}
 
 
-@contextmanager
-def flooding(name: str, endpoint: str, victim: str) -> Iterator[None]:
-    """Let a rack of that name flood another one, which listens at an endpoint."""
-    command = [sys.executable, "-m", "tests.boards.lan.flooder", name, endpoint, victim]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE) as process:
-        try:
-            yield
-        finally:
-            process.stdin.close()  # type: ignore[union-attr]
-            try:
-                process.wait(BOUND_S)
-            finally:
-                process.kill()
-
-
 @pytest.mark.alone
 def test_a_flood_costs_a_bounded_number_of_looks_and_other_entries_go_on(
     rack_name: str, tmp_path: Path
@@ -213,7 +196,7 @@ max_age_ms = 1000
     (config,) = configs(
         [rack_text(rack_name, at, [], "flood", lan="lease_ms = 1000") + calm], tmp_path
     )
-    with Rack(config) as rack, flooding("flood", at, rack_name):
+    with Rack(config) as rack, running("flooder", "flood", at, rack_name):
         rack.start(SECONDS)
 
         def goes_on() -> bool:
@@ -227,9 +210,7 @@ max_age_ms = 1000
 
         wait_until(goes_on)
         rows = written(rack.segment, "lan.status")
-        rack.stop("the test has seen enough")
-        while rack.watch(0.1):
-            continue
+        stop(rack)
     refused = np.diff(rows["import_other"]["refused"].astype(int))
     assert refused.max() == UNREAD
     assert (refused >= 0).all()
@@ -263,17 +244,3 @@ def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
         rack.segment.words[System.PEER_STOP] = switch(demand_from, is_on)
         rack.run(0.5)
     return [(event.tick, event.text) for event in rack.events if event.code == "demand"]
-
-
-def test_the_clock_follows_the_adapter_at_its_tick(rack_name: str) -> None:
-    text = (
-        rack_text(rack_name, "", [])
-        .partition("[adapter.lan]")[0]
-        .replace("[clock]", '[clock]\nmode = "lockstep"')
-    )
-    stop = "the arm must ramp to rest, then brake: a rack that it works with is lost"
-    assert words(100, True, Rack(loads(text))) == [(100, stop)]
-    assert words(100, False, Rack(loads(text))) == [
-        (0, stop),
-        (100, "arm released: no stop is requested"),
-    ]

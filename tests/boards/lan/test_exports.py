@@ -31,7 +31,6 @@ class Exporting:
         self.open()
 
     def open(self) -> None:
-        """Open the export."""
         self.entry = Export(self.segment, self.table, LAUNCH, OwnGrid(self.segment, EVERY))
         self.entry.open(self.network, Sealer())  # type: ignore[arg-type]
 

@@ -76,14 +76,6 @@ def test_a_unix_socket_is_reached_by_its_own_user_alone(
             LanLink("cell", LanTable(listen=("unix/cell",)))
 
 
-def test_a_link_that_connects_does_not_listen() -> None:
-    port = free_port()
-    with home(listen=[f"tcp/127.0.0.1:{port}"]), home(connect=[f"tcp/127.0.0.1:{port}"]) as program:
-        wait_until(lambda: program.state()["connected"])
-        assert {protocol for protocol, _ in sockets(program.pid)} == {"tcp"}
-        assert LISTENS not in {state for _, state in sockets(program.pid)}
-
-
 def test_opening_waits_for_no_peer() -> None:
     """A restarted board would come back late: zenoh by itself waits for a peer that is not
     there."""

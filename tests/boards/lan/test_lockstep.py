@@ -57,7 +57,6 @@ def digests(found: Sequence[Ended]) -> list[str]:
 
 
 def load() -> None:
-    """Keep a core busy."""
     while True:
         pass
 
@@ -81,19 +80,6 @@ def test_three_racks_repeat_whatever_the_order_of_launches_and_the_load(
         )
         assert one.last["echo.status"]["total"] == sum(range(48))
         assert one.last["echo.status"]["lost"] == 0
-
-
-def test_a_rack_that_ends_earlier_is_lost_at_the_same_tick_each_time(
-    names: list[str], tmp_path: Path
-) -> None:
-    racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
-    found = [run_together(racks, [0.75, 0.3]) for _ in range(2)]
-    assert digests(found[0]) == digests(found[1])
-    first, _ = found[0]
-    peer = first.last[f"lan.{peer_port(names[1])}"]
-    # The other one's last cycle begins 8 ticks before its end, at tick 120.
-    assert (peer["presence"], peer["since"], peer["losses"]) == (Presence.LOST, 120, 1)
-    assert first.last["echo.status"]["lost"] > 0
 
 
 def test_an_adapter_killed_at_a_tick_comes_back_and_the_run_repeats(
@@ -175,22 +161,6 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
         assert ended(rack).outcome.ticks <= CYCLE
 
 
-def test_a_rack_held_by_the_host_holds_the_others(names: list[str], tmp_path: Path) -> None:
-    racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
-    with running(racks) as (first, second):
-        first.segment.words[System.HOLD_AT] = 5 * CYCLE + 1
-        first.start(0.5)
-        second.start(0.5)
-        watch([first, second], until=lambda: second.segment.block("lan")[Block.AWAITS])
-        watch([first, second], until=lambda: first.segment.words[System.HELD])
-        assert first.segment.words[System.TICK] < 5 * CYCLE
-        assert second.segment.words[System.TICK] < 6 * CYCLE
-        first.segment.words[System.HOLD_AT] = 0
-        watch([first, second])
-        held = [ended(first), ended(second)]
-    assert digests(held) == digests(run_together(racks, [0.5, 0.5]))
-
-
 @pytest.mark.parametrize(
     ("setting", "text"),
     [
@@ -210,12 +180,3 @@ def test_racks_of_different_clocks_say_so_and_end(
     assert first.outcome.cause == "board lost"
     assert text.format(names[1]) in first.texts
     assert "restart" not in first.texts
-
-
-def test_a_rack_that_others_do_not_wait_for_says_so(names: list[str], tmp_path: Path) -> None:
-    a, b, c = names
-    texts = ring_texts(names, {a: [b], b: [a], c: [b]})
-    found = run_together(configs(texts, tmp_path, STEPPED), [0.5, 0.5, 0.5])
-    # Each imports from the one before it; the second one waits for the first alone.
-    assert [one.outcome.cause for one in found] == ["board lost", "time over", "board lost"]
-    assert f"rack '{b}' does not wait for '{c}' in lockstep" in found[2].texts

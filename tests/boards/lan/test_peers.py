@@ -22,22 +22,6 @@ def alarms(peer: PeerRack) -> list[Alarm]:
     return [finding.alarm for finding in peer.findings]
 
 
-def test_a_rack_is_there_from_its_token_to_the_end_of_it() -> None:
-    peer = PeerRack("b")
-    assert peer.presence is Presence.AWAITED
-    peer.goes(OLD, 3)
-    assert peer.presence is Presence.AWAITED
-    peer.comes(OLD, 5)
-    assert (peer.presence, peer.since, peer.launches, alarms(peer)) == (Presence.THERE, 5, 1, [])
-    peer.goes(OLD, 9)
-    assert (peer.presence, peer.since, peer.losses, alarms(peer)) == (
-        Presence.LOST,
-        9,
-        1,
-        [Alarm.PEER_LOST],
-    )
-
-
 def test_a_partition_is_not_a_restart() -> None:
     peer = PeerRack("b")
     peer.comes(OLD, 5)
@@ -63,28 +47,7 @@ def test_a_new_launch_replaces_one_whose_token_has_not_expired() -> None:
     assert (peer.launch, peer.launches) == (NEW, 2)
 
 
-def test_of_two_tokens_seen_at_once_the_one_that_stays_is_there() -> None:
-    for first, second in ((OLD, NEW), (NEW, OLD)):
-        peer = PeerRack("b")
-        peer.comes(first, 0)
-        peer.comes(second, 0)
-        peer.goes(OLD, 80)
-        assert (peer.launch, peer.is_there, peer.launches) == (NEW, True, 2)
-
-
-def test_a_new_launch_after_a_loss_is_a_restart_even_if_the_old_token_was_never_seen_to_go() -> (
-    None
-):
-    peer = PeerRack("b")
-    peer.comes(OLD, 5)
-    peer.goes(OLD, 9)
-    peer.comes(NEW, 20)
-    assert alarms(peer) == [Alarm.PEER_LOST, Alarm.PEER_RESTARTED]
-    assert (peer.launches, peer.losses) == (2, 1)
-
-
 def taken(changes: list[tuple[str, int, bool]]) -> Iterator[tuple[str, int, bool]]:
-    """Take the changes out of a list."""
     while changes:
         yield changes.pop(0)
 
@@ -129,14 +92,6 @@ def test_a_rack_that_ended_while_the_adapter_was_away_is_lost_in_time() -> None:
     assert [finding.alarm for finding in peers.look(100)] == [Alarm.PEER_LOST]
     assert peers.lost == ["b"]
     assert peers.look(101) == []
-
-
-def test_a_launch_that_came_while_the_adapter_was_away_is_a_restart() -> None:
-    peer = PeerRack("b")
-    peer.comes(OLD, 5)
-    after = restarted(peer, 100)
-    after.comes(NEW, 50)
-    assert (after.launch, after.launches, after.losses) == (NEW, 2, 1)
 
 
 def test_alarms_name_the_rack_by_its_number_and_strangers_are_no_peers() -> None:
@@ -201,14 +156,3 @@ def test_a_flood_of_tokens_is_bounded() -> None:
     for launch in range(1, 10 * REMEMBERED):
         peer.comes(launch, launch)
     assert len(peer.tokens) == REMEMBERED
-
-
-@pytest.mark.parametrize("is_there", [True, False])
-def test_a_message_of_the_peer_shows_its_launch_in_real_time_only(is_there: bool) -> None:
-    peer, message = PeerRack("b"), Message(PEER.dtype({}))
-    if is_there:
-        peer.comes(OLD, 5)
-    peer.fill(message, is_lockstep=False)
-    assert message.launch == (OLD if is_there else 0)
-    peer.fill(message, is_lockstep=True)
-    assert message.launch == 0

@@ -1,8 +1,7 @@
-"""Whole racks, each with its own certificate: over TLS, and where only their seals prove it."""
+"""Racks whose seals alone prove who they are: what another one sends in their name is refused."""
 
 from __future__ import annotations
 
-import signal
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -11,8 +10,6 @@ import pytest
 from rack.backplane.errors import BackplaneError
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
-from rack.boards.config import load, resolve
-from rack.boards.errors import ConfigError
 from rack.tools.network.certificates import make_credentials
 from tests.boards.lan.forger import FORGED, LATER
 from tests.boards.lan.racks import LAUNCH_S, configs, endpoints, rack_text, started
@@ -21,21 +18,6 @@ from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 ROUNDS = 20
-
-
-@pytest.fixture
-def names(rack_name: str, tmp_path: Path) -> list[str]:
-    """Two racks with certificates; the second connects to the first. Their configs are rack-0.toml
-    and rack-1.toml."""
-    names = [f"{rack_name}-{end}" for end in "ab"]
-    make_credentials(tmp_path / "certs", {name: ["127.0.0.1"] for name in names}, 1)
-    at, own = endpoints(1)[0].replace("tcp", "tls"), 'certificates = "certs"'
-    texts = [
-        rack_text(names[0], at, (), names[1], lan=own),
-        rack_text(names[1], "", (at,), names[0], lan=own),
-    ]
-    configs(texts, tmp_path)
-    return names
 
 
 def taken(rack: str) -> int:
@@ -48,23 +30,6 @@ def taken(rack: str) -> int:
         finally:
             segment.close()
     return 0
-
-
-def test_racks_exchange_mailboxes(names: list[str], tmp_path: Path) -> None:
-    with ExitStack() as stack:
-        racks = [stack.enter_context(started(tmp_path / f"rack-{at}.toml")) for at in range(2)]
-        wait_until(lambda: all(taken(name) > 3 for name in names), LAUNCH_S)
-        for rack in racks:
-            rack.send(signal.SIGTERM)
-        for rack in racks:
-            assert rack.outcome()["cause"] == "stopped"
-
-
-def test_a_rack_under_another_name_needs_another_certificate(
-    names: list[str], tmp_path: Path
-) -> None:
-    with pytest.raises(ConfigError, match=rf"{names[0]}x\.pem: missing"):
-        resolve(load(tmp_path / "rack-0.toml", [f"name={names[0]}x"]))
 
 
 def test_a_rack_that_speaks_in_the_name_of_another_is_refused(

@@ -14,7 +14,7 @@ from rack.backplane.segment import Segment
 from rack.boards.run.board import CANNOT_GO_ON, SELF_TEST_FAILED, enter
 from rack.levels.errors import CannotGoOn, LevelError
 from tests.backplane.bus import task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, forked
 
 
@@ -54,18 +54,13 @@ def ended(segment: Segment, board: Callable[[Segment], int]) -> tuple[int, str]:
     ],
 )
 def test_the_status_says_why_a_board_cannot_go_on(
-    make_bus: MakeBus,  # noqa: F811
-    error: Exception,
-    status: int,
-    said: str,
+    make_bus: MakeBus, error: Exception, status: int, said: str
 ) -> None:
     assert ended(make_bus(task("level")), raising(error)) == (status, said)
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_a_mistake_in_a_level_ends_its_board_with_a_traceback(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_mistake_in_a_level_ends_its_board_with_a_traceback(make_bus: MakeBus) -> None:
     status, said = ended(make_bus(task("level")), raising(ZeroDivisionError("by zero")))
     assert status == 1
     assert said.startswith("board 'level' failed:\nTraceback")
@@ -73,9 +68,7 @@ def test_a_mistake_in_a_level_ends_its_board_with_a_traceback(
 
 
 @pytest.mark.filterwarnings(FORKS)
-def test_a_board_that_ends_in_order_has_its_own_status_and_name(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_board_that_ends_in_order_has_its_own_status_and_name(make_bus: MakeBus) -> None:
     def board(segment: Segment) -> int:
         os.write(2, Path("/proc/self/comm").read_bytes())
         return 7

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import gc
-import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import pytest
 
 from rack.backplane import semaphores
-from rack.backplane.errors import MailboxError
 from rack.backplane.fault_table import FaultTable, Injection, Stage
-from rack.backplane.mailbox.protocols import MailboxLock, open_writer
+from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.process import die_with_parent, set_priority, take_processor
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import Flag, trace_ring
 from rack.backplane.words import Block, Slot, System
@@ -25,9 +20,8 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.run import control_loop
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
-from tests.backplane.bus import task as task_spec
 from tests.boards.conftest import MakeConfig
-from tests.processes import FORKS, exit_status, fork, runs, wait_until
+from tests.processes import FORKS
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 TROUBLE = Flag.MISSED | Flag.SKIPPED | Flag.BUS_ERROR | Flag.CORRUPT
@@ -51,7 +45,6 @@ class Bench:
         self.segment.words[System.EPOCH_NS] = time.monotonic_ns() - tick * HOUR_NS - HOUR_NS // 2
 
     def task(self, name: str) -> VirtualControlLoop | PlannerLoop:
-        """Return a task, ready to cycle."""
         wiring = next(wiring for wiring in self.plan.tasks if wiring.task == name)
         if name.endswith(".planner"):
             return PlannerLoop(
@@ -82,29 +75,6 @@ def bench(config: MakeConfig) -> Iterator[MakeBench]:
         semaphores.unlink(found.plan.layout)
         unlink(found.segment.rack)
         found.segment.close()
-
-
-def test_a_cycle_in_time_has_no_trouble(bench: MakeBench) -> None:
-    rack = bench()
-    wave = rack.task("wave")
-    for tick in range(3):
-        rack.to(tick)
-        wave.cycle(tick)
-    assert rack.flags("wave") == [Flag(0)] * 3
-    assert [rack.segment.block("wave")[w] for w in (Block.CYCLES, Block.DONE, Block.MISSED)] == [
-        3,
-        2,
-        0,
-    ]
-
-
-def test_a_cycle_after_its_deadline_is_a_miss(bench: MakeBench) -> None:
-    rack = bench()
-    wave = rack.task("wave")
-    rack.to(1)
-    wave.cycle(0)
-    assert rack.flags("wave") == [Flag.MISSED]
-    assert rack.segment.block("wave")[Block.MISSED] == 1
 
 
 def test_a_slow_level_may_use_its_whole_cycle(bench: MakeBench) -> None:
@@ -211,53 +181,6 @@ def test_a_release_without_a_plan_is_traced_after_skipped_ones(
         5,
         1,
     ]
-
-
-def test_a_second_writer_of_a_mailbox_is_refused(bench: MakeBench) -> None:
-    rack = bench()
-    writer = open_writer(rack.segment, "wave.status")
-    with pytest.raises(MailboxError, match=r"'wave\.status' has a writer already"):
-        rack.task("wave")
-    writer.close()
-    rack.task("wave")
-
-
-def test_a_board_takes_its_core_and_stops_its_garbage_collector() -> None:
-    core = max(os.sched_getaffinity(0))
-
-    def take() -> bool:
-        priority = take_processor(replace(task_spec("board"), core=core))
-        return os.sched_getaffinity(0) == {core} and priority == 0 and not gc.isenabled()
-
-    assert exit_status(fork(take)) == 0
-
-
-def test_ordinary_scheduling_is_never_refused() -> None:
-    assert set_priority(0)
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
-
-
-def test_a_board_dies_with_its_crate() -> None:
-    reading, writing = os.pipe()
-
-    def crate() -> None:
-        parent = os.getpid()
-
-        def board() -> None:
-            die_with_parent(parent)
-            os.write(writing, b"%d\n" % os.getpid())
-            time.sleep(60)
-
-        fork(board)
-        time.sleep(60)
-
-    pid = fork(crate)
-    with os.fdopen(reading) as lines:
-        board = int(lines.readline())
-    os.close(writing)
-    os.kill(pid, 9)
-    assert exit_status(pid) == -9
-    wait_until(lambda: not runs(board))
 
 
 def test_a_pause_in_reading_is_noted_in_a_cycle_that_begins_late(bench: MakeBench) -> None:

@@ -70,7 +70,6 @@ class Heard(NamedTuple):
 
 
 def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()) -> Heard:
-    """Run the rack for `TICKS`."""
     found = config(*settings, text=RACK).model_copy(update={"fault": faults})
     with Rack(found) as rack:
         outcome = rack.run(SECONDS)
@@ -137,15 +136,6 @@ def test_runs_with_a_full_inbox_and_killed_boards_repeat(
     assert first.cycle[-1].max() > TICKS - 10
 
 
-def test_a_restarted_reader_finds_its_inbox_as_it_was(config: MakeConfig) -> None:
-    killed = (FaultConfig(kind="kill", board="hub", tick=31),)
-    calm = run(config, SMALL, "supervision.lockstep_restart_s=0.02")
-    back = run(config, SMALL, "supervision.lockstep_restart_s=0.02", faults=killed)
-    ticks = back.written.messages["hub.status"]["tick"]
-    assert len(ticks) < TICKS
-    assert (back.cycle[ticks > 40] == calm.cycle[ticks[ticks > 40]]).all()
-
-
 def test_messages_that_faults_strike_cost_the_same_on_every_run(config: MakeConfig) -> None:
     faults = tuple(
         FaultConfig(kind=kind, board="figure3", tick=tick, cycles=10)  # type: ignore[arg-type]
@@ -162,17 +152,6 @@ def test_messages_that_faults_strike_cost_the_same_on_every_run(config: MakeConf
     assert first.counts == second.counts
     assert first.counts[0] != BOARDS * (TICKS - 1)
     assert first.cycle[-1, 3] == TICKS - 2
-
-
-def test_real_time_is_lockstep_up_to_its_first_miss(config: MakeConfig) -> None:
-    exact = run(config, SMALL)
-    for _ in range(2):
-        real = run(config, SMALL, "clock.mode=realtime", "clock.speed=0.5")
-        same = real.written.first_miss(TICKS)
-        assert real.written.until(same) == exact.written.until(same)
-        if same == TICKS:
-            assert real.digest == exact.digest
-            return
 
 
 def test_in_real_time_interrupts_take_the_reading_boards_processor(config: MakeConfig) -> None:

@@ -3,9 +3,7 @@ restarts."""
 
 from __future__ import annotations
 
-import re
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
@@ -13,12 +11,10 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.config.timing import rack_timing
-from rack.boards.faults.config import FaultConfig
 from rack.levels.timing.schedule import simulate
-from rack.tools.timing.charts.gantt import Subject, gantt_of
-from rack.tools.timing.charts.window import WindowOptions
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
+from tests.boards.runs import faulty, kill
 
 BOARD = """
 [board.{name}]
@@ -72,10 +68,7 @@ def test_a_static_cyclic_schedule_runs_in_its_order_and_repeats(config: MakeConf
         (int(row["tick"]), name) for name, rows in found.cycles.items() for row in rows
     )
     assert released == [(tick, ("wave", "left", "wave", "right")[tick % 4]) for tick in range(100)]
-
-
-def test_messages_are_visible_by_ticks_whatever_the_phases(config: MakeConfig) -> None:
-    found = written(Rack(config(text=cyclic())))
+    # Messages are visible by ticks, whatever the phases.
     for name, below in (("left", "wave"), ("right", "left")):
         made, seen = found.messages[f"{below}.status"], found.messages[f"{name}.status"]
         every = MINOR[below][0]
@@ -103,13 +96,11 @@ def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("victim", ["left", "wave"])
-def test_a_restart_keeps_the_phase(config: MakeConfig, victim: str) -> None:
+def test_a_restart_keeps_the_phase(config: MakeConfig) -> None:
     plain = config("supervision.lockstep_restart_s=0.06", text=cyclic())
-    kill = FaultConfig(kind="kill", board=victim, tick=42)
-    rack = Rack(plain.model_copy(update={"fault": (kill,)}))
-    ticks = written(rack, 0.5).cycles[victim]["tick"].tolist()
-    every, phase, _ = MINOR[victim]
+    rack = Rack(faulty(plain, kill("left", 42)))
+    ticks = written(rack, 0.5).cycles["left"]["tick"].tolist()
+    every, phase, _ = MINOR["left"]
     assert ticks[0] == phase
     assert {tick % every for tick in ticks} == {phase}
     steps = [later - earlier for earlier, later in pairwise(ticks)]
@@ -128,24 +119,3 @@ def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
         # What was not taken was skipped, and counted.
         last = int(rows["tick"][-1])
         assert len(rows) + block[Block.SKIPPED] == (last - phase) // every + 1
-
-
-def test_gantt_draws_the_cyclic_schedule_without_preemption(
-    config: MakeConfig, tmp_path: Path
-) -> None:
-    found = config(text=cyclic())
-    gantt = gantt_of(
-        Subject(found, wire(found), None, tmp_path),
-        WindowOptions(),
-        {},
-        lambda part: None,
-    )
-    text = gantt.text()
-    rows = [line.split()[-1] for line in text.splitlines() if line.startswith("core 0 ")]
-    # One stretch of each job, from its release on: the first of the watch "right" is at tick 3.
-    stretches = [[match.start() for match in re.finditer("X+", row)] for row in rows]
-    assert [len(found) for found in stretches] == [4, 2, 2]
-    tick = (stretches[0][1] - stretches[0][0]) / 2
-    assert [found[0] / tick for found in stretches] == pytest.approx([0, 1, 3], abs=1 / tick)
-    assert "wave: X -: 20 of 20 cycles" in text
-    assert "right: X -: 10 of 10 cycles" in text

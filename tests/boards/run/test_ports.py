@@ -57,13 +57,6 @@ def test_a_slow_output_that_stops_is_mute_after_three_of_its_periods(link: MakeL
     assert 63 + 3 * 8 <= tick <= 63 + 4 * 8
 
 
-def test_delayed_messages_of_a_slow_output_arrive_between_its_own(link: MakeLink) -> None:
-    rack = link(cycles=4)
-    rack.fault("delay", 1)
-    rack.run(0, 32)
-    assert [released for released, _, _ in rack.written()] == [3, 7, 11, 15, 19, 23, 27]
-
-
 def test_a_forged_message_in_a_tasks_own_mailbox_is_reported_once_an_episode(
     link: MakeLink,
 ) -> None:
@@ -79,12 +72,3 @@ def test_a_forged_message_in_a_tasks_own_mailbox_is_reported_once_an_episode(
             rack.writer.cycle(tick)
         rung.append([code for _, code in rack.alarms("writer")])
     assert rung == [[Alarm.MASQUERADE]] * 2
-
-
-def test_a_tasks_traffic_is_what_it_wrote_and_read(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 5)
-    size = rack.segment.layout.mailbox(NAME).size
-    assert rack.writer.ports.traffic == (5, 5 * size)
-    accesses, read = rack.reader.ports.traffic
-    assert (accesses, read) == (5, 4 * size)

@@ -15,7 +15,6 @@ from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import FIELDS, TraceWriter
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.words import Block
 from rack.boards.faults import messages
 from rack.boards.faults.kind import KINDS
 from rack.boards.run.ports import InputPorts, OutputPorts
@@ -72,7 +71,6 @@ class QueueLink:
         self._trace.write(*record.values())
 
     def read(self, tick: int) -> Reading:
-        """Do the reader's cycle."""
         self.reads.read(tick)
         reading: Reading = self.reads.values.point
         if reading.is_new:
@@ -97,7 +95,6 @@ class QueueLink:
         return [Alarm(row["code"]) for row in self._rings[name].drain().rows]
 
     def fault(self, kind: str, *parameters: float) -> FaultEntry:
-        """Write with this fault from now on."""
         values = [p.default or 0.0 for p in KINDS[kind].parameters]
         entry = FaultTable(self.segment).add(
             Injection(
@@ -112,7 +109,6 @@ class QueueLink:
         return entry
 
     def close(self) -> None:
-        """Give the bus back."""
         for writer in self.ports.writers.values():
             writer.close()
         for reader in self.reads.readers.values():
@@ -140,15 +136,6 @@ def link(rack_name: str) -> Iterator[MakeQueue]:
     yield make
     for one in made:
         one.close()
-
-
-def test_no_message_of_a_burst_is_lost_to_a_slower_reader(link: MakeQueue) -> None:
-    # 10 Hz, three motions a cycle, a reader at 4 Hz: it would sample 9 of 27.
-    rack = link(32, rates=(10, 25))
-    rack.run(0, 90, lambda tick: 3)
-    rack.run(90, 200, lambda tick: 0)
-    assert rack.taken == [*range(1, 28)]
-    assert rack.refused == rack.alarms("writer") == rack.alarms("reader") == []
 
 
 @settings(max_examples=40, deadline=None)
@@ -201,13 +188,6 @@ def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
     assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
 
 
-def test_room_comes_back_one_cycle_of_the_reader_after_it_has_taken(link: MakeQueue) -> None:
-    rack = link(1, rates=(1, 4))
-    rack.run(0, 17, lambda tick: 1)
-    # Sent at 0, taken at 4, known from 8 on.
-    assert [serial - 1 for serial in range(1, 18) if serial not in rack.refused] == [0, 8, 16]
-
-
 def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) -> None:
     rack = link(2, sends=False)
     for tick in range(6):
@@ -219,16 +199,6 @@ def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) 
     assert rack.taken == [1, 2]
     assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
     assert [rack.read(9).value.id, rack.taken] == [6, [1, 2, 5, 6]]
-
-
-def test_silence_of_the_writer_proves_nothing_but_its_loss_counts(link: MakeQueue) -> None:
-    rack = link()
-    rack.run(0, 4, lambda tick: 1)
-    rack.run(4, 200, lambda tick: 0)
-    assert not rack.read(200).is_lost
-    rack.segment.block("writer")[Block.LOST] = 201
-    assert [rack.read(200).is_lost, rack.read(201).is_lost] == [False, True]
-    assert rack.alarms("reader") == []
 
 
 FOUND = {
@@ -269,7 +239,6 @@ def test_a_fault_that_nothing_would_show_does_not_strike_a_queue(
 
 
 def forge(rack: QueueLink, tick: int) -> None:
-    """Publish a forged message from another process."""
     assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
 
 

@@ -18,33 +18,19 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.words import Block, Demand, System, TaskState
-from rack.boards import Rack
+from rack.backplane.words import Block, Demand, System, TaskState, switch
 from rack.boards.config.layout import field_specs
-from rack.boards.faults.config import FaultConfig
 from rack.boards.operator import hold
 from rack.boards.run.system_controller import EndOfRun, SystemController
 from rack.boards.wiring import ClockWiring
 from rack.levels.messages import TASK_STATUS
 from rack.levels.operator import OPERATOR_COMMAND, Operation
 from tests.backplane.bus import mailbox, task
-from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
-from tests.boards.conftest import MakeConfig
+from tests.backplane.conftest import MakeBus
 from tests.tools.faults.test_ending import box
 
 RESTART_TICKS = 200
 """Ticks of 2.5 ms after which a board comes back in lockstep: 0.5 s."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("tick", [0, 1])
-def test_a_board_that_dies_at_the_first_ticks_comes_back(config: MakeConfig, tick: int) -> None:
-    fault = FaultConfig.model_validate({"kind": "kill", "board": "wave", "tick": tick})
-    with Rack(config().model_copy(update={"fault": (fault,)})) as rack:
-        outcome = rack.run(1.0)
-    assert (outcome.cause, outcome.worked) == ("time over", True)
-    back = [event for event in rack.events if event.code == "rejoined"]
-    assert [(event.board, event.tick) for event in back] == [("wave", tick + RESTART_TICKS)]
 
 
 def wiring(**changed: object) -> ClockWiring:
@@ -97,7 +83,7 @@ class Controlled:
 BOARDS = task("left"), task("right", slot=3)
 
 
-def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> None:  # noqa: F811
+def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> None:
     rack = Controlled(make_bus(*BOARDS))
     assert rack.demand(0) is Demand.NONE
     rack.lose("left", 3)
@@ -113,9 +99,18 @@ def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> Non
     assert values == [Demand.STOP, Demand.BRAKE, 2, Demand.STOP, 6, Demand.NONE]
 
 
-def test_a_command_whose_client_has_died_is_not_issued_and_says_so(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_the_clock_follows_the_network_adapter_at_its_tick(make_bus: MakeBus) -> None:
+    rack = Controlled(make_bus(*BOARDS))
+    rack.words[System.PEER_STOP] = switch(5, True)
+    assert [rack.demand(tick) for tick in (4, 5, 6)] == [Demand.NONE, Demand.STOP, Demand.STOP]
+    rack.words[System.PEER_STOP] = switch(9, False)
+    assert rack.demand(8) is Demand.STOP
+    # A switch that lies ahead is waited for tick by tick.
+    assert rack.controller.rests_until(8) == 9
+    assert rack.demand(9) is Demand.NONE
+
+
+def test_a_command_whose_client_has_died_is_not_issued_and_says_so(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox(name="left.operator", writer="clock"), *BOARDS)
     rack, table = Controlled(segment), OperatorTable(segment)
     claim = table.enter(Request(0, b"", tick=2))
@@ -132,9 +127,7 @@ def test_a_command_whose_client_has_died_is_not_issued_and_says_so(
 @pytest.mark.parametrize("is_released", [False, True])
 @pytest.mark.parametrize("is_restarted", [False, True])
 def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
-    make_bus: MakeBus,  # noqa: F811
-    is_released: bool,
-    is_restarted: bool,
+    make_bus: MakeBus, is_released: bool, is_restarted: bool
 ) -> None:
     fields = field_specs(OPERATOR_COMMAND, {})
     size = OPERATOR_COMMAND.dtype({}).itemsize
@@ -164,19 +157,8 @@ def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     assert not table.leased()
 
 
-def test_the_emergency_stop_engages_brakes_until_it_is_released(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    rack = Controlled(make_bus(*BOARDS))
-    assert rack.demand(0) is Demand.NONE
-    rack.words[System.EMERGENCY_STOP] = 1
-    assert rack.demand(1) is Demand.BRAKE
-    rack.words[System.EMERGENCY_STOP] = 0
-    assert rack.demand(2) is Demand.NONE
-
-
 def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come_to_rest(
-    make_bus: MakeBus,  # noqa: F811
+    make_bus: MakeBus,
 ) -> None:
     rack = Controlled(make_bus(*BOARDS))
     rack.lose("left", 3)
@@ -190,9 +172,7 @@ def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come
     assert rack.words[System.STOP_TICK] == 14
 
 
-def test_the_controller_rests_until_the_run_may_end_unless_it_has_work(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_the_controller_rests_until_the_run_may_end_unless_it_has_work(make_bus: MakeBus) -> None:
     status = replace(box(TASK_STATUS, "task.status"), every=8, delay=8)
     bus = make_bus(*BOARDS, task("task", every=8, slot=4), status)
     rack = Controlled(bus, ends_run="task.status")
@@ -225,23 +205,19 @@ def ends_at(
 
 
 @pytest.mark.parametrize("state", [State.DONE, State.ERROR])
-def test_a_run_lingers_after_its_task_has_ended(make_bus: MakeBus, state: State) -> None:  # noqa: F811
+def test_a_run_lingers_after_its_task_has_ended(make_bus: MakeBus, state: State) -> None:
     found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), state, 5, 12)
     # Visible at 6, seen at 7 as of the tick before; ten ticks of rest.
     assert found == [None] * 7 + [16] * 5
 
 
-def test_a_run_whose_task_goes_on_ends_once_its_level_is_silent(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_run_whose_task_goes_on_ends_once_its_level_is_silent(make_bus: MakeBus) -> None:
     found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), State.EXECUTING, 5, 60)
     # Heard as of tick 6; silent for 40 ticks as of 46, which is seen at 47.
     assert found == [None] * 47 + [56] * 13
 
 
-def test_a_run_of_given_length_ends_there_whatever_its_task_does(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
+def test_a_run_of_given_length_ends_there_whatever_its_task_does(make_bus: MakeBus) -> None:
     found = ends_at(
         make_bus(box(TASK_STATUS, "task.status"), task("task")), State.DONE, 5, 12, stop_tick=99
     )

@@ -25,10 +25,8 @@ SNAPSHOTS = Snapshots(__file__)
 RACKS = (
     "nasrem.toml",
     "cyclic.toml",
-    "condor/condor.toml",
     "brown/one-machine.toml",
     "cell/puma.toml",
-    "rccl/rccl.toml",
     "fig4.toml",
 )
 SKIPPED = {"name", "python_path", "format", "joints", "task", "mesh", "model", "seed"}

@@ -16,22 +16,6 @@ MISTAKES = {
         ["host.program.rate_hz=10"],
         "host.program.rate_hz = 10: unknown key; known: program, external, below",
     ),
-    "a priority": (
-        ["host.program.priority=3"],
-        "host.program.priority = 3: unknown key; known: program",
-    ),
-    "no program": (
-        ["host.program.program=host_programs:Adder"],
-        "has no HostProgram named 'Adder'; it has: Console, ",
-    ),
-    "the name of a board": (
-        [f"host.adder={{ program = '{IDLE}' }}"],
-        "host.adder: board.adder has this name",
-    ),
-    "a name": (
-        [f"host.own={{ program = '{IDLE}' }}"],
-        "host.own: invalid name for a board; permitted: a-z",
-    ),
     "where determinism is demanded": (
         ["protocol.strict=true"],
         (
@@ -122,21 +106,6 @@ def test_a_mistake_is_one_line(name: str) -> None:
         resolve(loads(to_toml(override(parse(HOSTED), settings))))
     (mistake,) = error.value.mistakes
     assert line in str(mistake)
-
-
-def test_a_bridge_and_its_host_boards_are_in_the_layout() -> None:
-    resolved = resolve(loads(HOSTED))
-    layout = resolved.layout
-    assert [host.name for host in layout.hosts] == ["program"]
-    assert [task.name for task in layout.tasks] == ["bridge", "adder"]
-    boxes = {box.name: (box.writer, box.readers, box.protocol) for box in layout.mailboxes}
-    assert boxes["program.numbers"] == ("program", ("bridge",), "queue")
-    assert boxes["bridge.numbers"] == ("bridge", ("adder",), "queue")
-    assert boxes["bridge.sum"] == ("bridge", ("program",), "time-slice")
-    assert {box.name for box in layout.timed} == set(boxes) - {"program.numbers"}
-    bridge = next(task for task in resolved.tasks if task.task == "bridge")
-    assert dict(bridge.inputs) == {"sum": "adder.status"}
-    assert set(bridge.outputs) == {"numbers", "status"}
 
 
 def test_a_host_board_with_a_mistake_hides_none_of_another_and_causes_none() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load, resolve
-from rack.boards.config.reference import key_tables
 from rack.boards.config.resolved import loads
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.errors import ConfigError
@@ -25,24 +24,6 @@ MISTAKES = {
             " the adapter; nearest: 12.5 Hz (every 4 cycles), 16.67 Hz (every 3 cycles)"
         ),
     ),
-    "a rate above the adapter's": (
-        ["adapter.lan.rate_hz=20", "adapter.lan.export.pulse.rate_hz=10"],
-        (
-            "adapter.lan.import.other.rate_hz = 50.0: exchange: 50 Hz does not divide the 20 Hz of"
-            " the adapter; nearest: 20 Hz (every 1 cycle)"
-        ),
-    ),
-    "a rate of which one neighbour is beyond 50 Hz": (
-        [
-            "adapter.lan.rate_hz=66.67",
-            "adapter.lan.import.other.rate_hz=45",
-            "adapter.lan.export.pulse.rate_hz=33.33",
-        ],
-        (
-            "adapter.lan.import.other.rate_hz = 45.0: exchange: 45 Hz does not divide the"
-            " 66.6667 Hz of the adapter; nearest: 33.33 Hz (every 2 cycles)"
-        ),
-    ),
     "the adapter's rate": (
         [
             "adapter.lan.rate_hz=33",
@@ -50,17 +31,6 @@ MISTAKES = {
             "adapter.lan.export.pulse.rate_hz=33",
         ],
         "adapter.lan.rate_hz: level 'lan': 33 Hz does not divide the 400 Hz clock",
-    ),
-    "a rate beyond 50 Hz": (
-        ["adapter.lan.import.other.rate_hz=60"],
-        (
-            "adapter.lan.import.other.rate_hz = 60: should be less than or equal to 50; rate of the"
-            " exchange"
-        ),
-    ),
-    "a rate off the grid of a board that is exported": (
-        ["board.pulse.rate_hz=33"],
-        "board.pulse.rate_hz: level 'pulse': 33 Hz does not divide the 400 Hz clock",
     ),
     "a servo loop": (
         ["board.pulse.rate_hz=400"],
@@ -126,10 +96,6 @@ MISTAKES = {
             " message type 'PLUSE'"
         ),
     ),
-    "an unknown module": (
-        ["adapter.lan.import.other.type=lan_lewels:PULSE"],
-        "adapter.lan.import.other.type = \"lan_lewels:PULSE\": cannot import 'lan_lewels'",
-    ),
     "a type with sizes of an arm": (
         [
             "adapter.lan.import.more={ from = 'two/servo.command', type ="
@@ -158,10 +124,6 @@ MISTAKES = {
             " levels may read"
         ),
     ),
-    "an export twice": (
-        ["adapter.lan.export.again={ from = 'pulse.status' }"],
-        'adapter.lan.export = "pulse.status": listed 2 times: pulse, again',
-    ),
     "a port of the adapter's own": (
         [
             "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms ="
@@ -169,23 +131,9 @@ MISTAKES = {
         ],
         "adapter.lan.import.status: the adapter writes its status under this name; rename the port",
     ),
-    "a port of a peer": (
-        [
-            "adapter.lan.import.peer_two={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms"
-            " = 500 }"
-        ],
-        (
-            "adapter.lan.import.peer_two: the adapter writes what it knows of rack 'two' under this"
-            " name; rename the port"
-        ),
-    ),
     "a board of its name": (
         ["board.lan={ slot = 9, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
         "board.lan: [adapter.lan] makes the board of this name; rename the board, or leave one out",
-    ),
-    "a host board of its name": (
-        ["host.lan={ program = 'rack.levels.host_program:HostProgram' }"],
-        "host.lan: adapter.lan has this name already",
     ),
     "a board that is the adapter": (
         ["board.net={ slot = 9, rate_hz = 50, executor = 'rack.boards.lan.adapter:LanAdapter' }"],
@@ -193,14 +141,6 @@ MISTAKES = {
             'board.net.executor = "rack.boards.lan.adapter:LanAdapter": permitted: [adapter.lan],'
             " which makes its board"
         ),
-    ),
-    "a slot that is taken": (
-        ["adapter.lan.slot=2"],
-        "adapter.lan.slot = 2: already taken by board.pulse.slot",
-    ),
-    "a slot that it has taken": (
-        ["board.late={ slot = 5, rate_hz = 50, executor = 'lan_levels:Pulse' }"],
-        "adapter.lan.slot = 5: already taken by board.late.slot",
     ),
     "a priority below a neighbour's": (
         ["clock.mode=realtime", "adapter.lan.priority=40", "board.pulse.priority=40"],
@@ -214,17 +154,6 @@ MISTAKES = {
         (
             "adapter.lan: what other racks send makes a run depend on timing, refused by"
             ' protocol.strict = true; permitted: clock.mode = "lockstep"'
-        ),
-    ),
-    "an unknown key": (
-        ["adapter.lan.lisen=['tcp/127.0.0.1:7555']"],
-        "adapter.lan.lisen = ['tcp/127.0.0.1:7555']: unknown key; did you mean 'listen'?",
-    ),
-    "an unknown rule": (
-        ["adapter.lan.on_peer_loss=brake"],
-        (
-            "adapter.lan.on_peer_loss = \"brake\": should be 'hold', 'stop' or 'go on'; while a"
-            " rack that was there"
         ),
     ),
 }
@@ -257,12 +186,6 @@ def test_the_loss_of_the_adapter_is_as_bad_as_that_of_a_rack() -> None:
     for rule, on_loss in (("hold", "hold"), ("stop", "stop"), ("go on", "hold")):
         text = rack_text("one", "", [], "two", lan=f'on_peer_loss = "{rule}"')
         assert loads(text).board["lan"].on_loss == on_loss
-
-
-def test_the_schema_shows_the_table_that_users_write() -> None:
-    names = [table.name for table in key_tables(loads(TEXT))]
-    assert {"adapter.lan", "adapter.lan.import", "adapter.lan.export"} <= set(names)
-    assert not [name for name in names if name.startswith("board.lan")]
 
 
 def test_endpoints_can_be_set_for_a_run(tmp_path: Path) -> None:

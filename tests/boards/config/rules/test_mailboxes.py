@@ -14,7 +14,6 @@ from tests.boards.test_queues import QUEUES
 
 
 def mistake(text: str, *settings: str) -> str:
-    """Return the one mistake of a config."""
     with pytest.raises(ConfigError) as error:
         resolve(validated(override(parse(text), settings)))
     (found,) = error.value.mistakes

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import pytest
 
+from rack.backplane.address_map import AddressMap
 from rack.boards.config import load, resolve
+from rack.boards.config.rules import levels
 from rack.boards.errors import ConfigError, Mistake
+from tests.boards.conftest import MakeConfig
 
 Write = Callable[[str, str], Path]
 
 
 def mistakes(name: str | Path, *settings: str) -> list[Mistake]:
-    """Return everything wrong with a config."""
     with pytest.raises(ConfigError) as error:
         resolve(load(name, settings))
     return error.value.mistakes
@@ -33,8 +35,6 @@ MISTAKES = {
     "slot of the clock": ("board.upper.slot=1", "slot 1 is the clock's"),
     "slot taken": ("board.upper.slot=3", "board.lower.slot = 3: already taken by board.upper.slot"),
     "name": ("name='../x'", 'name = "../x": '),
-    "choice": ("clock.mode=fast", "'realtime' or 'lockstep'"),
-    "not finite": ("clock.speed=inf", "clock.speed = inf: should be a finite number"),
     "period": (
         "clock.period_ms=2.4999995",
         "clock.period_ms = 2.4999995: not a whole number of ns",
@@ -46,37 +46,15 @@ MISTAKES = {
             " (every 6 ticks)"
         ),
     ),
-    "rate above the clock": ("board.upper.rate_hz=1000", "nearest: 400 Hz (every 1 tick)"),
+    "rate and period": ("board.upper.every=4", "every is also given"),
     "speed in lockstep": ("clock.speed=2", "clock.speed = 2.0: lockstep runs as fast as it can"),
     "neighbour": (
         "board.lower.above=uper",
         'board.lower.above = "uper": no other board has this name; boards: upper',
     ),
-    "circle below": ("board.lower.below=upper", "the levels form a circle, "),
-    "circle above": ("board.upper.above=lower", "the levels form a circle, "),
     "truth for a number": (
         "clock.period_ms=true",
         "clock.period_ms = true: should be a valid number; tick period, ms",
-    ),
-    "text for a number": (
-        "board.upper.core='1'",
-        'board.upper.core = "1": should be a valid integer',
-    ),
-    "number for a truth": (
-        "board.upper.ends_run=1",
-        "board.upper.ends_run = 1: should be a valid boolean",
-    ),
-    "very short tick": (
-        "clock.period_ms=1e-6",
-        "should be greater than or equal to 0.01; tick period, ms",
-    ),
-    "very fast": (
-        "clock.speed=1e300",
-        "clock.speed = 1e+300: should be less than or equal to 1000; simulated time",
-    ),
-    "very slow": (
-        "clock.speed=1e-300",
-        "clock.speed = 1e-300: should be greater than or equal to 0.001",
     ),
     "short tick in real time": (
         "clock={ mode = 'realtime', speed = 500 }",
@@ -86,25 +64,9 @@ MISTAKES = {
         "board.lower={ rate_hz = 1e-5 }",
         "a cycle would take 40000000 ticks; permitted: up to 1000000",
     ),
-    "rate near zero": (
-        "board.lower={ rate_hz = 5e-324 }",
-        "board.lower.rate_hz = 5e-324: should be greater than or",
-    ),
-    "phase": (
-        "board.upper.phase=8",
-        "board.upper.phase = 8: must be less than the board's period; permitted: 0 to 7",
-    ),
-    "phase below zero": (
-        "board.upper.phase=-1",
-        "board.upper.phase = -1: should be greater than or equal to 0; first",
-    ),
     "port of no executor": (
         "board.upper.exchange={ command = { every = 2 } }",
         "board.upper.exchange.command: no such port of the executor; ports: status",
-    ),
-    "exchange never": (
-        "board.upper.exchange={ status = { every = 0 } }",
-        "exchange.status.every = 0: should be gr",
     ),
     "exchange in no cycle": (
         "board.upper.exchange={ status = { every = 3, phase = 3 } }",
@@ -117,7 +79,6 @@ MISTAKES = {
             " permitted: 1"
         ),
     ),
-    "own neighbour": ("board.lower.above=lower", "no other board has this name"),
     "coupling": ("board.lower.coupling=none", 'permitted: "tight" or "loose" with a planner'),
     "no planner": ("board.upper.coupling=tight", 'permitted: "none" without a planner'),
     "loose": (
@@ -138,18 +99,9 @@ MISTAKES = {
         "board.upper.executor=two_levels:Stateless",
         "board.upper.ends_run = true: its status has no field 'state' of State",
     ),
-    "board name": (
-        "board.own={ slot = 4, every = 1, executor = 'two_levels:Upper', below = 'lower' }",
-        "invalid name for a board",
-    ),
-    "no class name": ("board.upper.executor=two_levels", "package.module:Class"),
     "moving what is not there": (
         "scene.motion=[{ body = 'bar', at = 1, to = [0, 0, 0] }]",
         "no such obstacle",
-    ),
-    "pushing what is not there": (
-        "scene.push=[{ body = 'bar', at = 1, seconds = 1, force = [0, 0, 1] }]",
-        "no such object",
     ),
     "no module": (
         "board.upper.executor='no_levels:Upper'",
@@ -158,17 +110,6 @@ MISTAKES = {
     "no method": (
         "board.upper.executor='two_levels:Unfinished'",
         "class 'Unfinished' lacks: process",
-    ),
-    "no class": (
-        "board.upper.executor='two_levels:Uper'",
-        (
-            "has no class 'Uper'; it has: Crashing, Lower, PlanWriter, Programmed, Reasonless,"
-            " Stateless, Unfinished, Upper"
-        ),
-    ),
-    "no executor": (
-        "board.upper.executor='two_levels:LowerPlanner'",
-        "has no Executor named 'LowerPlanner'",
     ),
     "nobody writes": (
         "board.upper.reads={ status = 'lower.state' }",
@@ -203,71 +144,18 @@ def test_a_mistake_is_reported_alone_with_place_value_and_what_is_permitted(
     assert expected in str(mistake)
 
 
-def test_all_mistakes_are_reported_at_once_wherever_they_are(small: Path) -> None:
-    found = mistakes(
-        small,
-        "clock.wake=sleep",
-        "board.upper.core=-1",
-        "board.lower.planner_slot=9",
-        "board.lower.above=uper",
-        "board.lower.planner='two_levels:Nobody'",
-    )
-    assert {mistake.place for mistake in found} >= {
-        "clock.wake",
-        "board.upper.core",
-        "board.lower.planner_slot",
-        "board.lower.above",
-        "board.lower.planner",
-    }
-
-
-def test_mistakes_of_tables_model_scene_faults_and_commands_are_reported_together(
-    write: Write,
-) -> None:
+def test_names_that_a_model_lacks_are_reported_together_with_those_it_has(write: Write) -> None:
     text = """
 extends = ["nasrem"]
-[clock]
-wake = "sleep"
 [robot]
 joints = ["j1", "j2", "j3", "j4", "j5", "j9"]
 tool = "palm"
 [scene]
 objects = ["block1", "block2", "peg", "cup"]
 supports = ["shelf"]
-[board.world]
-slot = 99
-[board.servo.params]
-bandwith = 3
-[[fault]]
-kind = 3
-[[fault]]
-kind = "explode"
-board = "servo"
-[[command]]
-level = 3
-[[command]]
-level = "task"
-what = "hold"
-home = true
 """
     found = {mistake.place: mistake.why for mistake in mistakes(write("mine.toml", text))}
-    # No further mistakes of tables that are broken: the world board, the first fault, the first
-    # command.
-    assert set(found) == {
-        "clock.wake",
-        "robot.joints",
-        "robot.tool",
-        "scene.objects",
-        "scene.supports",
-        "board.world.slot",
-        "board.servo.params.bandwith",
-        "fault[0].kind",
-        "fault[0].board",
-        "fault[1].kind",
-        "command[0].level",
-        "command[0].what",
-        "command[1].home",
-    }
+    assert set(found) == {"robot.joints", "robot.tool", "scene.objects", "scene.supports"}
     assert found["robot.joints"].startswith(
         "no joint 'j9' in the model; it has: j1, j2, j3, j4, j5, j6"
     )
@@ -307,16 +195,22 @@ def test_a_segment_too_large_for_any_machine_is_refused(small: Path) -> None:
         resolve(load(small, ["board.lower.rate_hz=0.001", "board.lower.within_cycles=10000"]))
 
 
-def test_a_broken_board_causes_no_mistakes_in_its_neighbours(small: Path) -> None:
-    assert [mistake.place for mistake in mistakes(small, "board.lower.slot=99")] == [
-        "board.lower.slot"
-    ]
+def test_a_phase_is_less_than_the_period(config: MakeConfig) -> None:
+    assert resolve(config("board.watch.phase=7")).layout.task("watch").phase == 7
+    with pytest.raises(ConfigError, match="permitted: 0 to 7 ticks"):
+        resolve(config("board.watch.phase=8"))
 
 
-def test_a_mistake_stays_on_one_short_line(small: Path) -> None:
-    (mistake,) = mistakes(small, f"clock.mode='{'long' * 100}'")
-    assert len(str(mistake)) < 250
-    assert "\n" not in str(mistake)
+def test_a_segment_may_have_its_largest_size(
+    config: MakeConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layout = resolve(config()).layout
+    size = AddressMap(layout).size
+    monkeypatch.setattr(levels, "MAX_SEGMENT_BYTES", size)
+    assert not [*levels.memory(layout)]
+    monkeypatch.setattr(levels, "MAX_SEGMENT_BYTES", size - 1)
+    (mistake,) = levels.memory(layout)
+    assert f"needs {size} bytes; permitted: {size - 1}" in mistake.why
 
 
 @pytest.mark.parametrize(
@@ -376,16 +270,6 @@ PARAMS = {
         "world.params.x=1",
         "= 1: unknown key; known: moved, turned, slow, resting",
     ),
-    "text": (
-        "fig2",
-        "level.params.process_ms=lock",
-        '= "lock": should be a valid number; X: the executor in a cycle',
-    ),
-    "truth": (
-        "nasrem",
-        "servo.params.bandwidth=true",
-        "= true: should be a valid number; natural frequency",
-    ),
     "range": (
         "nasrem",
         "primitive.params.braking=4",
@@ -400,11 +284,6 @@ PARAMS = {
         "nasrem",
         "task.params.settling=-1",
         "= -1: should be greater than 0; from the end",
-    ),
-    "both": (
-        "nasrem",
-        "elemental_move.params.patience=nan",
-        "= nan: should be a finite number; time that a move",
     ),
 }
 

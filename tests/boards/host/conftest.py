@@ -1,0 +1,112 @@
+"""The backplane of a rack with a bridge and a host board, without processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from rack.backplane import semaphores
+from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.watch.alarms import AlarmWriter
+from rack.boards.classes import find_class
+from rack.boards.config import resolve
+from rack.boards.config.resolved import Resolved
+from rack.boards.host.bus import HostBus
+from rack.boards.host.bus_adapter import BusAdapter
+from rack.boards.host.entries import Outward
+from rack.boards.run.ports import InputPorts, OutputPorts
+from tests.boards.conftest import MakeConfig
+from tests.boards.host.test_board import HOSTED
+
+EVERY = 4
+"""Ticks of a cycle of the bridge."""
+
+
+class Site:
+    """A backplane with the bridge's adapter and its host board's program at their ends of it."""
+
+    def __init__(self, plan: Resolved, segment: Segment) -> None:
+        self.plan = plan
+        self.segment = segment
+        self.host = segment.block("program")
+        self.adapter = self.started()
+        self.tick = -EVERY
+
+    def started(self) -> BusAdapter:
+        """Return an adapter, as a board that begins has it, with its ports."""
+        (wiring,) = (task for task in self.plan.tasks if task.task == "bridge")
+        adapter = find_class(wiring.target, BusAdapter)(wiring.context)
+        adapter.attach(self.segment, None)
+        alarms = AlarmWriter(self.segment, "bridge")
+        self.inputs = InputPorts(self.segment, wiring.inputs, alarms)
+        self.outputs = OutputPorts(self.segment, wiring.outputs, alarms, self.inputs, wiring.sent)
+        return adapter
+
+    def restart(self) -> None:
+        """Replace the adapter, as after the end of its board's process."""
+        for writer in self.outputs.writers.values():
+            writer.close()
+        for _, entry in self.adapter._entries:
+            if isinstance(entry, Outward):
+                entry._writer.close()
+        self.adapter = self.started()
+
+    def cycle(self) -> None:
+        self.tick += EVERY
+        self.inputs.read(self.tick)
+        self.adapter.process(self.inputs.values, self.outputs.messages, self.tick)
+        assert self.outputs.write(self.tick, None)
+
+    @property
+    def status(self) -> Any:
+        return open_observer(self.segment, "bridge.status").peek().value
+
+    def count(self, port: str) -> dict[str, int]:
+        """Return what the newest status counts of an entry, but for what is zero."""
+        record = getattr(self.status, port)
+        return {name: int(record[name]) for name in record.dtype.names if record[name]}
+
+    def crossed(self) -> list[float]:
+        """Return the numbers that are in the bridge's own mailbox, oldest first."""
+        reading = open_observer(self.segment, "bridge.numbers").peek()
+        values = [*reading.earlier, reading.value] if reading.is_there else []
+        return [message.value for message in values]
+
+
+MakeSite = Callable[..., Site]
+
+
+@pytest.fixture
+def make_site(config: MakeConfig) -> Iterator[MakeSite]:
+    with ExitStack() as stack:
+
+        def make(*settings: str) -> Site:
+            plan = resolve(config(*settings, text=HOSTED))
+            segment = Segment.create(plan.layout, "")
+            stack.callback(unlink, plan.layout.rack)
+            stack.callback(segment.close)
+            semaphores.create(plan.layout)
+            stack.callback(semaphores.unlink_all, plan.layout.rack)
+            semaphores.open_all(plan.layout)
+            return Site(plan, segment)
+
+        yield make
+
+
+@pytest.fixture
+def open_bus() -> Iterator[Callable[[Site], HostBus]]:
+    with ExitStack() as stack:
+
+        def open_it(site: Site) -> HostBus:
+            bus = HostBus(site.segment, site.plan.hosts[0])
+            stack.callback(bus.close)
+            return bus
+
+        yield open_it
+
+
+OpenBus = Callable[[Site], HostBus]
