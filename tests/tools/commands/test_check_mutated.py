@@ -30,61 +30,20 @@ from rack.tools.console.answer import MAX_LINE
 
 pytestmark = pytest.mark.thorough
 
-EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "300"))
+EXAMPLES = int(os.environ.get("RACK_CHECK_EXAMPLES", "150"))
 BOUND_S = 20
 """Processor time of one check, at most: the machine's load does not count."""
 
 DEEP: list[Any] = []
 for _ in range(40):
     DEEP = [DEEP]
-PLAIN = (
-    True,
-    False,
-    0,
-    1,
-    -1,
-    3,
-    99,
-    2**31,
-    2**63 - 1,
-    2**70,
-    0.0,
-    0.5,
-    2.5,
-    1e-9,
-    1e9,
-    5e-324,
-    1e300,
-    -1e300,
-)
-ODD = (
-    float("inf"),
-    float("-inf"),
-    float("nan"),
-    "",
-    "lock",
-    "servo",
-    "x" * 5000,
-    "two\nlines",
-    "a\0b",
-    "../..",
-    "~no/x",
-)
+NUMBERS = (True, False, 0, 1, -1, 3, 99, 2**31, 2**63 - 1, 2**70, 0.0, 0.5, 2.5, 1e-9, 1e9)
+EXTREME = (5e-324, 1e300, -1e300, float("inf"), float("-inf"), float("nan"))
+TEXTS = ("", "lock", "servo", "x" * 5000, "two\nlines", "a\0b", "../..", "~no/x")
 LISTS = ([], [1], [1.0] * 6, ["a"], [[]], [0] * 1000, {}, {"a": 1}, {"": {}}, {"every": 8}, DEEP)
-VALUES = (*PLAIN, *ODD, *LISTS)
-KEYS = (
-    "",
-    "x",
-    "every",
-    "rate_hz",
-    "below",
-    "planner",
-    "params",
-    "a.b",
-    "two\nlines",
-    "k" * 300,
-    "model",
-)
+VALUES = (*NUMBERS, *EXTREME, *TEXTS, *LISTS)
+KEYS = ("", "x", "every", "rate_hz", "below", "planner", "params", "a.b", "k" * 300, "model")
+PIECES = ("=", "[", "]]", '"', "1990-03-01", "0x", "\x7f", "\ufeff", "#", "\t", "nan", "1e400")
 
 
 @cache
@@ -105,13 +64,9 @@ def texts() -> dict[str, dict[str, Any]]:
 
 def paths(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Yield the way to every value."""
-    items = (
-        node.items()
-        if isinstance(node, dict)
-        else enumerate(node)
-        if isinstance(node, list)
-        else ()
-    )
+    items: Any = enumerate(node) if isinstance(node, list) else ()
+    if isinstance(node, dict):
+        items = node.items()
     for key, value in items:
         yield (*path, key)
         yield from paths(value, (*path, key))
@@ -132,9 +87,7 @@ def spoilt(draw: st.DrawFn) -> str:
         ways = list(paths(tables))
         *way, key = draw(st.sampled_from(ways))
         holder = at(tables, tuple(way))
-        change = draw(
-            st.sampled_from(("replace", "replace", "swap", "delete", "rename", "add", "double"))
-        )
+        change = draw(st.sampled_from(("replace", "swap", "delete", "rename", "add", "double")))
         if change == "delete":
             del holder[key]
         elif change == "rename" and isinstance(holder, dict):
@@ -159,28 +112,13 @@ def torn(draw: st.DrawFn, text: str) -> str:
     """Draw text that was edited without care: a line twice, a line less, the end lost, a stray
     piece."""
     lines = text.splitlines()
-    line = draw(st.integers(0, len(lines) - 1))
-    piece = draw(
-        st.sampled_from(
-            ("=", "[", "]]", '"', "1990-03-01", "0x", "\x7f", "\ufeff", "#", "\t", "nan", "1e400")
-        )
-    )
-    column = draw(st.integers(0, len(lines[line])))
-    return draw(
-        st.sampled_from(
-            (
-                [*lines[: line + 1], *lines[line:]],
-                [*lines[:line], *lines[line + 1 :]],
-                lines[:line],
-                [
-                    *lines[:line],
-                    lines[line][:column] + piece + lines[line][column:],
-                    *lines[line + 1 :],
-                ],
-                [*lines[:line], lines[line].partition("=")[0] + "= " + piece, *lines[line + 1 :]],
-            )
-        ).map("\n".join)
-    )
+    at = draw(st.integers(0, len(lines) - 1))
+    line, rest, piece = lines[at], lines[at + 1 :], draw(st.sampled_from(PIECES))
+    column = draw(st.integers(0, len(line)))
+    stray = line[:column] + piece + line[column:]
+    assigned = f"{line.partition('=')[0]}= {piece}"
+    ends = ([line, line, *rest], rest, [], [stray, *rest], [assigned, *rest])
+    return "\n".join([*lines[:at], *draw(st.sampled_from(ends))])
 
 
 @contextmanager

@@ -52,17 +52,12 @@ def seen(pilot: Pilot[None]) -> str:
     return unescape(pilot.app.export_screenshot()).replace("\N{NO-BREAK SPACE}", " ")
 
 
-async def shows(pilot: Pilot[None], *words: str) -> None:
-    """Wait until the screen shows all of these."""
+async def shows(pilot: Pilot[None], *words: str, not_any_more: str = "") -> None:
+    """Wait until the screen shows all of these, and does not show a text any more."""
     async with asyncio.timeout(BOUND_S):
-        while not all(word in seen(pilot) for word in words):
-            await pilot.pause(0.05)
-
-
-async def hides(pilot: Pilot[None], word: str) -> None:
-    """Wait until the screen does not show this any more."""
-    async with asyncio.timeout(BOUND_S):
-        while word in seen(pilot):
+        while not all(word in seen(pilot) for word in words) or (
+            not_any_more and not_any_more in seen(pilot)
+        ):
             await pilot.pause(0.05)
 
 
@@ -94,11 +89,11 @@ def test_keys_hold_a_level_and_let_it_resume(running: str) -> None:
         await pilot.press("h")
         await shows(pilot, "upper held by the operator", f"rack command {running} upper resume")
         await pilot.press("r")
-        await hides(pilot, "held by the operator")
+        await shows(pilot, not_any_more="held by the operator")
         await pilot.press("l", "h")
         await shows(pilot, "lower held by the operator")
         await pilot.press("r")
-        await hides(pilot, "held by the operator")
+        await shows(pilot, not_any_more="held by the operator")
 
     on_screen(running, act, (100, 30))
 
@@ -154,16 +149,6 @@ def test_a_screen_of_twenty_by_five_loses_nothing_and_the_rack_runs_on(running: 
         assert segment.words[System.TICK] > before
 
     on_screen(running, act)
-
-
-def test_a_low_screen_has_its_few_lines_for_the_rack(running: str) -> None:
-    async def act(pilot: Pilot[None]) -> None:
-        await shows(pilot, "running", "missed")
-        assert "hold" not in seen(pilot)
-        await pilot.resize_terminal(60, 24)
-        await shows(pilot, "1 boards", "hold")
-
-    on_screen(running, act, (60, 5))
 
 
 def test_a_fault_of_the_menu_strikes_the_chosen_level(running: str) -> None:

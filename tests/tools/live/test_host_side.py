@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 
-from rack import open_run
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.recording.recording import Recording
@@ -82,21 +81,6 @@ def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
 
 
 @pytest.mark.slow
-def test_the_levels_of_a_run_with_a_host_board_are_shown_at_a_tick(
-    recorded: tuple[Path, dict[str, Any]],
-) -> None:
-    run, first = recorded
-    one = Recording(run)
-    tick = int(one.signal("bridge.numbers", "tick")[20])
-    moment = open_run(run).at(tick * one.layout.clock_ns * 1e-9)
-    assert set(moment.levels()) == {"adder", "bridge"}
-    with moment.resume() as again:
-        outcome = again.wait(60)
-    assert outcome is not None
-    assert outcome.digest == first["digest"]
-
-
-@pytest.mark.slow
 def test_entries_of_another_rack_are_refused_in_one_line(
     rack_name: str, tmp_path: Path, recorded: tuple[Path, dict[str, Any]]
 ) -> None:
@@ -106,15 +90,11 @@ def test_entries_of_another_rack_are_refused_in_one_line(
     other.write_text(text.replace("[host", 'reads.number = "bridge.others"\n\n[host'))
     done = rack("run", other, "--entries", run, "--no-record")
     assert (done.returncode, done.stdout) == (2, "")
-    assert (
-        done.stderr
-        == f"--entries {run}: bridge.others: no such mailbox; needed: number 1, 24 bytes\n"
-    )
+    said = "bridge.others: no such mailbox; needed: number 1, 24 bytes"
+    assert done.stderr == f"--entries {run}: {said}\n"
     none = rack("run", "k1607", "--set", f"name={rack_name}", "--entries", run, "--no-record")
-    assert (none.returncode, none.stderr) == (
-        2,
-        f"--entries {run}: '{rack_name}' has no adapter\n",
-    )
+    assert none.returncode == 2
+    assert none.stderr == f"--entries {run}: '{rack_name}' has no adapter\n"
 
 
 def test_check_shows_the_host_side_and_leaves_it_out_of_the_timing(hosted: Path) -> None:

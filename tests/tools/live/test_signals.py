@@ -30,7 +30,9 @@ def signals(link: Link) -> list[Signal]:
     return [Signal.of(f"{NAME}.{name}", boxes) for name in ("row[3]", "id")]
 
 
-def test_every_message_is_taken_once(link: Link, signals: list[Signal]) -> None:
+def test_every_message_is_taken_once_and_what_is_overwritten_is_counted(
+    link: Link, signals: list[Signal]
+) -> None:
     tap = SignalTap(link.segment, signals)
     taken = []
     for first in range(0, 60, 20):
@@ -40,11 +42,7 @@ def test_every_message_is_taken_once(link: Link, signals: list[Signal]) -> None:
             taken += zip(written.ticks.tolist(), written.messages["id"].tolist(), strict=True)
     assert taken == [(tick, tick) for tick in range(0, 60, 2)]
     assert [*tap.take()] == []
-
-
-def test_what_is_overwritten_is_counted(link: Link, signals: list[Signal]) -> None:
-    tap = SignalTap(link.segment, signals)
-    link.run(0, 400)
+    link.run(60, 460)
     (written,) = tap.take()
     assert written.lost + len(written.ticks) == 200
     assert written.lost > 0
@@ -73,17 +71,6 @@ def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Sig
     strip.take()
     assert strip.table(5, 6) == [(6, [6, 6])]
     assert strip.time_s(6) == 0.015
-
-
-def test_a_strip_counts_only_what_is_overwritten_after_it_began(
-    link: Link, signals: list[Signal]
-) -> None:
-    link.run(0, 400)
-    strip = Strip(link.segment, signals, span=20)
-    assert strip.lost == 0
-    link.run(400, 800)
-    strip.take()
-    assert strip.lost > 0
 
 
 def test_lines_are_as_far_apart_as_was_asked(
