@@ -11,7 +11,6 @@ from rack.backplane.fault_table import NEVER, FaultTable, Stage
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Run, System
 from rack.boards.config import load, resolve
-from rack.boards.errors import ConfigError
 from rack.tools.console.answer import Failure
 from rack.tools.faults import live
 from rack.tools.faults.live import LiveRack
@@ -151,24 +150,6 @@ def test_waits_have_an_end(rack: Running, monkeypatch: pytest.MonkeyPatch) -> No
         rack.live.inject(later, True)
     with pytest.raises(Failure, match=f"rack '{rack.segment.rack}': its run is over"):
         rack.live.inject(later, False)
-
-
-@pytest.mark.parametrize(
-    ("given", "why"),
-    [
-        ({"kind": "self-test"}, "a running rack has passed its self-tests"),
-        ({"kind": "kill", "tick": TICK}, f"has passed; the rack is at tick {TICK}"),
-        ({"kind": "hog", "for": 0.1}, "hog needs real time"),
-        ({"kind": "kill", "speed": 2}, "kill has no such parameter"),
-    ],
-)
-def test_what_a_running_rack_cannot_have_is_refused(
-    rack: Running, given: dict[str, object], why: str
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        rack.live.inject({"board": "lower", **given}, False)
-    assert why in str(caught.value)
-    assert rack.live.faults() == []
 
 
 def test_the_table_has_what_each_waits_for_and_no_numbers_that_are_not_known(

@@ -13,8 +13,8 @@ import pytest
 from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.faults.campaigns import campaign as module
-from rack.tools.faults.campaigns.campaign import Campaign, Order, _text
-from rack.tools.faults.campaigns.plan import Kill, Plan
+from rack.tools.faults.campaigns.campaign import Campaign, Order
+from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.results import TrialResult
 from rack.tools.faults.campaigns.workers import TrialJob
 from tests.tools.faults.campaigns.test_report import RUN
@@ -222,20 +222,6 @@ def test_a_trial_that_falls_short_leaves_a_plan_that_repeats_it(make: MakeCampai
     (path,) = campaign.folder.glob("trial-*.toml")
     assert path.name == "trial-0001.toml"
     assert path.read_text() == trials.made[1].toml("small")
-
-
-def test_a_plan_is_said_in_a_few_words() -> None:
-    hang, mute = {"kind": "hang"}, {"kind": "mute"}
-    kills = (Kill("upper", 3, 0.0), Kill("lower", 4, 0.0))
-    assert _text(Plan(7, "faults", True, (hang, mute, hang))) == "trial 7, 2 hang, mute"
-    assert _text(Plan(8, "kills", False, (), kills)) == "trial 8, 2 external kill"
-    assert _text(Plan(0, "nominal", True)) == "nominal"
-
-
-def test_an_order_is_for_faults_of_all_kinds_and_nothing_else_unless_it_says_so() -> None:
-    order = Order(name="nasrem", config=load("nasrem"), injections=3, seed=0, modes=(True,))
-    assert (order.kinds, order.kills, order.sizes, order.faultless_s) == (None, 0, 0, 0.0)
-    assert (order.loads, order.seconds) == ((False, True), None)
 
 
 def test_after_a_signal_nothing_is_drawn_again(

@@ -184,12 +184,6 @@ def test_a_campaign_without_shortfalls_has_passed() -> None:
     )
 
 
-def test_faults_that_ended_their_task_as_permitted_are_recovered_from() -> None:
-    faults = (judgement(is_latched=True), judgement(is_latched=True), judgement())
-    text = report_of(Results(RUN, [run(1, faults=faults)])).markdown()
-    assert "3, of which 2 ended the task, as permitted" in text
-
-
 def test_the_text_shows_the_first_of_many_shortfalls() -> None:
     many = report_of(Results(RUN, lacking=[f"line {k}" for k in range(SHOWN + 1)]))
     assert f"## Shortfalls: {SHOWN + 1}" in many.markdown()

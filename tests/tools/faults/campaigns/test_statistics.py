@@ -9,9 +9,7 @@ from rack.tools.faults.campaigns.statistics import (
     EventRate,
     Spread,
     by_kind,
-    curve,
     rate,
-    spread,
     totals,
     wilson,
 )
@@ -93,23 +91,6 @@ def test_a_death_is_measured_in_time_where_time_is_its_bound() -> None:
     assert judgement(delay=None, bound=2).part_of_bound is None
 
 
-def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
-    faults = [
-        judgement("sensor-bias", size=0.1),
-        judgement("sensor-bias", size=0.001, delay=None),
-        judgement(),
-    ]
-    assert [(point.size, point.delay_ms) for point in curve(faults, "sensor-bias", TICK_NS)] == [
-        (0.001, None),
-        (0.1, 12.5),
-    ]
-
-
-def test_nothing_has_no_median() -> None:
-    assert spread([]) is None
-    assert by_kind([judgement(delay=None)], TICK_NS)["mute"].ticks is None
-
-
 def test_bounds_of_a_share_are_wilsons() -> None:
     # As in any table of them.
     assert wilson(100, 100) == (0.963007, 1.0)
@@ -123,12 +104,3 @@ def test_a_rate_stays_below_what_so_few_events_leave_possible() -> None:
     assert rate(0, 3600.0) == EventRate(0.0, 2.996)
     assert rate(2, 7200.0) == EventRate(1.0, 3.148)
     assert rate(0, 0.0) is None
-
-
-def test_every_share_of_a_kind_has_its_bounds() -> None:
-    faults = [judgement(), judgement(delay=12), judgement(is_recovered=False)]
-    assert by_kind(faults, TICK_NS)["mute"].wilson == {
-        "detected": wilson(3, 3),
-        "within_bound": wilson(2, 3),
-        "recovered": wilson(2, 3),
-    }

@@ -70,23 +70,6 @@ def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(
         assert exit_status(pid) == -9
 
 
-def test_it_looks_often_in_lockstep_and_sleeps_to_its_instant_in_real_time(
-    make_bus: MakeBus,  # noqa: F811
-) -> None:
-    segment = bus(make_bus, os.getpid(), lockstep=False)
-    assert Killer(segment, []).due_in_s() == 0.5
-    near, far = Kill(board="level", tick=60, phase=0.5), Kill(board="level", tick=4000, phase=0.0)
-    # At 60.5 ticks of 2.5 ms after the start, which is now.
-    assert 0.0 <= Killer(segment, [near]).due_in_s() <= 0.15125
-    assert Killer(segment, [far, near]).due_in_s() == 0.5
-    segment.words[System.EPOCH_NS] += 10**9
-    assert Killer(segment, [near]).due_in_s() == 0.5
-    segment.words[System.EPOCH_NS] -= 2 * 10**9
-    assert Killer(segment, [near]).due_in_s() == 0.0
-    segment.words[System.LOCKSTEP] = 1
-    assert Killer(segment, [far]).due_in_s() < 0.05
-
-
 @pytest.mark.slow
 def test_a_trial_has_what_its_judgement_needs(small: Path, rack_name: str) -> None:
     config = load(small)
@@ -96,16 +79,16 @@ def test_a_trial_has_what_its_judgement_needs(small: Path, rack_name: str) -> No
     assert found.plan is plan
     assert found.outcome is not None
     assert (found.outcome.cause, found.outcome.ticks, found.refused) == ("time over", 200, "")
-    assert [(strike.kind, strike.board, strike.tick) for strike in found.strikes] == [
-        ("mute", "lower", 40)
-    ]
-    assert found.run is not None
-    assert [task.name for task in found.run.layout.tasks] == ["upper", "lower", "lower.planner"]
+    (struck,) = found.strikes
+    assert (struck.kind, struck.board, struck.tick) == ("mute", "lower", 40)
+    run = found.run
+    assert run is not None
+    assert [task.name for task in run.layout.tasks] == ["upper", "lower", "lower.planner"]
     assert any(event.code == "mute" for event in found.events)
     assert (found.left, found.again, found.is_late) == ((), None, False)
-    assert (found.run.moving, found.run.is_lockstep, found.run.has_failed) == ((), True, False)
-    assert found.run.restart_s == config.supervision.lockstep_restart_s
-    assert abs(time.time_ns() - time.monotonic_ns() - found.run.offset_ns) < 10**9
+    assert (run.moving, run.is_lockstep, run.has_failed) == ((), True, False)
+    assert run.restart_s == config.supervision.lockstep_restart_s
+    assert abs(time.time_ns() - time.monotonic_ns() - run.offset_ns) < 10**9
     assert 0.0 < found.wall_s < BOUND_S
     assert "upper" in found.levels
 
@@ -191,11 +174,3 @@ def test_a_run_that_stands_still_is_stopped_and_left_if_it_is_stuck(
     assert run.stopped == [LONG]
     # Two minutes of half seconds, and twenty seconds more if it does not end.
     assert run.looks in (range(280, 286) if stuck else range(240, 246))
-
-
-def test_a_restart_takes_at_least_its_real_time_where_time_is_real(small: Path) -> None:
-    config = load(small, ["supervision.lockstep_restart_s=0.5"])
-    supervision = config.supervision
-    assert (supervision.restart_s(True), supervision.restart_s(False)) == (0.5, 2.0)
-    slow = load(small, ["supervision.lockstep_restart_s=3.0"]).supervision
-    assert (slow.restart_s(True), slow.restart_s(False)) == (3.0, 3.0)
