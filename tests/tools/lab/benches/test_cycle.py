@@ -45,20 +45,13 @@ def cycles(processor_us: int, count: int = 5) -> Cycles:
 def test_the_parts_of_a_cycle_are_its_whole_processor_time() -> None:
     found = parts_of(cycles(50))
     assert tuple(found) == PARTS
-    assert [times.tolist() for times in found.values()] == [
-        [us] * 4 for us in (8.0, 3.0, 30.0, 4.0, 5.0)
-    ]
-
-
-def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
+    assert [set(times) for times in found.values()] == [{8.0}, {3.0}, {30.0}, {4.0}, {5.0}]
+    # Interrupted bookkeeping counts without the interruption.
     one = cycles(50)
     one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 90_000
     one.rows["start_ns"][1:] = one.rows["closed_ns"][1:] + 2000
     assert [times[0] for times in parts_of(one).values()] == [2.0, 3.0, 30.0, 4.0, 11.0]
-
-
-def test_start_up_and_stalls_are_not_judged() -> None:
-    one = cycles(50)
+    # Start-up and stalls are not judged.
     one.is_judged[[0, 3]] = False
     assert len(parts_of(one)["process"]) == 3
 
@@ -74,12 +67,6 @@ def test_a_board_is_compared_with_another_checkout_or_the_servo_with_its_physics
         assert own is not None
         assert (own.median, own.count, found.ratio(own)) == (50.0, 15, ratio)
         assert found.sample("servo, lockstep", PHYSICS) is not None
-
-
-def test_a_single_cycle_has_no_parts() -> None:
-    found = costs({**THIS_TREE, ("task, lockstep", "this tree"): [cycles(50, count=1)]}, [], None)
-    assert list(found.parts) == [("servo, lockstep", "this tree")]
-    assert found.sample("task, lockstep", "this tree") is not None
 
 
 @pytest.mark.slow

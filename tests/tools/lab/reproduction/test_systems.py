@@ -35,23 +35,20 @@ def test_what_a_config_promises_is_read_from_it_alone() -> None:
     assert (found.command_ms, found.status_ms) == (1282.5, 2280.0)
 
 
-def test_a_rack_without_levels_above_each_other_promises_no_response(tmp_path: Path) -> None:
-    path = tmp_path / "lone.toml"
-    path.write_text(PLAIN.replace('below = "wave"', 'reads = { status = "wave.status" }'))
-    config = load(path)
-    found = prediction(config)
-    assert (found.levels, found.rates_hz, found.command_ms) == ((), (), 0)
-    assert hold_for(config, 10.0) is None
-
-
-def test_the_highest_level_that_responds_within_the_run_is_held() -> None:
+def test_the_highest_level_that_responds_within_the_run_is_held(tmp_path: Path) -> None:
     config = load("nasrem")
-    long, short = (hold_for(config, seconds) for seconds in (10.0, 2.0))
+    found = {seconds: hold_for(config, seconds) for seconds in (10.0, 2.0, 0.1)}
+    long, short, none = found.values()
     assert long is not None
     assert (long.level, long.what, long.tick) == ("task", "hold", 2000)
     assert short is not None
-    assert short.level == "elemental_move"
-    assert hold_for(config, 0.1) is None
+    assert (short.level, none) == ("elemental_move", None)
+    # A rack without levels above each other promises no response.
+    path = tmp_path / "lone.toml"
+    path.write_text(PLAIN.replace('below = "wave"', 'reads = { status = "wave.status" }'))
+    lone = load(path)
+    assert prediction(lone).command_ms == 0
+    assert hold_for(lone, 10.0) is None
 
 
 @pytest.mark.thorough
