@@ -9,17 +9,13 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.lockstep import differences, run_bare
 from rack.tools.lab.benches.observed import record
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
-from rack.tools.timing.charts.figure5 import lines
 from rack.tools.timing.operator_response import response_of
-from rack.tools.viewer.reading import read
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES
 from tests.tools.command_line import rack
@@ -74,14 +70,6 @@ def test_a_joint_that_does_not_fit_is_repaired_without_the_others(jointed: Path)
     assert [step[0]["board"] for step in found["steps"]] == ["joint2", "arm"]
 
 
-def test_figure_5_has_one_line_for_boards_of_one_cycle(jointed: Path) -> None:
-    rows = [line for line in lines(load(jointed)) if line.rstrip().endswith("no planner to couple")]
-    assert [row.rpartition(" ms:")[0] for row in rows] == [
-        "joint1 ... joint3, arm, 2.5",
-        "path, 20",
-    ]
-
-
 @pytest.mark.slow
 def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
     report, text = write_report(folder)
@@ -125,27 +113,3 @@ def test_a_hold_acts_at_its_predicted_tick_through_every_joint(folder: Path) -> 
     ]
     assert response.held
     assert response.paths["path"].levels == ("path", "joint1", "arm")
-
-
-@pytest.mark.slow
-def test_the_levels_alone_write_what_they_write_in_the_rack(
-    jointed: Path, rack_name: str, tmp_path: Path
-) -> None:
-    config = load(jointed, [f"name={rack_name}"])
-    recording = record(config, 0.5, tmp_path / "run").recording
-    bare = apart(run_bare, config, 200)
-    assert list(differences(recording, bare)) == []
-
-
-@pytest.mark.slow
-def test_the_graph_of_boards_has_a_row_for_every_level(folder: Path) -> None:
-    names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
-    places = (
-        read(folder / "run.rrd", "/hierarchy", "GraphNodes:positions")
-        .values[0]
-        .reshape(-1, 2)
-        .tolist()
-    )
-    rows = {name: row for name, (_, row) in zip(names, places, strict=True)}
-    assert rows["path"] < rows["joint1"] == rows["joint2"] == rows["joint3"] < rows["arm"]
-    assert len({tuple(place) for place in places}) == len(names)

@@ -49,12 +49,8 @@ def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None
     report = report_of(recording)
     assert report["recording"] == "complete"
     assert not any(recording.lost.values())
-    assert set(recording.mailboxes) == {
-        "upper.command",
-        "upper.status",
-        "lower.status",
-        "lower.plan",
-    }
+    boxes = {"upper.command", "upper.status", "lower.status", "lower.plan"}
+    assert set(recording.mailboxes) == boxes
     for mailbox in recording.mailboxes:
         serials = recording.signal(mailbox, "serial")
         assert np.array_equal(serials, np.arange(1, len(serials) + 1))
@@ -64,20 +60,6 @@ def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None
         "lower": report["tasks"]["lower"]["cycles"],
         "lower.planner": report["tasks"]["lower.planner"]["plans"],
     }
-
-
-def test_signals_are_what_the_levels_wrote(recording: Recording) -> None:
-    goals = recording.signal("upper.command", "goal")
-    # Each goal is one more than the count that the level below had reached: the status of the cycle
-    # before.
-    assert goals[0] == 1
-    assert np.all(np.diff(goals) >= 0)
-    assert goals[-1] > 20
-    ticks, visible_at = (
-        recording.signal("lower.plan", "tick"),
-        recording.signal("lower.plan", "visible_at"),
-    )
-    assert np.array_equal(visible_at, ticks + 4)
 
 
 @pytest.mark.slow

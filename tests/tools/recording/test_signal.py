@@ -12,7 +12,6 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Field, MessageType
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
-from rack.tools.recording.parquet import columns_of
 from rack.tools.recording.signal import Signal, Trigger
 
 
@@ -86,13 +85,6 @@ def test_a_text_is_shown_with_escapes_in_place_of_control_characters(messages: n
     shown = "\\x1b[2J\N{REPLACEMENT CHARACTER}"
     assert signal.plain(messages) == [shown] * 3
     assert signal.in_message(messages[0]) == shown
-
-
-def test_units_are_those_of_numbers() -> None:
-    units = {column.path[0]: Signal("", "", column, ()).unit for column in columns_of(BOX)}
-    assert units == {"gait": "", "speed": "m/s", "name": "", "legs": "rad"}
-    heads = [Signal.of(f"walker.status.{name}", [BOX]).head for name in ("gait", "legs.angle[1]")]
-    assert heads == ["walker.status.gait", "walker.status.legs.angle[1], rad"]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rack.boards.config import budgets, load, loads
+from rack.boards.config import load, loads
 from rack.tools.timing.judged_config import Change, JudgedConfig
 from rack.tools.timing.repair import changes_for, first_that, repair
 from tests.tools.timing.conftest import Judge
@@ -30,17 +30,8 @@ def test_the_first_that_works_is_found_in_few_attempts() -> None:
 
     assert first_that(range(10_000), attempt) == 700
     assert len(attempts) < 25
-    assert [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 7, 100)] == [
-        None,
-        None,
-        5,
-        5,
-        5,
-    ]
-    assert [
-        first_that(range(30), lambda k, least=least: k if k >= least else None)
-        for least in range(30)
-    ] == [*range(30)]
+    found = [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 100)]
+    assert found == [None, None, 5, 5]
 
 
 LOOSE = ("coupling=loose", "planner_slot=4")
@@ -150,16 +141,6 @@ def test_a_longer_cycle_of_a_board_on_the_same_core_is_a_change_too(judge: Judge
     assert change.after.failing == ()
 
 
-def test_a_plan_many_times_as_old_is_no_change(judge: Judge) -> None:
-    # 16 cycles leave 88.8 for a plan.
-    late = [
-        settings_for(judge("board.lower.within_cycles=1", f"board.lower.budget.plan_ms={ms}"))
-        for ms in (88, 89)
-    ]
-    assert [{"within_cycles": 16} in found for found in late] == [True, False]
-    assert all(change.get("within_cycles", 0) <= 16 for found in late for change in found)
-
-
 def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1")
     for change in changes_for(judged, "lower"):
@@ -181,12 +162,6 @@ def test_a_new_core_is_asked_for_where_no_used_one_has_room(judge: Judge) -> Non
     assert "this machine has no core 2, uses core 0" in change.text
 
 
-def test_a_core_of_unknown_load_is_left_alone(judge: Judge, budgeted: object) -> None:
-    config = load(str(budgeted), ["board.lower.within_cycles=1"])
-    known = {name: budget for name, budget in budgets(config).items() if name == "lower"}
-    assert change_of(JudgedConfig.of(config, known), "planner_core").settings["planner_core"] == 2
-
-
 def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
     loosened = change_of(judged, "coupling")
@@ -204,11 +179,6 @@ def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
     assert changes_for(judged, "lower")[0].board == "upper"
 
 
-def test_a_longer_cycle_is_told_with_the_response_of_the_system(judge: Judge) -> None:
-    (change,) = changes_for(judge("board.lower.budget.process_ms=9"), "lower")
-    assert "every 4 -> 8 (cycle 10 -> 20 ms; R_s 30 -> 40 ms)" in change.text
-
-
 def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() -> None:
     config = load("fig3")
     changes = changes_for(JudgedConfig.of(config), "level")
@@ -217,19 +187,6 @@ def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() ->
         {"coupling": "loose", "planner_slot": 3, "planner_core": 0},
         {"within_cycles": 2, "every": 4},
     ]
-
-
-def test_more_cycles_would_do_for_figure_3_if_plans_could_be_old() -> None:
-    config = load("fig3", ["board.level.budget.plan_within_ms=24"])
-    assert {"within_cycles": 4} in settings_for(JudgedConfig.of(config), "level")
-
-
-def test_a_board_that_waits_for_others_gets_a_core_of_its_own(judge: Judge) -> None:
-    judged = judge(
-        "board.upper.core=1", "board.upper.budget.process_ms=13", "board.lower.budget.plan_ms=1"
-    )
-    assert {verdict.subject for verdict in judged.failing} >= {"upper"}
-    assert {"core": 0} in settings_for(judged, "upper")
 
 
 def test_boards_are_mended_one_after_another(judge: Judge) -> None:

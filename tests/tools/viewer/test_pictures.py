@@ -29,15 +29,8 @@ def test_without_a_driver_the_cause_and_what_to_install_are_one_line(
 ) -> None:
     for name, value in NO_DRIVER.items():
         monkeypatch.setenv(name, value)
-    command = [
-        sys.executable,
-        "-m",
-        "rack.tools.viewer.pictures",
-        tmp_path / "run.rrd",
-        tmp_path / "out.png",
-        "--at",
-        "1",
-    ]
+    files = (tmp_path / "run.rrd", tmp_path / "out.png")
+    command = [sys.executable, "-m", "rack.tools.viewer.pictures", *files, "--at", "1"]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
     )

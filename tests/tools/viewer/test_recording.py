@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import mujoco
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from rack.levels.robot.state import view_state
 from rack.tools.recording.recording import Recording
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.window import executable
 from tests.shared_runs import NASREM_S, nasrem_run
 
 
@@ -29,14 +26,6 @@ def cell(run: Recording) -> Cell:
     config = loads(run.config)
     assert config.robot is not None
     return build_cell(config.robot, config.scene, config.clock_ns)
-
-
-@pytest.mark.slow
-def test_the_file_is_whole(run: Recording) -> None:
-    verified = subprocess.run(
-        [executable(), "rrd", "verify", run.folder / "run.rrd"], capture_output=True, text=True
-    )
-    assert verified.returncode == 0, verified.stderr
 
 
 @pytest.mark.slow
@@ -105,17 +94,6 @@ def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
         work = "process" if task.role == "executor" else "plan"
         assert np.array_equal(rows.ticks, np.repeat(cycles["tick"], 4))
         assert rows.values.ravel().tolist() == ["read", work, "write", "wait"] * len(cycles)
-
-
-@pytest.mark.slow
-def test_spans_of_a_lane_follow_one_another_and_stay_in_their_slices(run: Recording) -> None:
-    for task in run.layout.tasks:
-        times = sim_times(run, f"/boards/{task.slot}-{task.board}/{task.role}")
-        slice_ns = task.every * task.within_cycles * run.layout.clock_ns
-        assert (np.diff(times) >= 0).all()
-        assert (
-            times < np.repeat(run.cycles[task.name]["tick"], 4) * run.layout.clock_ns + slice_ns
-        ).all()
 
 
 @pytest.mark.slow
@@ -194,18 +172,6 @@ def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
         pytest.skip(str(error))
     assert look.complaints == ()
     assert look.picture.startswith(b"\x89PNG")
-
-
-def sim_times(run: Recording, entity: str) -> np.ndarray:
-    chunks = (
-        RrdReader(str(run.folder / "run.rrd"))
-        .stream()
-        .filter(content=entity, has_timeline="tick")
-        .to_chunks()
-    )
-    return np.concatenate(
-        [c.to_record_batch().column("sim_time").to_numpy().astype(np.int64) for c in chunks]
-    )
 
 
 @pytest.mark.slow

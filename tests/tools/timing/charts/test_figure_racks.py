@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.trace import Flag
 from rack.boards.config import load, rack_timing, wire
 from rack.levels.timing.tasks import Unit
 from rack.levels.timing.verdicts import verdicts
@@ -99,16 +98,6 @@ def test_what_is_predicted_to_fail_fails_in_the_run_and_nothing_else(
     assert predicted == scheduled == seen == (name in ("fig2", "fig4"))
 
 
-@pytest.mark.parametrize("name", ["fig2", "fig4"])
-def test_the_run_has_the_patterns_of_its_schedule(name: str, panels: dict[str, Panel]) -> None:
-    config = load(name)
-    schedule = Schedule(config, wire(config), {}).panel(0, 1)
-    for lane, scheduled in schedule.patterns.items():
-        for expected, measured in zip(scheduled, panels[name].patterns[lane], strict=True):
-            if expected:
-                assert usual(measured) == usual(expected)
-
-
 def updates_met(found: TracedRun) -> tuple[int, int]:
     """Return how many plan updates their executor was released in, and how many of them it cut in
     two.
@@ -157,22 +146,3 @@ def test_an_update_that_is_no_critical_section_is_preempted(tmp_path: Path) -> N
     met, cut = updates_met(found)
     assert met > ENOUGH
     assert cut > MOSTLY * met
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["fig2", "fig4-overload"])
-def test_in_lockstep_a_figure_misses_nothing_and_repeats_itself(name: str, tmp_path: Path) -> None:
-    lockstep = "clock.mode=lockstep"
-    first, second = (
-        run(name, tmp_path / turn, lockstep, seconds=0.1) for turn in ("first", "second")
-    )
-    outcomes = [found.recording.ended["outcome"] for found in (first, second)]
-    assert outcomes[0]["digest"] == outcomes[1]["digest"]
-    assert not any((rows["flags"] & Flag.MISSED).any() for rows in first.recording.cycles.values())
-    made, level = (
-        first.recording.signal("level.plan", "made_at").tolist(),
-        first.config.board["level"],
-    )
-    slices = list(range(0, outcomes[0]["ticks"], first.config.every("level") * level.within_cycles))
-    # The last plan may be one that the end of the run cut off.
-    assert made in (slices, slices[:-1])

@@ -12,7 +12,7 @@ from rack.boards.config import load
 from rack.levels.timing.schedule import Chart
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import union, without
-from tests.tools.recordings import EPOCH_NS, cycle, recorded
+from tests.tools.recordings import cycle, recorded
 
 TICK_US = 2000
 """A tick of the figures' clock; a cycle of fig2 has four."""
@@ -147,24 +147,6 @@ def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
     assert parts[-1] == 1.0
     assert (in_blocks.patterns, in_blocks.counts) == (at_once.patterns, at_once.counts)
     assert dict(at_once.patterns["level"].plans) == {"R X W P | R X W P U -": 30}
-
-
-def test_times_count_from_tick_0_whatever_the_machines_clock_says(folder: Path) -> None:
-    assert EPOCH_NS % 1000
-    run = fig2(folder, [executor(0, 0, 0, 0, 0, 100)], [])
-    assert run.chart(0, run.end_ns).jobs[0].end_ns == 100_000
-
-
-def test_a_union_is_in_order_and_has_no_overlaps() -> None:
-    assert union([(5, 8), (0, 2), (7, 9), (2, 3), (20, 21), (5, 6)]) == [(0, 3), (5, 9), (20, 21)]
-
-
-def test_what_is_left_of_a_stretch_lies_between_what_was_taken() -> None:
-    assert list(without((0, 10), [])) == [(0, 10)]
-    assert list(without((0, 10), [(2, 3), (5, 7)])) == [(0, 2), (3, 5), (7, 10)]
-    assert list(without((2, 6), [(0, 3), (5, 9)])) == [(3, 5)]
-    assert list(without((2, 6), [(0, 2), (6, 9)])) == [(2, 6)]
-    assert list(without((2, 6), [(1, 7)])) == []
 
 
 def test_every_moment_is_either_taken_or_left() -> None:

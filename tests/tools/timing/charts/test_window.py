@@ -84,10 +84,6 @@ def test_a_bad_window_is_refused(
     assert failure.value.status == 2
 
 
-def test_times_of_x_are_read_by_level() -> None:
-    assert times_of(["level=3,2", "servo=0.5"]) == {"level": [3 * MS, 2 * MS], "servo": [500_000]}
-
-
 @pytest.mark.parametrize(
     "text", ["level", "level=", "level=a", "level=1,-1", "level=nan", "level=inf", "level=1,,2"]
 )
