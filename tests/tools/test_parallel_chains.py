@@ -12,10 +12,8 @@ from rack.boards.config import load
 from rack.tools.lab.benches.observed import record
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
-from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
-from rack.tools.timing.operator_response import response_of
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES
 from tests.tools.command_line import rack
@@ -100,16 +98,3 @@ def test_a_slower_joint_has_a_response_of_its_own(
         if pair.equation == "3.3" and pair.measured
     }
     assert subjects == {"system, path > joint2 > arm", "system, path > joint1, joint3 > arm"}
-
-
-@pytest.mark.slow
-def test_a_hold_acts_at_its_predicted_tick_through_every_joint(folder: Path) -> None:
-    response = response_of(Recording(folder))
-    assert response is not None
-    # Read at 104, by the joints at 112, by the arm at 113.
-    assert [(c.sampled, c.predicted, c.acts) for c in response.commands] == [
-        (104, 113, 113),
-        (168, 177, 177),
-    ]
-    assert response.held
-    assert response.paths["path"].levels == ("path", "joint1", "arm")

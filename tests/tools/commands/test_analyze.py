@@ -188,20 +188,3 @@ def test_alpha_and_deviation_are_those_of_equation_3_6(small: Path, tmp_path: Pa
     # Residuals of 0.3 and 1.0 ms.
     assert found["tasks"]["lower"]["deviation_ms"] == pytest.approx(0.35)
     assert found["levels"]["lower"]["predicted"] is None
-
-
-def test_lateness_and_gaps_are_those_of_the_wall_clock(small: Path, tmp_path: Path) -> None:
-    trace = [Cycle(SETTLED + k, PLAIN, late=0.3 if k == 5 else 0.1) for k in (*range(8), 11)]
-    traces = {"lower": trace}
-    found = document(
-        Analysis.of(recorded(tmp_path / "a", load(small, ["clock.mode=realtime"]), traces))
-    )
-    task = found["tasks"]["lower"]
-    assert (task["lateness_ms"]["max"], task["lateness_ms"]["p50"]) == (0.3, 0.1)
-    assert task["largest_gap_ms"] == 4 * 2.5
-    assert found["core_loads"] == {"core 0": pytest.approx(1.2 / 2.5)}
-    lockstep = Analysis.of(recorded(tmp_path / "b", load(small), traces))
-    task = document(lockstep)["tasks"]["lower"]
-    assert (task["lateness_ms"], task["largest_gap_ms"], task["residual_ms"]) == (None, None, None)
-    assert "late max" not in text(lockstep)
-    assert "lockstep: no deadlines, no lateness" in text(lockstep)

@@ -121,19 +121,6 @@ def test_without_budgets_a_run_is_shown_alone_and_a_config_has_no_schedule(tmp_p
 
 
 @pytest.mark.slow
-def test_a_run_in_lockstep_has_its_schedule_alone_and_says_why(tmp_path: Path) -> None:
-    recorded(
-        tmp_path / "run",
-        load("fig2", ["clock.mode=lockstep"]),
-        {"level": [cycle(0, 2000, 0, 0, 0, 0, 1000)]},
-    )
-    shown = rack("gantt", tmp_path / "run")
-    assert "fig2: schedule, 0 to 32 ms" in shown.stdout
-    assert "ran in lockstep: time stood still" in shown.stdout
-    assert "measured" not in shown.stdout
-
-
-@pytest.mark.slow
 def test_a_static_schedule_is_drawn_with_its_frames(tmp_path: Path) -> None:
     shown = rack("gantt", "cyclic", "--out", tmp_path, "--json")
     (panel,) = json.loads(shown.stdout)["panels"]

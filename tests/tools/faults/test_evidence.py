@@ -62,15 +62,6 @@ def test_the_best_detection_is_within_its_bound_then_early() -> None:
     ]
 
 
-def test_of_detections_in_the_same_tick_the_tightest_bound_counts_then_the_board() -> None:
-    tight = Detection(found(1, "a", "c"), 4, 9)
-    by_name = Detection(found(1, "a", "b"), 4, 16)
-    later_name = Detection(found(1, "a", "c"), 4, 16)
-    unbound = Detection(found(1, "a", "a"), 4, None)
-    found_by = sorted([later_name, unbound, by_name, tight], key=lambda one: one.order)
-    assert found_by == [tight, by_name, later_name, unbound]
-
-
 RESTART = event(105, "reaction", "restart", "lower")
 REJOINED = event(130, "recovery", "rejoined", "lower")
 

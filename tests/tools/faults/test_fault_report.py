@@ -14,7 +14,6 @@ from rack.tools.live.launch import run_rack
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.analysis.report_markdown import markdown
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.style import STATES
 from tests.conftest import SMALL
 
 HANG = '{ kind = "hang", board = "upper", tick = 80 }'
@@ -106,18 +105,3 @@ def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder:
         "ERROR",
         "INFO",
     )
-
-
-@pytest.mark.slow
-def test_the_graph_of_boards_shows_who_is_lost_until_it_is_back(
-    folder: Path, report: Report
-) -> None:
-    names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
-    nodes = read(folder / "run.rrd", "/hierarchy", "GraphNodes:colors")
-    lost = STATES["lost"]
-    at = names.index("upper")
-    seen = {int(tick): row.ravel()[at] for tick, row in zip(nodes.ticks, nodes.values, strict=True)}
-    ticks = [tick for tick, colour in seen.items() if colour == lost]
-    assert ticks
-    assert min(ticks) >= 80
-    assert seen[max(seen)] != lost

@@ -15,10 +15,6 @@ import pytest
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment, racks
 from rack.backplane.words import System
-from rack.boards import Rack
-from rack.boards.config import load
-from rack.tools.console.answer import Failure
-from rack.tools.live import desk
 from rack.tools.live.desk import LiveDesk
 from rack.tools.live.watched import LocalRack
 from rack.tools.scripting.attached import AttachedRack
@@ -307,17 +303,3 @@ def test_the_end_of_the_run_ends_a_wait(tmp_path: Path) -> None:
         assert printed.splitlines()[-1] == "'upper', hold: the run ended before it was given"
     finally:
         end(process, name)
-
-
-@pytest.mark.slow
-def test_a_clock_without_ticks_is_not_waited_for(
-    rack_name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(desk, "SILENT_S", 0.05)
-    path = tmp_path / "told.toml"
-    path.write_text(COMMANDED)
-    # Launched and not started: there is a rack, and no clock yet.
-    with Rack(load(path, [f"name={rack_name}"])):
-        with pytest.raises(Failure, match="has not ticked for"):
-            LiveDesk(LocalRack(rack_name)).give({"level": "upper", "what": "hold"}, wait=False)
-        assert OperatorTable(Segment.attach(rack_name)).waiting() == []

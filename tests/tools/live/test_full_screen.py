@@ -112,28 +112,6 @@ def test_keys_set_the_emergency_stop_and_reset_it(running: str) -> None:
     on_screen(running, act)
 
 
-def test_what_cannot_be_done_is_answered(running: str) -> None:
-    segment = Segment.attach(running)
-    before = segment.words[System.COMMANDED], segment.words[System.INJECTED]
-    answers = {
-        "upper": "'upper': permitted: LEVEL WHAT",
-        "nobody hold": "nobody",
-        "upper goto nowhere": "'nowhere': not a goal",
-        "upper fly": "fly",
-        "inject upper flop": "flop",
-        "inject upper mute for=ages": "ages",
-    }
-
-    async def act(pilot: Pilot[None]) -> None:
-        await pilot.press("3")
-        for text, answer in answers.items():
-            await write(pilot, text)
-            await shows(pilot, answer)
-
-    on_screen(running, act, (100, 40))
-    assert (segment.words[System.COMMANDED], segment.words[System.INJECTED]) == before
-
-
 def test_a_screen_of_twenty_by_five_loses_nothing_and_the_rack_runs_on(running: str) -> None:
     segment = Segment.attach(running)
 

@@ -4,13 +4,11 @@ tick."""
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 
 import pytest
-from rich.console import Console
 
-from rack.tools.live.signals import Lines, Plot, SignalTap, Strip
+from rack.tools.live.signals import Lines, SignalTap, Strip
 from rack.tools.recording.signal import Signal
 from tests.backplane.bus import NAME
 from tests.link import Link, links
@@ -87,17 +85,3 @@ def test_lines_are_as_far_apart_as_was_asked(
     assert found[0] == {"time_s": 0.01, "tick": 4, f"{NAME}.row[3]": 4, f"{NAME}.id": 4}
     Lines(strip, first=36, every=0, as_json=False).show(39)
     assert capsys.readouterr().out.splitlines() == ["    0.0900  36  36", "    0.0950  38  38"]
-
-
-def test_a_plot_has_a_curve_for_each_number(link: Link) -> None:
-    boxes = link.segment.layout.mailboxes
-    signals = [Signal.of(f"{NAME}.{name}", boxes) for name in ("row[3]", "id", "text")]
-    strip = Strip(link.segment, signals, span=100)
-    link.run(0, 40)
-    strip.take()
-    terminal = Console(force_terminal=True, color_system=None, width=90, height=30)
-    with terminal.capture() as drawn, Plot(strip, 40, terminal) as plot:
-        plot.show(39)
-    # Text has no curve.
-    assert {*re.findall(rf"{NAME}\S+", drawn.get())} == {f"{NAME}.row[3]", f"{NAME}.id"}
-    assert "simulated time, s" in drawn.get()

@@ -10,7 +10,6 @@ import socket
 import ssl
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -23,9 +22,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure
-from rack.tools.network import estop
 from rack.tools.network.certificates import make_credentials
-from rack.tools.network.estop import EstopSession, check_reach
+from rack.tools.network.estop import check_reach
 from rack.tools.viewer.window import free_port
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S, RACK, wait_until
@@ -267,34 +265,3 @@ def test_another_machine_is_not_asked_without_certificates(monkeypatch: pytest.M
         pytest.raises(Failure, match="not this machine, so it needs certificates"),
     ):
         check_reach(RackAddress("127.0.0.1", server.getsockname()[1], "cell"), Operator())
-
-
-class Line(EstopSession):
-    """A session in which each request gets the next of these answers; None: it comes back without
-    one. The last is repeated."""
-
-    def __init__(self, *answers: int | None, wait_s: float = 0.0) -> None:
-        self._address, self._operator = RackAddress("127.0.0.1", 7447, "cell"), Operator()
-        self._launches = {"cell": 1}
-        self._changes = lambda: iter(())
-        self._answers = [*answers]
-        self._wait_s = wait_s
-
-    def _request(self, launch: int, flags: int) -> int | None:
-        time.sleep(self._wait_s)
-        return self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
-
-
-def test_a_rack_that_never_answers_does_not_permit_it_or_does_not_cycle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(estop, "DENIED_S", 0.1)
-    monkeypatch.setattr(estop, "PATIENCE_S", 0.3)
-    monkeypatch.setattr(estop, "ANSWER_S", 0.04)
-    with pytest.raises(Failure, match="rack 'cell' does not permit 'operator' to stop it"):
-        Line(None).set_stop(1)
-    # A request that does not come back at once was taken.
-    with pytest.raises(Failure, match=r"has not answered for 0\.3 s"):
-        Line(None, wait_s=0.03).set_stop(1)
-    with pytest.raises(Failure, match="has ended, or is out of reach"):
-        Line(None).set_stop(2)

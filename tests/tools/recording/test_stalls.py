@@ -16,7 +16,6 @@ from rack.tools.recording.cores import CoreRecord, Stolen
 from rack.tools.recording.cycles import cycles_of, measured_budgets
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import (
-    LEAST_STALLS,
     Absence,
     Quota,
     Stalls,
@@ -119,19 +118,6 @@ def test_stalls_that_end_at_one_phase_of_100_ms_are_named(
     report = report_of(recording)
     assert report["stalls"]["quota"] == {"together": 11, "stalls": 13, "levels": []}
     assert "- 11 of 13 stalls end at one phase of 100 ms: a quota of the host\n" in markdown(report)
-
-
-@pytest.mark.slow
-def test_what_may_be_chance_is_not_named(config: RackConfig, tmp_path: Path) -> None:
-    few = [resumed_at(100.0 * k + 31.2) for k in range(LEAST_STALLS - 1)]
-    assert found_in(run(tmp_path / "run", config, {"lower": few})).quota is None
-    for seed in range(15):
-        # Far enough apart to be stalls of their own.
-        ends = np.cumsum(np.random.default_rng(seed).uniform(50, 350, 5 + seed))
-        found = found_in(
-            run(tmp_path / "run", config, {"lower": [resumed_at(float(end)) for end in ends]})
-        )
-        assert (found.lost, found.quota) == (2 * len(ends), None)
 
 
 def test_losses_of_several_tasks_and_cycles_by_one_stall_count_once(

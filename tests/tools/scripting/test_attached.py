@@ -140,19 +140,6 @@ def test_a_killed_board_is_restarted_while_the_program_computes(
 
 
 @pytest.mark.slow
-def test_an_error_of_a_program_ends_its_rack_and_is_shown(path: Path, rack_name: str) -> None:
-    with (  # noqa: PT012  the run is part of it
-        pytest.raises(ZeroDivisionError),
-        Rack.from_file(path, [f"name={rack_name}", "clock.mode=lockstep"]) as own,
-    ):
-        own.run_in_background()
-        _ = 1 / 0
-    assert own.outcome is not None
-    assert own.outcome.cause == "stopped"
-    assert rack_name not in racks()
-
-
-@pytest.mark.slow
 def test_an_error_of_its_supervision_ends_a_rack_and_is_shown(path: Path, rack_name: str) -> None:
     def fail(event: Event) -> None:
         if event.kind == "command":

@@ -88,15 +88,3 @@ def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorRes
     assert replace(response, commands=(late,)).beyond == []
     lost = replace(response.commands[0], acts=101 + 40)
     assert replace(response, commands=(lost,), lockstep=False).beyond == [lost]
-
-
-@pytest.mark.slow
-def test_a_run_in_real_time_has_responses_by_the_wall_clock(
-    config: MakeConfig, tmp_path: Path
-) -> None:
-    given = [CommandConfig(level="upper", what="hold", tick=101)]
-    response = measured(config("clock.mode=realtime"), tmp_path / "run", *given)
-    (command,) = response.commands
-    assert command.wall_ms is not None
-    # Given at tick 101, its cycle begins at 112 or later.
-    assert command.wall_ms > 10 * 2.5

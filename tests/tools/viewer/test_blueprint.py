@@ -14,8 +14,8 @@ from rack.boards.config import load, wire
 from rack.boards.events import Event
 from rack.levels.messages import SERVO_STATUS
 from rack.levels.robot.cell import build_cell, sizes
-from rack.tools.viewer.blueprint import RackViews, eye_on, grid_on
-from rack.tools.viewer.cell import Marks, extent_of, floor_of
+from rack.tools.viewer.blueprint import RackViews
+from rack.tools.viewer.cell import Marks
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, new_recording
 from rack.tools.viewer.style import LOST
@@ -114,17 +114,3 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
     assert list(faults.values[0]) == ["fault of servo: sensor-nan (j3)"]
     places = read(tmp_path / "run.rrd", "/cell/faults/j3", "Points3D:positions")
     assert [len(row) for row in places.values] == [1, 0]
-
-
-def test_the_eye_is_close_to_the_arm_and_the_grid_on_the_floor() -> None:
-    config = load("nasrem")
-    assert config.robot is not None
-    cell = build_cell(config.robot, config.scene, config.clock_ns)
-    centre, radius = extent_of(cell)
-    eye = eye_on(cell)
-    assert eye.position is not None
-    place = np.array(eye.position.as_arrow_array().to_pylist()[0])
-    assert 1.5 * radius < np.linalg.norm(place - centre) < 2.5 * radius
-    assert radius < 0.6 * float(cell.model.stat.extent)
-    assert grid_on(cell).visible is not None
-    assert floor_of(cell) == 0.0

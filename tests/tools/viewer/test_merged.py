@@ -102,18 +102,6 @@ def test_how_uncertain_it_is_stands_in_the_log(both: Path) -> None:
     assert line.endswith(" ms")
 
 
-@pytest.mark.slow
-def test_no_view_of_several_racks_fails_in_the_viewer(both: Path) -> None:
-    try:
-        with opened(both) as screen:
-            look = screen.look(at_s=2.0)
-            views = set(screen.views)
-    except NoViewerError as error:
-        pytest.skip(str(error))
-    assert look.complaints == ()
-    assert {"a: levels", "b: levels", "log of all racks"} <= views
-
-
 @pytest.fixture
 def branched_runs(rack_name: str, tmp_path: Path) -> Path:
     """Runs "whole", and "other", which branches off at tick 150; the folder of both."""

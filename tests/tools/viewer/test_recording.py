@@ -42,14 +42,6 @@ def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
 
 
 @pytest.mark.slow
-def test_limits_are_the_arms(run: Recording, cell: Cell) -> None:
-    rows = read(run.folder / "run.rrd", "/joints/j2/position/limits")
-    assert np.array_equal(rows.values, np.tile(cell.bounds.position[1], (len(rows.values), 1)))
-    assert rows.ticks[0] == 0
-    assert rows.ticks[-1] == run.signal("servo.status", "tick")[-1]
-
-
-@pytest.mark.slow
 def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
     states = dict(
         zip(
@@ -70,16 +62,6 @@ def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
             assert places[row] == pytest.approx(body.xpos, abs=1e-6)
             assert turns[row][[3, 0, 1, 2]] == pytest.approx(body.xquat, abs=1e-6)
     assert {"body/link6", "body/finger_left", "body/block1", "body/peg"} <= set(frames.values[:, 0])
-
-
-@pytest.mark.slow
-def test_the_planned_path_begins_where_the_tool_is(run: Recording) -> None:
-    file = run.folder / "run.rrd"
-    line = read(file, "/cell/planned_path", "LineStrips3D:strips").values[0][0]
-    points = read(file, "/cell/way_points", "Points3D:positions")
-    tool = run.signal("servo.scene", "tool_position")[0]
-    assert line[0] == pytest.approx(tool, abs=2e-3)
-    assert line[-1] == pytest.approx(points.values[0][-1], abs=1e-6)
 
 
 @pytest.mark.slow

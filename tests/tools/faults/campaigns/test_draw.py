@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from math import ceil
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -18,7 +16,6 @@ from rack.boards.config.faults import fault_mistakes, places
 from rack.boards.config.published import publish
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.bounds import cycle_ticks
-from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Failure
 from rack.tools.faults.campaigns.draw import (
@@ -31,7 +28,7 @@ from rack.tools.faults.campaigns.draw import (
     fault_plans,
     size_plans,
 )
-from rack.tools.faults.campaigns.plan import Kill, Plan, Targets, kinds_for, needs_real_time
+from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
 from rack.tools.faults.ending import EXTERNAL
 
 BOTH = (True, False)
@@ -123,20 +120,6 @@ def test_faults_of_a_trial_follow_each_other_with_time_to_recover(
     assert max(len(plan.faults) + len(plan.kills) for plan in plans) > 8
 
 
-def test_faults_of_the_arm_come_in_as_few_trials_as_they_fit_into(course: RackUnderTest) -> None:
-    # No mailbox keeps them apart.
-    kinds = [
-        kind.name for kind in KINDS if kind.where == "arm" and course.targets.by_kind[kind.name]
-    ]
-    plans = drawn(course, kinds, "6", True)
-    rng = Random("6 lockstep")
-    order = [kind for kind in kinds for _ in range(COUNT)]
-    rng.shuffle(order)
-    took = sum(Card.draw(course, kind, rng).room(course) for kind in order)
-    fewest = max(took / (course.last() - course.first()), len(order) / MOST_FAULTS)
-    assert len(plans) == ceil(fewest)
-
-
 def _undone(kind: str, board: str, course: RackUnderTest) -> int:
     return KINDS[kind].recovery_ticks(board, course.targets.layout, course.restart_s)
 
@@ -177,26 +160,6 @@ def test_only_mailboxes_that_somebody_reads_are_struck(small: Path) -> None:
         "lower.status",
     }
     assert struck == {"upper.command", "lower.status", "lower.plan"}
-
-
-def test_a_plan_is_a_file_that_repeats_it(config: RackConfig, tmp_path: Path) -> None:
-    fault = {
-        "kind": "drop",
-        "board": "servo",
-        "tick": 7,
-        "for": 0.05,
-        "mailbox": "servo.status",
-        "probability": 0.5,
-    }
-    plan = Plan(3, "faults", lockstep=True, faults=(fault,), kills=(Kill("task", 90, 0.25),))
-    text = plan.toml("nasrem")
-    assert "rack run nasrem --lockstep --faults" in text
-    assert "# external kill: task at tick 90 + 0.25" in text
-    tables = tomllib.loads(text)["fault"]
-    assert (
-        tuple(FaultConfig.model_validate(table) for table in tables)
-        == plan.config(config, "other").fault
-    )
 
 
 @pytest.mark.parametrize(

@@ -161,16 +161,3 @@ def test_no_run_goes_on_for_ever(
     assert run.seconds == seconds
     # The look after it is the first beyond.
     assert ends_at < run.words[System.TICK] <= ends_at + 2 * pace
-
-
-@pytest.mark.parametrize("stuck", [False, True])
-def test_a_run_that_stands_still_is_stopped_and_left_if_it_is_stuck(
-    monkeypatch: pytest.MonkeyPatch, stuck: bool
-) -> None:
-    now = [100.0]
-    monkeypatch.setattr(trial, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    run = Run(0, now, stuck)
-    _watch(run, NO_KILLS, 1000, None)  # type: ignore[arg-type]
-    assert run.stopped == [LONG]
-    # Two minutes of half seconds, and twenty seconds more if it does not end.
-    assert run.looks in (range(280, 286) if stuck else range(240, 246))

@@ -4,8 +4,6 @@ peer as baseline."""
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -24,8 +22,7 @@ from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import EXTRA, Absent, Sample, absent_package
 from rack.tools.lab.benches.mailbox import MESSAGE, Case, Exchange, compare, measure
 from rack.tools.lab.benches.transports import PEERS, Peer, Transport, multiprocessing_pipe
-from tests.processes import BOUND_S, RACK
-from tests.tools.command_line import ROOT
+from tests.processes import BOUND_S
 from tests.tools.lab.benches.test_harness import Hidden
 
 pytestmark = pytest.mark.thorough
@@ -118,26 +115,3 @@ def test_a_bench_measures_every_protocol_and_names_who_is_absent(
     assert found.absent == (Absent("iceoryx2 blackboard", "No module named 'iceoryx2'", EXTRA),)
     assert set(found.baselines.values()) <= {peer.name for peer in PEERS}
     assert not left_by(os.getpid())
-
-
-@pytest.mark.slow
-def test_an_interrupted_bench_leaves_nothing(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*RACK, "bench", "mailbox", "--rounds", "100000"],
-        cwd=ROOT,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
-    try:
-        assert process.stdout is not None
-        lines = [process.stdout.readline() for _ in range(2)]
-        assert lines == [b"about 1 minutes\n", b"64 B, 1 reader\n"]
-        process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=BOUND_S)
-    finally:
-        process.kill()
-        process.communicate()
-    assert process.returncode == 128 + signal.SIGTERM
-    assert not left_by(process.pid)
-    assert not list(tmp_path.iterdir())

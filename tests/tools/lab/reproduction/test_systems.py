@@ -6,24 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, wire
+from rack.boards.config import load
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.systems import (
     hold_for,
     prediction,
     system_experiment,
-    systems,
 )
 from tests.boards.conftest import PLAIN
 from tests.boards.vector_racks import JOINTED
-
-
-@pytest.mark.slow
-def test_the_default_is_nasrem_and_every_bundled_rack_with_a_folder() -> None:
-    assert systems()[0] == "nasrem"
-    assert len(set(systems())) == len(systems())
-    for name in systems():
-        assert wire(load(name)).tasks
 
 
 def test_what_a_config_promises_is_read_from_it_alone() -> None:

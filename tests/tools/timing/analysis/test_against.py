@@ -212,18 +212,6 @@ def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> No
     ]
 
 
-def test_a_level_that_depends_on_a_clock_is_found(ran: Run, tmp_path: Path) -> None:
-    level = tmp_path / "clock_levels.py"
-    level.write_text(OWN_LEVEL.replace("AFTER", "float(monotonic_ns())"))
-    text = SUMMING.format(folder=tmp_path, module=level.stem)
-    one, two = ran("one", text), ran("two", text)
-    found = why(one, two)
-    repetition = found["repetition"]
-    assert repetition["because"] == "chance"
-    assert set(repetition["runs"]) == {str(one.folder), str(two.folder)}
-    assert any("such as a clock" in line for line in found["why"])
-
-
 def test_an_operators_command_is_the_cause(ran: Run) -> None:
     one = ran("one", COMMANDED)
     two = ran("two", COMMANDED, commands("level = 'upper', what = 'hold', tick = 80"))

@@ -137,12 +137,3 @@ def test_the_update_of_a_plan_keeps_its_executor_waiting(tmp_path: Path) -> None
     # In the chart too such an update is of one piece.
     updates = [span for span in found.chart(0, found.end_ns).spans if span.unit is Unit.UPDATE]
     assert sum(span.end_ns - span.start_ns > UPDATE_NS for span in updates) > MOSTLY * met
-
-
-@pytest.mark.slow
-def test_an_update_that_is_no_critical_section_is_preempted(tmp_path: Path) -> None:
-    free = "protocol.mailbox={ 'level.plan' = 'time-slice' }"
-    found = undisturbed("fig2", tmp_path, *STRADDLING, free)
-    met, cut = updates_met(found)
-    assert met > ENOUGH
-    assert cut > MOSTLY * met

@@ -82,18 +82,6 @@ def test_what_an_executor_needs_to_wake_up_is_not_its_planners(folder: Path) -> 
     )
 
 
-def test_a_planner_on_another_core_is_preempted_by_nobody(folder: Path) -> None:
-    loose = (
-        "board.level.coupling=loose",
-        "board.level.planner_slot=3",
-        "board.level.planner_core=0",
-    )
-    run = fig2(
-        folder, [executor(1, 8100, 8100, 8200, 8300, 8400)], [plan(0, 500, 9000, 9500)], *loose
-    )
-    assert ("P", 500, 9000) in spans(run.chart(0, run.end_ns))
-
-
 def test_releases_that_were_skipped_are_jobs_that_were_never_done(folder: Path) -> None:
     run = fig2(
         folder,
