@@ -26,14 +26,11 @@ def test_a_run_with_a_script_repeats_with_its_faults(
 ) -> None:
     script = tmp_path / "hang.toml"
     script.write_text(HANG)
-    done = run(
-        small, rack_name, "--faults", script, "--seconds", "2", "--out", tmp_path / "run", "--json"
-    )
+    words = ("--seconds", "2", "--json")
+    done = run(small, rack_name, "--faults", script, "--out", tmp_path / "run", *words)
     assert done.returncode == 0, done.stderr
     # The resolved config holds the script: it needs no file to run again.
-    again = run(
-        tmp_path / "run" / "config.toml", rack_name, "--seconds", "2", "--no-record", "--json"
-    )
+    again = run(tmp_path / "run" / "config.toml", rack_name, "--no-record", *words)
     assert again.returncode == 0, again.stderr
     report, repeated = json.loads(done.stdout), json.loads(again.stdout)
     assert report["digest"] == repeated["digest"]
@@ -42,26 +39,19 @@ def test_a_run_with_a_script_repeats_with_its_faults(
     assert [(fault.kind, fault.at) for fault in found.fault] == [("hang", 0.5)]
 
 
-@pytest.mark.parametrize(
-    ("script", "line"),
-    [
-        (
-            "noisy",
-            "--faults = \"noisy\": no such file; did you mean 'noisy-bus'?",
-        ),
-        ("[[fault]]\nkind = 'kill'", "fault[0].board: missing; task to strike"),
-        (
-            "[[fault]]\nkind = 'kill'\nboard = 'servo'",
-            'fault[0].board = "servo": no such task; tasks: upper, lower',
-        ),
-        (
-            "[[fault]]\nkind = 'hog'\nboard = 'lower'",
-            'fault[0].kind = "hog": hog needs real time: in lockstep time',
-        ),
-        ("[[fault]\n", "script.toml: not TOML: "),
-        ("[run]\n", "script.toml: run: a fault script contains [[fault]] tables and nothing else"),
-    ],
-)
+SCRIPTS = {
+    "noisy": "--faults = \"noisy\": no such file; did you mean 'noisy-bus'?",
+    "[[fault]]\nkind = 'kill'": "fault[0].board: missing; task to strike",
+    "[[fault]]\nkind = 'kill'\nboard = 'servo'": (
+        'fault[0].board = "servo": no such task; tasks: upper, lower'
+    ),
+    "[[fault]]\nkind = 'hog'\nboard = 'lower'": 'fault[0].kind = "hog": hog needs real time',
+    "[[fault]\n": "script.toml: not TOML: ",
+    "[run]\n": "script.toml: run: a fault script contains [[fault]] tables and nothing else",
+}
+
+
+@pytest.mark.parametrize(("script", "line"), SCRIPTS.items())
 def test_a_script_that_does_not_fit_is_refused_before_anything_starts(
     small: Path, rack_name: str, tmp_path: Path, script: str, line: str
 ) -> None:

@@ -34,7 +34,6 @@ def test_the_first_that_works_is_found_in_few_attempts() -> None:
     assert found == [None, None, 5, 5]
 
 
-LOOSE = ("coupling=loose", "planner_slot=4")
 ELSEWHERE = {"coupling": "loose", "planner_slot": 4, "planner_core": 2}
 LATE = "within_cycles=1"
 """8.5 of planning, 5.55 left in a cycle."""
@@ -64,29 +63,6 @@ LATE = "within_cycles=1"
         ),
         pytest.param(
             ("budget.process_ms=9",), (), 2, [{"every": 8, "rate_hz": None}], id="too long a cycle"
-        ),
-        pytest.param(
-            # 24.7 of planning need 5 cycles on the core of its executor or of the upper level, 3
-            # alone.
-            (*LOOSE, "planner_core=1", "within_cycles=2", "budget.plan_ms=24"),
-            ("board.upper.budget.process_ms=6",),
-            3,
-            [{"within_cycles": 3, "planner_core": 2}, {"within_cycles": 5}],
-            id="a core of its own with older plans ranks by their age",
-        ),
-        pytest.param(
-            # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of
-            # 15 on another core: just.
-            (
-                "budget.process_ms=9",
-                "budget.plan_ms=29",
-                "budget.plan_within_ms=30",
-                "budget.exchange_ms=0",
-            ),
-            ("timing.context_switch_ms=0", "board.upper.rate_hz=16.666666666666668"),
-            2,
-            [{**ELSEWHERE, "within_cycles": 2, "every": 6, "rate_hz": None}],
-            id="a planner elsewhere and a longer cycle together are a last resort",
         ),
         pytest.param(
             (LATE,),

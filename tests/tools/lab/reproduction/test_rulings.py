@@ -15,30 +15,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import TypeAdapter
 
 from rack.boards.config import load
 from rack.tools.lab.reproduction.experiments import (
     figures,
-    nasrem,
-    partition,
     response,
     sharing,
-    switch,
     systems,
     tasks,
 )
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
-from rack.tools.lab.reproduction.experiments.figures import settings_of
-from rack.tools.lab.reproduction.experiments.nasrem import SystemResponse
 from rack.tools.lab.reproduction.experiments.sharing import WAITS
 from rack.tools.lab.reproduction.page import PaperClaim
 from rack.tools.lab.reproduction.rules import judge_layers
 from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
-from rack.tools.timing.analysis.analysis import Analysis
 from tests.tools.lab.reproduction.breaking import CHAIN, BreakingWorkshop
 from tests.tools.lab.reproduction.test_figures import FIGURES
-from tests.tools.lab.reproduction.test_rules import CLAIMS, RULINGS, RUN
+from tests.tools.lab.reproduction.test_rules import CLAIMS, RULINGS
 
 pytestmark = [pytest.mark.thorough, pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -115,25 +108,6 @@ def by_experiments(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdic
     return claim.judge(*found)
 
 
-IN_LOCKSTEP = ("clock.mode=lockstep",)
-"""Times of processors are measured in lockstep, too."""
-
-
-def by_equation(rack: str, settings: tuple[str, ...] = IN_LOCKSTEP) -> Judge:
-    """Return a judge of an equation by a run of another rack than NASREM's."""
-
-    def judge(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
-        run = workshop.run(rack, workshop.config(rack, settings)).recording
-        analysis = Analysis.of(run)
-        found = replace(RUN, verdicts=tuple(nasrem._verdicts(analysis)))
-        if analysis.response is not None:
-            response = TypeAdapter(SystemResponse).validate_python(analysis.response)
-            found = replace(found, response=response)
-        return claim.judge(found)
-
-    return judge
-
-
 def with_polling_later(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
     """Return the ruling on a run in which polling is given the later times: no rack makes it so,
     and on some machines it is so by itself."""
@@ -185,38 +159,6 @@ ROWS = (
         ONE_LOSS,
     ),
     Breaking("nasrem", "servo_off_400_Hz_share", LATE_SERVO, alone=True),
-    Breaking(
-        "equation-3.4",
-        "level: t_exec",
-        judge=by_equation("fig4", (*IN_LOCKSTEP, *settings_of("fig4", 7.0))),
-    ),
-    Breaking("equation-3.5", "level", judge=by_equation("fig4-overload")),
-    Breaking(
-        "equation-3.6",
-        "level",
-        judge=by_equation("fig4", (*IN_LOCKSTEP, *settings_of("fig4", 4.0))),
-    ),
-    Breaking(
-        "equation-3.7", "level", judge=by_equation("fig4", settings_of("fig4", 7.0)), alone=True
-    ),
-    Breaking("equation-3.8", "level", judge=by_equation("fig3")),
-    Breaking(
-        "equation-3.9",
-        "level",
-        judge=by_equation("fig3", (*IN_LOCKSTEP, *settings_of("fig3", 4.0))),
-    ),
-    Breaking(
-        "equation-3.10",
-        "level",
-        judge=by_equation("fig2", (*IN_LOCKSTEP, "timing.small_share=0.05")),
-    ),
-    Breaking(
-        "equation-3.2",
-        "R_s of a status",
-        {"nasrem": "[timing]\nresponse_ms = 1000\n" + LOCKSTEP},
-        7.0,
-        judge=by_equation("nasrem"),
-    ),
     Breaking(
         "speedup",
         "plans_on_two_processors",
@@ -288,10 +230,8 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "SECONDS", 1.0)
     monkeypatch.setattr(figures, "ATTEMPTS", 1)
     monkeypatch.setattr(sharing, "SECONDS", 0.7)
-    monkeypatch.setattr(partition, "SECONDS", 2.5)
     monkeypatch.setattr(response, "COMMANDS", 4)
     monkeypatch.setattr(response, "TWINS", 0)
-    monkeypatch.setattr(switch, "WAKES", 200)
 
 
 def case(rack: str) -> Any:
@@ -314,10 +254,9 @@ def test_claims_do_not_hold_in_a_rack_that_breaks_them(
 
 HEALTHY = (
     Breaking("two-levels", "", judge=lambda workshop, claim: claim.judge()),
-    Breaking("equation-3.2", "", {"nasrem": LOCKSTEP}, 7.0, judge=by_equation("nasrem")),
     Breaking("bounded-waits", "", {"nasrem": LOCKSTEP}, 3.5, ONE_LOSS),
 )
-"""Racks that keep a claim, where a run is short and needs no real time; test_chapters.py and
+"""Racks that keep a claim, where a run is short and needs no real time; test_rules.py and
 test_figures.py have the others, by data."""
 
 
