@@ -180,8 +180,10 @@ def story(rack: Link, kind: str, *parameters: float) -> dict[str, object]:
         "statistics": {
             name: getattr(statistics, name) for name in statistics.__slots__ if name != "forger"
         },
-        "ends": [writer.serial, writer.bus_errors]
-        + [reader.serial, reader.accesses, reader.transfers],
+        "ends": [
+            *(writer.serial, writer.bus_errors),
+            *(reader.serial, reader.accesses, reader.transfers),
+        ],
     }
 
 
