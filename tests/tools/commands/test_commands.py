@@ -185,17 +185,6 @@ def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_na
     wait_until(lambda: not any(map(runs, family)))
 
 
-def test_check_shows_every_mailbox_at_its_bus_address(small: Path) -> None:
-    shown = json.loads(rack("check", small, "--json").stdout)
-    addresses = {mailbox["mailbox"]: mailbox["address"] for mailbox in shown["mailboxes"]}
-    assert set(addresses) == {"upper.command", "upper.status", "lower.status", "lower.plan"}
-    assert len(set(addresses.values())) == 4
-    assert max(addresses.values()) < shown["segment_bytes"]
-    assert shown["timing"]["plan_ms"] == {"lower": 10.0}
-    text = rack("check", small, "--verbose").stdout
-    assert all(f"0x{address:06x}" in text for address in addresses.values())
-
-
 @pytest.mark.slow
 def test_a_running_rack_can_be_seen_and_stopped(
     running: subprocess.Popen[str], rack_name: str

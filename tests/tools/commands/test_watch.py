@@ -69,14 +69,23 @@ def test_what_is_not_there_is_one_line(held: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_lines_show_every_message_until_the_run_ends(held: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "options", "count", "step"),
+    [
+        ("watch", ("counter.status.fired", "--every", "0s"), "tick", 4),
+        ("mailbox", ("counter.status", "--watch"), "serial", 1),
+    ],
+)
+def test_every_message_is_shown_until_the_run_ends(
+    held: str, command: str, options: tuple[str, ...], count: str, step: int
+) -> None:
     with in_thread(lambda: go_on(held, "count down")):
-        done = rack("watch", held, "counter.status.fired", "--every", "0s", "--json")
+        done = rack(command, held, *options, "--json")
     assert (done.returncode, done.stderr) == (0, "")
-    lines = [json.loads(line) for line in done.stdout.splitlines()]
-    ticks = [line["tick"] for line in lines]
-    assert ticks == [*range(ticks[0], ticks[-1] + 1, 4)]
-    assert {line["counter.status.fired"] for line in lines} >= {"count up", "count down"}
+    counts = [json.loads(line)[count] for line in done.stdout.splitlines()]
+    assert counts == [*range(counts[0], counts[-1] + 1, step)]
+    assert "count up" in done.stdout
+    assert "count down" in done.stdout
 
 
 @pytest.mark.slow

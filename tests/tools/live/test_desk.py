@@ -195,18 +195,6 @@ def test_a_paused_rack_goes_on_from_there(running: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("running", ["realtime"], indirect=True)
-def test_a_rack_in_real_time_without_one_highest_level_cannot_be_paused(
-    running: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for levels in ([], ["lower", "upper"]):
-        monkeypatch.setattr(LiveDesk, "highest", lambda desk, *in_force, found=levels: found)
-        done = rack("pause", running)
-        assert done.returncode == 1
-        assert done.stderr.endswith(f"highest: {', '.join(levels) or 'none'}\n")
-
-
-@pytest.mark.slow
 def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
     done = rack("set", running, "board.lower.params.by=2", "--json")
     answer = json.loads(done.stdout)

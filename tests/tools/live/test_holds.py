@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Run, System
 from rack.boards.config import load, wire
-from rack.levels.messages import Error
 from rack.levels.operator import Answer, Goal, Operation
 from rack.tools.live.holds import STILL_S, Standstill, find_holds
 from rack.tools.live.newest import Newest
@@ -111,20 +109,3 @@ def test_a_standstill_is_one_event_for_each_hold(segment: Segment) -> None:
     assert event.text.startswith(
         "nothing has moved for 6 s: upper held by the operator (hold), since 0.25 s; "
     )
-
-
-@pytest.mark.parametrize(("error", "asks"), [(Error.DISABLED, "enable"), (Error.DRIVES, "reset")])
-def test_an_arm_that_is_not_enabled_says_which_command_it_waits_for(
-    rack_name: str, error: Error, asks: str
-) -> None:
-    config = load("nasrem-three-poses", [f"name={rack_name}"])
-    with closing(Segment.create(wire(config), config.text())) as segment:
-        writer = open_writer(segment, "servo.status")
-        writer.message.state, writer.message.error = State.HOLDING, error
-        writer.message.reason = "why"
-        writer.write(400)
-        (hold,) = find_holds(Newest(segment))
-        writer.close()
-    unlink(rack_name)
-    assert (hold.level, hold.why) == ("servo", "holding: why")
-    assert hold.release == f"rack command {rack_name} servo {asks}"

@@ -156,22 +156,3 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
             continue
         assert running.outcome is not None
         assert running.outcome.cause == "task done"
-
-
-@pytest.mark.slow
-def test_a_script_that_fails_is_one_line_and_unknown_boards_are_refused(
-    hosted: Path, rack_name: str
-) -> None:
-    with console(hosted, rack_name):
-        script = hosted.parent / "bad.py"
-        script.write_text("number(1 / 0)\n")
-        done = rack("prompt", rack_name, "program", script)
-        assert (done.returncode, done.stderr) == (
-            1,
-            f"{script}: ZeroDivisionError: division by zero\n",
-        )
-        wrong = rack("prompt", rack_name, "adder")
-        assert wrong.returncode == 2
-        assert wrong.stderr.startswith(
-            f"BOARD = adder: not an external host board of '{rack_name}'; permitted: program"
-        )

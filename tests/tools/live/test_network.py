@@ -30,7 +30,6 @@ from rack.tools.live.newest import Newest
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.timing.analysis.report import network
 from rack.tools.timing.analysis.report_markdown import _network
-from rack.tools.timing.inventory import inventory, inventory_lines
 from tests.boards.lan.racks import rack_text
 
 TEXT = rack_text(
@@ -79,18 +78,6 @@ def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> Non
     shown = ("other-one  lost", "lan.other  other-one/pulse.status", "lan.pulse  pulse.status")
     assert [part for part in (*shown, "16  0.040") if part not in text] == []
     assert exchanged('name = "alone"') is None
-
-
-def test_check_shows_the_exchange() -> None:
-    config = loads(TEXT)
-    found = inventory(config, wire(config), [])
-    assert found["network"]["peers"] == ("other-one", "third")
-    text = "\n".join(inventory_lines(found))
-    assert (
-        "network: listen tcp/127.0.0.1:7447; works with other-one, third; lost after 500 ms: go on"
-        in text
-    )
-    assert "lan.other  in   other-one/pulse.status        50          100" in text
 
 
 class Recorded:

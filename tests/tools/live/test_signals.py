@@ -3,12 +3,11 @@ tick."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 
 import pytest
 
-from rack.tools.live.signals import Lines, SignalTap, Strip
+from rack.tools.live.signals import SignalTap, Strip
 from rack.tools.recording.signal import Signal
 from tests.backplane.bus import NAME
 from tests.link import Link, links
@@ -69,19 +68,3 @@ def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Sig
     strip.take()
     assert strip.table(5, 6) == [(6, [6, 6])]
     assert strip.time_s(6) == 0.015
-
-
-def test_lines_are_as_far_apart_as_was_asked(
-    link: Link, signals: list[Signal], capsys: pytest.CaptureFixture[str]
-) -> None:
-    strip = Strip(link.segment, signals, span=100)
-    link.run(0, 40)
-    strip.take()
-    lines = Lines(strip, first=4, every=10, as_json=True)
-    for last in (3, 15, 16, 39):
-        lines.show(last)
-    found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [line["tick"] for line in found] == [4, 14, 24, 34]
-    assert found[0] == {"time_s": 0.01, "tick": 4, f"{NAME}.row[3]": 4, f"{NAME}.id": 4}
-    Lines(strip, first=36, every=0, as_json=False).show(39)
-    assert capsys.readouterr().out.splitlines() == ["    0.0900  36  36", "    0.0950  38  38"]

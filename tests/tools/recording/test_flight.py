@@ -32,8 +32,6 @@ from rack.tools.recording.spool import STRETCHES
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.sink import ViewSink
-from rack.tools.viewer.window import free_port
 from tests.conftest import SMALL
 from tests.tools.recording.struck_recorders import Held
 
@@ -234,14 +232,3 @@ def test_what_is_kept_is_saved_while_the_run_goes_on(config: RackConfig, tmp_pat
     ticks = part.trace("lower")["tick"]
     assert len(ticks) > SECOND
     assert np.isin(ticks, whole.trace("lower")["tick"]).all()
-
-
-def test_a_viewer_is_served_and_its_file_is_not_written(config: RackConfig, tmp_path: Path) -> None:
-    (tmp_path / CONFIG).write_text(config.text())
-    with Rack(config) as rack:
-        view = ViewSink(rack.segment, tmp_path, free_port())
-        with Recorder(rack.segment, tmp_path, view) as recorder:
-            rack.run(0.5)
-            recorder.drain()
-    assert not (tmp_path / FILE).exists()
-    assert len(Recording(tmp_path).trace("lower")) == SECOND // 2

@@ -180,23 +180,6 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
 
 
 @pytest.mark.slow
-def test_rows_that_no_recorder_took_are_missing(config: RackConfig, tmp_path: Path) -> None:
-    taken, left = tmp_path / "taken", tmp_path / "left"
-    with Rack(config) as rack:
-        for folder in (taken, left):
-            folder.mkdir()
-            (folder / CONFIG).write_text(config.text())
-        with Recorder(rack.segment, left):
-            rack.run(0.5)
-        with Recorder(rack.segment, taken) as recorder:
-            recorder.drain()
-        assert Recording(taken).missing(rack.segment) == {}
-        missing = Recording(left).missing(rack.segment)
-    assert (missing["lower.status"], missing["lower"]) == ((200, 200), (200, 200))
-    assert missing["upper.status"] == (25, 25)
-
-
-@pytest.mark.slow
 def test_what_a_killed_recorder_took_is_readable(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -182,30 +182,12 @@ def test_a_core_that_ran_another_task_was_there(config: RackConfig, tmp_path: Pa
 def test_a_task_without_real_time_priority_shows_no_absence(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    # The launch was refused all of them; then only that of a planner, which waited for some
-    # program.
+    # The launch was refused all of them.
     long = {"upper": [Cycle(48, (0.0, 0.1, 15.0, 0.1)), Cycle(88, PLAIN)]}
-    refused = run(
-        tmp_path / "refused",
-        config,
-        away() | long,
-        late_clock(52, since=50, late_ms=5.9),
-        priority=0,
-    )
+    late = late_clock(52, since=50, late_ms=5.9)
+    refused = run(tmp_path / "refused", config, away() | long, late, priority=0)
     assert not found_in(refused).absences
     assert [cycles.stalled for cycles in cycles_of(refused).values()] == [0, 0]
-    waits = {
-        "lower.planner": [
-            Cycle(44, PLAIN, late=6.0, flags=PLANNED),
-            Cycle(60, PLAIN, late=6.0, flags=PLANNED),
-        ]
-    }
-    recording = run(tmp_path / "ordinary", config, {"lower": plain(SETTLED, 42)} | waits)
-    assert [(absence.core, absence.times) for absence in found_in(recording).absences] == [
-        (OTHER, 2)
-    ]
-    recording.ended["tasks"]["lower.planner"]["priority"] = 0
-    assert not found_in(recording).absences
 
 
 def test_what_was_counted_as_steal_is_not_counted_again(config: RackConfig, tmp_path: Path) -> None:

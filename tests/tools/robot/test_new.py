@@ -22,8 +22,6 @@ from tests.tools.robot.models import LIMIT, joint, link, urdf, written
 
 DESK_ARM = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml"
 EXAMPLE = DESK_ARM.with_suffix(".toml")
-MESH = '<geometry><mesh filename="package://small/meshes/l2.stl" scale="1 -1 1"/></geometry>'
-BOX = '<geometry><box size="0.1 0.1 0.1"/></geometry>'
 TAIL = "</robot>"
 LEVER = link("lever", "0.01 0.01 0.01", "0 0 0") + joint(
     "aside", "base", "lever", "0 0.2 0", "0 0 1", limit=LIMIT.format(low=-1, high=1, effort=9)
@@ -38,20 +36,11 @@ def follows(leader: str) -> str:
 
 BAD = {
     "no inertia": (urdf().replace('"1.0"', '"0"').replace('"0.01"', '"0"'), "inertia"),
-    "no mesh": (urdf().replace(BOX, MESH), "no mesh 'package://small/meshes/l2.stl'"),
     "two roots": (urdf().replace(TAIL, f'<link name="top"/>{TAIL}'), "roots: base, top"),
     "two links": (urdf().replace(TAIL, f'<link name="l2"/>{TAIL}'), "named twice: link 'l2'"),
     "two joints": (
         urdf().replace('joint name="j2"', 'joint name="j1"'),
         "named twice: joint 'j1'",
-    ),
-    "two joints in MJCF": (
-        DESK_ARM.read_text().replace('name="elbow"', 'name="waist"'),
-        "repeated name 'waist'",
-    ),
-    "no drives in MJCF": (
-        DESK_ARM.read_text().partition("<actuator>")[0] + "</mujoco>",
-        "no actuator and no effort at waist",
     ),
     "no drives": (urdf(effort=0.0, gripper=False), "no actuator and no effort at j1"),
     "coupled": (follows("j2"), "couples j2, j3, but the joints of an arm are driven independently"),

@@ -130,29 +130,12 @@ def test_the_next_smaller_change_would_not_do(judge: Judge) -> None:
     assert not judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=11").failing
 
 
-def test_a_new_core_is_asked_for_where_no_used_one_has_room(judge: Judge) -> None:
-    judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
-    change = change_of(judged, "planner_core")
-    assert change.settings["planner_core"] == 2
-    assert "planner_core 2 (not shared" in change.text
-    assert "this machine has no core 2, uses core 0" in change.text
-
-
 def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
     loosened = change_of(judged, "coupling")
     assert loosened.after.layout.mailbox("lower.plan").protocol == "time-slice"
     assert loosened.document()["protocols"] == {"lower.plan": "time-slice"}
     assert "lower.plan by time-slice" in loosened.text
-
-
-def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
-    loose = ["coupling=loose", "planner_slot=4", "planner_core=0", "budget.plan_ms=31"]
-    # 8.4 of every 40 are the upper level's.
-    judged = judge(*(f"board.lower.{setting}" for setting in loose))
-    assert {"planner_core": 2} in settings_for(judged)
-    # The upper level could go instead, at no cost.
-    assert changes_for(judged, "lower")[0].board == "upper"
 
 
 def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() -> None:

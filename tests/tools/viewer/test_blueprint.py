@@ -19,7 +19,6 @@ from rack.tools.viewer.cell import Marks
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, new_recording
 from rack.tools.viewer.style import LOST
-from rack.tools.viewer.timing import colours_of
 
 Part = rrb.Container | rrb.View
 
@@ -77,13 +76,6 @@ def test_the_first_view_shows_what_a_rack_is_about(name: str, contents: list[str
     shown = [list(view.contents) for view in plots(name, first=True)]
     found = {entity.replace("\\", "") for inner in shown for entity in inner}
     assert found.issuperset(contents)
-
-
-def test_a_planner_has_the_colour_of_its_board_dimmed() -> None:
-    colours = colours_of(wire(load("nasrem")))
-    assert colours["servo"] >> 8 == colours["servo.planner"] >> 8
-    assert colours["servo"] != colours["servo.planner"]
-    assert colours["servo"] != colours["primitive"]
 
 
 def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -146,20 +145,6 @@ def test_a_mailbox_is_struck_again_only_where_its_readers_would_tell_of_it_again
 def _lasts(table: Mapping[str, Any]) -> int:
     # A hang ends when it is found.
     return 0 if table["kind"] == "hang" else round(table.get("for", 0.0) * SECOND)
-
-
-def test_only_mailboxes_that_somebody_reads_are_struck(small: Path) -> None:
-    counting = load(small)
-    targets = Targets(counting, wire(counting))
-    struck = {
-        target.mailbox for found in targets.by_kind.values() for target in found if target.mailbox
-    }
-    # Nobody reads upper.status; lower.plan is of a planner, and no periodic message.
-    assert {target.mailbox for target in targets.by_kind["mute"]} == {
-        "upper.command",
-        "lower.status",
-    }
-    assert struck == {"upper.command", "lower.status", "lower.plan"}
 
 
 @pytest.mark.parametrize(

@@ -128,28 +128,6 @@ def test_the_figures_are_of_the_runs_that_they_are_about(report: dict[str, Any])
     assert report["shortfalls"] == ["trial 2: late", "overrun: did not strike"]
 
 
-def test_a_kind_counts_the_trials_in_which_it_struck(report: dict[str, Any]) -> None:
-    kinds = report["by_kind"]
-    assert {kind: (f["trials"], f["tasks_done"]) for kind, f in kinds.items()} == {
-        # One of them at tick 0.
-        "mute": (2, 1),
-        "sensor-bias": (1, 0),
-    }
-    points = report["sizes"]["sensor-bias"]["curve"]
-    assert [(point["size"], point["delay"]) for point in points] == [(0.01, None), (0.02, 5)]
-    assert [(fault["trial"], fault["kind"]) for fault in report["faults"]] == [
-        (1, "mute"),
-        (1, "mute"),
-        (2, "mute"),
-        (2, "sensor-bias"),
-    ]
-    assert [(trial["number"], trial["faults"]) for trial in report["trials"]] == [
-        (1, 2),
-        (2, 2),
-        (3, 0),
-    ]
-
-
 def test_the_text_says_what_the_document_holds(made: CampaignReport) -> None:
     lines = made.markdown().splitlines()
     assert lines[0] == "# Campaign on small, seed 9: fell short"

@@ -50,9 +50,3 @@ def test_a_chain_passes_a_message_on_in_every_cycle(tmp_path: Path) -> None:
     assert result.outcome.ticks == 40
     assert count_cycles(result.tasks[name] for name in chain.names) == (0, 80)
     assert recording.signal("board2.status", "sent").tolist() == [-1, *range(39)]
-
-
-def test_a_chain_of_boards_fills_the_crate() -> None:
-    layout = wire(loads(Chain(20, 400).text()))
-    assert [task.slot for task in layout.tasks] == list(range(2, 22))
-    assert layout.mailbox("board19.status").readers == ("board20",)

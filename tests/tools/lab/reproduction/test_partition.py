@@ -7,13 +7,11 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.boards.errors import ConfigError
 from rack.tools.lab.reproduction.experiments import partition
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.partition import (
     PARTITION,
     PARTITIONS,
-    Partition,
     Partitions,
 )
 from tests.boards.conftest import PLANNED
@@ -41,13 +39,6 @@ def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
         assert len(slots) == len(set(slots)) == len(rack.board) + 4 * name.startswith("loose")
     assert found["loose, 2 cores"].board["servo"].planner_core == 0
     assert found["tight, 2 cores"].board["world"].coupling == "none"
-
-
-def test_a_board_that_polls_cannot_share_the_only_core() -> None:
-    settings = ["wake=poll", "core=3", "coupling=loose", "planner_slot=9", "planner_core=1"]
-    config = load("nasrem", [f"board.servo.{setting}" for setting in settings])
-    with pytest.raises(ConfigError, match="needs a core of its own"):
-        Partition("tight", 1).of(config)
 
 
 def partitioned(

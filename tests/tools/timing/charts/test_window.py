@@ -34,16 +34,6 @@ def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_stil
     assert WindowOptions().window(level, None, 40 * MS) == (40 * MS, 120 * MS)
 
 
-def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
-    tasks = [
-        task("a", 10),
-        task("a.planner", 10, 2),
-        task("b", 10, core=1),
-        task("b.planner", 10, 4, core=0),
-    ]
-    assert shown_task(tasks).name == "a.planner"
-
-
 @pytest.mark.parametrize(
     ("from_ms", "to_ms", "extent_ms", "seen"),
     [
