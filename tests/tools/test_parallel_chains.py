@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.lab.benches.observed import record
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
-from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES
@@ -77,24 +75,3 @@ def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
     assert [response[way]["measured_ms"]["max"] for way in ("command", "status")] == [25.0, 42.5]
     assert [response[way]["holds"] for way in ("command", "status")] == [True, True]
     assert f"{TOGETHER}: eq. 3.2 bound 60, eq. 3.3 sum 25" in text
-
-
-@pytest.mark.slow
-def test_a_slower_joint_has_a_response_of_its_own(
-    jointed: Path, rack_name: str, tmp_path: Path
-) -> None:
-    config = load(jointed, [f"name={rack_name}", "board.joint2.rate_hz=100"])
-    recording = record(config, 1.0, tmp_path / "run").recording
-    first = write_report(recording.folder)[0]["system_response"]
-    (other,) = first["others"]
-    assert first["levels"] == ["path", "joint2", "arm"]
-    assert other["levels"] == ["path", "joint1, joint3", "arm"]
-    assert [found["command"]["measured_ms"]["max"] for found in (first, other)] == [32.5, 25.0]
-    assert first["command"]["holds"]
-    assert other["command"]["holds"]
-    subjects = {
-        pair.subject
-        for pair in Analysis.of(recording).pairs
-        if pair.equation == "3.3" and pair.measured
-    }
-    assert subjects == {"system, path > joint2 > arm", "system, path > joint1, joint3 > arm"}

@@ -13,7 +13,6 @@ from rack.boards.config import load
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.document import document
 from rack.tools.timing.analysis.tables import brief, text
 from tests.tools.command_line import rack
 from tests.tools.recordings import MS, Cycle, recorded
@@ -177,14 +176,3 @@ def test_a_level_that_is_late_though_its_times_fit_is_not_referred_to_the_check(
     analysis = Analysis.of(recorded(tmp_path / "run", config, {"lower": late}))
     assert not analysis.holds
     assert "to do: nothing about the config: its levels' own times fit" in brief(analysis)
-
-
-def test_alpha_and_deviation_are_those_of_equation_3_6(small: Path, tmp_path: Path) -> None:
-    trace = [Cycle(SETTLED, (0.0, 0.1, 2.0, 0.1)), Cycle(SETTLED + 1, (0.0, 0.4, 1.0, 0.1))]
-    recording = recorded(tmp_path / "run", load(small, ["clock.mode=realtime"]), {"lower": trace})
-    found = document(Analysis.of(recording))
-    # 2.5 less the longest execution and the longest communication, each part at its longest.
-    assert found["levels"]["lower"]["measured"]["residual_ns"] == pytest.approx(0, abs=1)
-    # Residuals of 0.3 and 1.0 ms.
-    assert found["tasks"]["lower"]["deviation_ms"] == pytest.approx(0.35)
-    assert found["levels"]["lower"]["predicted"] is None

@@ -148,15 +148,3 @@ def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
     assert "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque" in line
     (found,) = json.loads(check(*words, "--json").stdout)["patience"]
     assert [found[key] for key in ("board", "ms", "cycles", "energy_j")] == ["servo", 10, 4, 10.372]
-
-
-@pytest.mark.slow
-def test_verbose_shows_what_the_monitors_stand_for_an_arm_of_ones_own_more() -> None:
-    hardware = "configs/examples/own-hardware/hardware.toml"
-    (own,) = json.loads(check(hardware, "--json").stdout)["monitors"]
-    assert (own["position_mrad"], own["velocity_mrad_s"]) == ([0.375] * 7, [3.5] * 7)
-    assert (own["board"], own["jitter_ms"]) == ("servo", 0.125)
-    (simulated,) = json.loads(check("k1607", "--json").stdout)["monitors"]
-    assert (simulated["position_mrad"], simulated["jitter_ms"]) == ([0.025] * 7, 0.008)
-    lines = rack("check", hardware, "--verbose").stdout.splitlines()
-    assert sum(line.startswith("monitors: 'servo' takes samples for good") for line in lines) == 1

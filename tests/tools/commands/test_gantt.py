@@ -71,24 +71,6 @@ def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(tmp_path: P
 
 
 @pytest.mark.slow
-def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> None:
-    shown = rack("gantt", "fig3", "--to-ms", 24, "--out", tmp_path, "--json")
-    assert shown.stderr == ""
-    found = json.loads(shown.stdout)
-    (panel,) = found["panels"]
-    assert (panel["kind"], panel["from_ms"], panel["to_ms"]) == ("schedule", 0, 24)
-    update = next(span for span in panel["spans"] if span["unit"] == "U")
-    assert (update["start_ms"], update["end_ms"], update["task"]) == (22, 23, "level.planner")
-    late = [(job["task"], job["release_ms"], job["end_ms"]) for job in panel["jobs"] if job["late"]]
-    assert late == [("level.planner", 0, 23)]
-    assert (
-        sum(panel["patterns"]["level"]["plans"].values())
-        == panel["counts"]["level.planner"]["jobs"]
-    )
-    assert [Path(path).name for path in found["pictures"]] == ["gantt.png", "gantt.svg"]
-
-
-@pytest.mark.slow
 def test_a_run_is_shown_above_the_schedule_of_its_config(run: Path) -> None:
     shown = rack("gantt", run)
     assert (shown.returncode, shown.stderr) == (0, "")
@@ -118,17 +100,6 @@ def test_without_budgets_a_run_is_shown_alone_and_a_config_has_no_schedule(tmp_p
     shown = rack("gantt", tmp_path / "bare.toml")
     assert (shown.returncode, shown.stdout) == (2, "")
     assert "no board has a budget: give [board.<name>.budget]" in shown.stderr
-
-
-@pytest.mark.slow
-def test_a_static_schedule_is_drawn_with_its_frames(tmp_path: Path) -> None:
-    shown = rack("gantt", "cyclic", "--out", tmp_path, "--json")
-    (panel,) = json.loads(shown.stdout)["panels"]
-    assert (panel["frame_ms"], panel["to_ms"]) == (4, 8)
-    text = rack("gantt", "cyclic", "--out", tmp_path, "--from-ms", 4, "--to-ms", 16).stdout
-    assert [line.split() for line in text.splitlines() if line.startswith("frame")] == [
-        ["frame", "|1", "|2", "|3"]
-    ]
 
 
 def test_without_matplotlib_a_chart_is_printed_alone(

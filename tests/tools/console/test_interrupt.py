@@ -103,13 +103,6 @@ def test_a_signal_while_the_report_is_made_ends_the_command_after_it(
 
 
 @pytest.mark.slow
-def test_a_second_signal_ends_a_run_at_once(small: Path, rack_name: str, tmp_path: Path) -> None:
-    run = Run(small, rack_name, tmp_path / "run", "cycle", (TERM, INT))
-    assert run.ended()[0] in (128 + TERM, 128 + INT)
-    assert run.leaves_nothing()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("delay_s", [0.02, 0.25, 0.6])
 def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
     small: Path, rack_name: str, tmp_path: Path, delay_s: float

@@ -9,11 +9,10 @@ import pytest
 
 from rack.tools.faults.evidence import (
     Aftermath,
-    Detection,
     SkippedTicks,
     aftermath,
 )
-from tests.tools.fault_events import event, found, strike
+from tests.tools.fault_events import event, strike
 
 KILL = strike("kill", "lower", 100)
 
@@ -46,20 +45,6 @@ def test_skipped_ticks_are_those_that_one_task_has_missed_and_no_more_than_there
     first: int, last: int, skipped: int
 ) -> None:
     assert SKIPS.between(first, last) == skipped
-
-
-def test_the_best_detection_is_within_its_bound_then_early() -> None:
-    seen = found(1, "a", "b")
-    late = Detection(seen, 2, 1)
-    slow = Detection(seen, 9, 10, 3.0)
-    early = Detection(seen, 4, 10, 3.0)
-    earliest = Detection(seen, 4, 10, 1.0)
-    assert sorted([late, slow, early, earliest], key=lambda one: one.order) == [
-        earliest,
-        early,
-        slow,
-        late,
-    ]
 
 
 RESTART = event(105, "reaction", "restart", "lower")

@@ -150,20 +150,3 @@ def test_waits_have_an_end(rack: Running, monkeypatch: pytest.MonkeyPatch) -> No
         rack.live.inject(later, True)
     with pytest.raises(Failure, match=f"rack '{rack.segment.rack}': its run is over"):
         rack.live.inject(later, False)
-
-
-def test_the_table_has_what_each_waits_for_and_no_numbers_that_are_not_known(
-    rack: Running,
-) -> None:
-    for tick in (TICK + 1, TICK + 2):
-        rack.live.inject({"board": "lower", "kind": "kill", "tick": tick}, False)
-    rack.begin(1)
-    entry = rack.table.entries[1]
-    entry.struck_tick = 0
-    _, first, second = map(str.rstrip, rack.live.text())
-    numbers = first.removesuffix(f"  tick {TICK + 1}; the rack is at tick {TICK}").split()
-    assert numbers[-5:] == ["waiting", str(TICK + 1), "-", "-", "0"]
-    # Begins, first acted, until, acted.
-    assert second.split()[-4:] == [str(TICK + 1), "0", str(TICK + 9), "0"]
-    # Two faults of one run do not draw the same random numbers.
-    assert rack.table.entries[0].seed != rack.table.entries[1].seed

@@ -274,20 +274,3 @@ def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(
     process.communicate(timeout=BOUND_S)
     assert process.returncode == (-end if end == signal.SIGKILL else 128 + end)
     assert table.waiting() == []
-
-
-@pytest.mark.slow
-def test_the_end_of_the_run_ends_a_wait(tmp_path: Path) -> None:
-    name = f"test-command-end-{os.getpid()}"
-    process = start(tmp_path / "told.toml", name, "clock.mode=realtime")
-    try:
-        table = OperatorTable(Segment.attach(name))
-        command = [*RACK, "command", name, "upper", "hold", "--tick", str(10**9)]
-        waiting = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-        wait_until(table.waiting)
-        rack("stop", name)
-        _, printed = waiting.communicate(timeout=BOUND_S)
-        assert waiting.returncode == 1
-        assert printed.splitlines()[-1] == "'upper', hold: the run ended before it was given"
-    finally:
-        end(process, name)

@@ -11,9 +11,7 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input
 
-from rack.backplane.lines import UtilityLines
-from rack.backplane.segment import Segment, racks
-from rack.backplane.words import System
+from rack.backplane.segment import racks
 from rack.tools.live.full_screen import RackScreen
 from rack.tools.live.watched import LocalRack
 from tests.processes import wait_until
@@ -96,37 +94,6 @@ def test_keys_hold_a_level_and_let_it_resume(running: str) -> None:
         await shows(pilot, not_any_more="held by the operator")
 
     on_screen(running, act, (100, 30))
-
-
-def test_keys_set_the_emergency_stop_and_reset_it(running: str) -> None:
-    segment = Segment.attach(running)
-    stop = UtilityLines(segment)
-
-    async def act(pilot: Pilot[None]) -> None:
-        await pilot.press("e")
-        assert stop.emergency_stop
-        await shows(pilot, "EMERGENCY STOP")
-        await pilot.press("E")
-        assert not stop.emergency_stop
-
-    on_screen(running, act)
-
-
-def test_a_screen_of_twenty_by_five_loses_nothing_and_the_rack_runs_on(running: str) -> None:
-    segment = Segment.attach(running)
-
-    async def act(pilot: Pilot[None]) -> None:
-        for pane in "1234":
-            await pilot.press(pane, "i", "escape", "c", "escape")
-            await pilot.resize_terminal(20, 5)
-            await pilot.pause(0.3)
-            await pilot.resize_terminal(120, 40)
-        before = segment.words[System.TICK]
-        await pilot.press("1")
-        await shows(pilot, "upper", "lower", "executing")
-        assert segment.words[System.TICK] > before
-
-    on_screen(running, act)
 
 
 def test_a_fault_of_the_menu_strikes_the_chosen_level(running: str) -> None:

@@ -97,14 +97,6 @@ def test_entries_of_another_rack_are_refused_in_one_line(
     assert none.stderr == f"--entries {run}: '{rack_name}' has no adapter\n"
 
 
-def test_check_shows_the_host_side_and_leaves_it_out_of_the_timing(hosted: Path) -> None:
-    text = rack("check", hosted, "--verbose").stdout
-    assert "program    host_programs:Counting  program.numbers  bridge.sum" in text
-    found = json.loads(rack("check", hosted, "--json").stdout)
-    assert [task["task"] for task in found["tasks"]] == ["bridge", "adder"]
-    assert found["hosts"][0]["writes"] == ["program.numbers"]
-
-
 @contextmanager
 def console(hosted: Path, name: str) -> Iterator[Rack]:
     """Run a rack with an external host board."""

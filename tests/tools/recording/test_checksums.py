@@ -9,13 +9,12 @@ import random
 import shutil
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.checkpoint.format import read as read_checkpoint
 from rack.boards.config import RackConfig, load
@@ -154,37 +153,6 @@ def test_a_flipped_bit_in_what_a_recorder_leaves_is_named(
             Recording(again)
         shutil.rmtree(again)
     assert values(copy)
-
-
-@pytest.mark.slow
-def test_an_error_in_a_recorder_costs_no_row(
-    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A recorder without memory for a block of rows ends; the next one takes them from its
-    spool."""
-    (tmp_path / CONFIG).write_text(config.text())
-
-    def fail(*arguments: object, **named: object) -> None:
-        raise MemoryError
-
-    with Rack(config) as running, bounded():
-        segment = running.segment
-        running.run_in_background(3.0)
-        with ExitStack() as stack:
-            recorder = stack.enter_context(Recorder(segment, tmp_path))
-            while segment.words[System.TICK] < 1000:
-                recorder.drain()
-            monkeypatch.setattr("rack.tools.recording.run_files.RunFiles.add", fail)
-            with pytest.raises(MemoryError) as error:
-                recorder.drain()
-            monkeypatch.undo()
-            stack.pop_all().__exit__(error.type, error.value, error.tb)
-        with Recorder(segment, tmp_path) as recorder:
-            recorder.follow()
-        recording = Recording(tmp_path)
-        assert recording.missing(segment) == {}
-    serials = recording.signal("lower.status", "serial")
-    assert np.array_equal(serials, np.arange(1, 1201))
 
 
 def test_a_value_that_is_not_a_number_is_null_in_json_and_comes_back() -> None:

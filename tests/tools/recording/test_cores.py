@@ -58,14 +58,6 @@ def test_a_rise_is_found_with_its_core_and_the_looks_around_it(machine: Path) ->
     assert CoreRecord.of(record.text()) == record
 
 
-def test_a_kernel_that_counts_no_steal_is_not_measured(machine: Path) -> None:
-    (machine / "stat").write_text("cpu  9 9 9 9\ncpu0 1 1 1 1\n")
-    found = CoreMeter()
-    found.look()
-    assert found.record().stolen is None
-    assert found.record().mhz == ()
-
-
 def test_frequencies_are_those_of_cpuinfo_without_cpufreq(machine: Path) -> None:
     found = CoreMeter()
     for mhz in ("2600.000", "1200.5"):

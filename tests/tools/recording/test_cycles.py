@@ -90,15 +90,6 @@ def test_a_process_that_starts_up_is_not_counted(config: RackConfig, tmp_path: P
     assert found.process_ns == 2_200_000
 
 
-def test_a_percentile_leaves_out_what_a_host_stalls_now_and_then(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    trace = [Cycle(SETTLED + k, (0.0, 0.1, 9.0 if k == 500 else 1.0, 0.2)) for k in range(1000)]
-    recording = recorded(tmp_path / "run", config, {"lower": trace})
-    assert measured_budgets(recording)["lower"].process_ns == 9 * MS
-    assert measured_budgets(recording, 99.0)["lower"].process_ns == MS
-
-
 def test_a_recording_without_the_new_times_is_refused_in_one_line(
     config: RackConfig, tmp_path: Path
 ) -> None:

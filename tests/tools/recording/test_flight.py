@@ -135,19 +135,6 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     assert recording.kept_text in str([chunk.to_record_batch().to_pydict() for chunk in logged])
 
 
-def test_a_run_that_is_shorter_than_what_is_kept_is_as_any_other(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
-    names = [f"name={rack_name}"]
-    for folder, settings in (("whole", names), ("flight", [*names, RECORD])):
-        assert run_rack(load(small, settings), 3.0, tmp_path / folder, Display()).worked
-    whole, flight = (Recording(tmp_path / name) for name in ("whole", "flight"))
-    assert (flight.kept, flight.kept_text) == ([], "")
-    assert first_difference(whole, flight) is None
-    for name in ("lower", "upper", *whole.mailboxes):
-        assert len(flight.rows(name)) == len(whole.rows(name))
-
-
 def test_a_recorder_that_is_killed_goes_on_with_the_next_stretch(
     config: RackConfig, tmp_path: Path
 ) -> None:

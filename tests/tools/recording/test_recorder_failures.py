@@ -3,16 +3,13 @@ and the user gets a message."""
 
 from __future__ import annotations
 
-import re
 import signal
-import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from rerun.chunk import RrdReader
 
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
@@ -32,9 +29,7 @@ from rack.tools.recording.spool import Spool, locked
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.timing.analysis.tables import text as analysis_text
-from rack.tools.viewer.window import executable
 from tests.tools.recording.struck_recorders import (
-    FIRST_BLOCK,
     LONG_S,
     AtTick,
     Held,
@@ -74,19 +69,6 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
     assert counts(recording) == counts(Recording(tmp_path / "whole"))
     # The viewer's file is not written over.
     assert {"run.rrd", "run-2.rrd"} < {path.name for path in (tmp_path / "run").iterdir()}
-
-
-@pytest.mark.slow
-def test_recorders_killed_before_their_first_block_cost_no_row(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    # Each new one, too, is struck as soon as it is there.
-    display = Held(config.name, signal.SIGKILL, tick=0, times=recorder_process.RESTARTS)
-    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
-    assert len(display.struck) == recorder_process.RESTARTS
-    assert (result.worked, result.recording, result.rows_lost) == (True, "complete", {})
-    serials = Recording(tmp_path / "run").signal("lower.status", "serial")
-    assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
 
 
 @pytest.mark.slow
@@ -177,33 +159,6 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
     assert f"lower: judged by {taken['lower']:,} of {ticks:,} cycles" in analysis_text(
         Analysis.of(recording)
     )
-
-
-@pytest.mark.slow
-def test_what_a_killed_recorder_took_is_readable(
-    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder_process, "RESTARTS", 0)
-    display = AtTick(signal.SIGKILL, view=tmp_path / "run" / "run.rrd")
-    result = run_rack(realtime(config), LONG_S, tmp_path / "run", display)
-    # The run went well, but is not recorded as wanted.
-    assert (result.outcome.worked, result.worked) == (True, False)
-    assert re.fullmatch(
-        r"[0-9,]+ of [0-9,]+ rows of lower.* are missing .*ended with status -9", result.recording
-    )
-    report, _ = write_report(tmp_path / "run")
-    assert (report["worked"], report["recording"]) == (False, result.recording)
-    assert report["rows_lost"] == result.rows_lost
-    assert notes_of(Recording(tmp_path / "run")) == [
-        "the recorder ended with status -9; the run continues, unrecorded"
-    ]
-    ticks = pq.read_table(tmp_path / "run" / "signals" / "lower.status.parquet")["tick"].to_numpy()
-    assert ticks.max() > FIRST_BLOCK / 2
-    repaired = tmp_path / "repaired.rrd"
-    for words in (("optimize", tmp_path / "run" / "run.rrd", "-o"), ("verify",)):
-        command = [executable(), "rrd", *words, repaired]
-        subprocess.run(command, check=True, capture_output=True, timeout=WATCHDOG_S)
-    assert RrdReader(str(repaired)).stream().filter(content="/boards/**").to_chunks()
 
 
 @pytest.mark.slow

@@ -13,9 +13,6 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.levels.errors import RobotError
-from rack.tools.commands.robot import drafting
-from rack.tools.console.answer import Failure
 from tests.processes import RACK
 from tests.tools.command_line import ROOT, rack
 from tests.tools.robot.models import LIMIT, joint, link, urdf, written
@@ -145,13 +142,6 @@ def test_the_command_that_it_prints_finds_the_new_rack(
     config = load(shlex.split(command)[2])
     assert config.robot is not None
     assert config.robot.joints == tuple(f"j{k}" for k in range(1, 7))
-
-
-def test_errors_name_the_users_file_in_place_of_a_temporary_one(tmp_path: Path) -> None:
-    with pytest.raises(Failure) as refused, drafting(Path("own arm.urdf")) as folder:
-        raise RobotError(f"no gripper: model '{folder / 'a' / 'a.xml'}': geom 'g' not found")
-    assert str(refused.value) == "no gripper: model 'own arm.urdf': geom 'g' not found"
-    assert not folder.exists()
 
 
 @pytest.mark.slow

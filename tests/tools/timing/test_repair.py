@@ -106,17 +106,6 @@ def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
     assert first.after.failing == ()
 
 
-def test_a_longer_cycle_of_a_board_on_the_same_core_is_a_change_too(judge: Judge) -> None:
-    # Every 40 ms 4 cycles of each level, 4.45 and 3.2, and 11.7 of planning: 42.3; with half of the
-    # upper level's 35.9.
-    settings = ("core=1", "priority=85", "rate_hz=100", "budget.process_ms=1")
-    full = ("timing.clock_ms=2.2", "board.lower.budget.plan_ms=11")
-    judged = judge(*(f"board.upper.{setting}" for setting in settings), *full)
-    change = next(change for change in changes_for(judged, "lower") if change.board == "upper")
-    assert change.settings == {"every": 8, "rate_hz": None}
-    assert change.after.failing == ()
-
-
 def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1")
     for change in changes_for(judged, "lower"):

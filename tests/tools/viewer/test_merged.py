@@ -143,17 +143,3 @@ def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
         pytest.skip(str(error))
     assert look.complaints == ()
     assert {"signals: whole in grey, other in colour", "log of all runs"} <= views
-
-
-@pytest.mark.slow
-def test_runs_that_cannot_be_shown_together_are_refused(branched_runs: Path) -> None:
-    for arguments, why in (
-        (("other", "whole"), "one with --against the other"),
-        (("other", "whole", "--against", "whole"), "--against: permitted with one RUN"),
-        (("other", "--against", "nowhere"), "nowhere: no such folder"),
-        (("other", "--against", "other"), "permitted: two runs of one rack"),
-    ):
-        refused = rack("replay", *arguments, "--out", "both.rrd", folder=branched_runs)
-        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
-        assert why in refused.stderr
-    assert not (branched_runs / "both.rrd").exists()

@@ -95,21 +95,6 @@ def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
 
 
 @pytest.mark.slow
-def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> None:
-    end_ns = round(NASREM_S * 1e9)
-    for chunk in (
-        RrdReader(str(run.folder / "run.rrd")).stream().filter(is_static=False).to_chunks()
-    ):
-        if chunk.entity_path.startswith("/__"):
-            continue
-        assert {"sim_time", "tick", "wall"} <= set(chunk.timeline_names), chunk.entity_path
-        times = chunk.to_record_batch().column("sim_time").to_numpy().astype(np.int64)
-        assert times.min() >= 0, chunk.entity_path
-        # A plan shows from the tick at which it can be used, which may be after the end.
-        assert times.max() <= end_ns + 2 * 10**9, chunk.entity_path
-
-
-@pytest.mark.slow
 def test_config_and_events_are_in_it(run: Recording) -> None:
     file = run.folder / "run.rrd"
     document = (
@@ -154,12 +139,3 @@ def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
         pytest.skip(str(error))
     assert look.complaints == ()
     assert look.picture.startswith(b"\x89PNG")
-
-
-@pytest.mark.slow
-def test_lockstep_shows_no_time_that_is_held_against_the_clock(run: Recording) -> None:
-    lateness, execution, deadline = read(run.folder / "run.rrd", "/times/servo").values.T
-    assert np.isnan([lateness, deadline]).all()
-    assert (execution > 0.0).all()
-    with pytest.raises(KeyError):
-        read(run.folder / "run.rrd", "/load/servo")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from random import Random
 from typing import Any
 
 import pytest
@@ -22,7 +21,6 @@ from rack.tools.faults.campaigns.draw import (
     HOLDS_UP_S,
     LEAD_S,
     MOST_FAULTS,
-    Card,
     RackUnderTest,
     fault_plans,
     size_plans,
@@ -53,18 +51,6 @@ def kinds(course: RackUnderTest) -> list[str]:
 def drawn(course: RackUnderTest, kinds: Sequence[str], seed: str, lockstep: bool) -> list[Plan]:
     fitting = [kind for kind in kinds if not (lockstep and needs_real_time(kind))]
     return fault_plans(course, dict.fromkeys(fitting, COUNT), seed, lockstep, first=1)
-
-
-def test_a_mailbox_is_silent_for_as_long_as_its_fastest_reader_needs_to_notice(
-    course: RackUnderTest,
-) -> None:
-    # The scene is written in every eighth cycle of its board.
-    rng = Random(1)
-    cards = [Card.draw(course, "mute", rng) for _ in range(200)]
-    assert "servo.scene" in {card.target.mailbox for card in cards}
-    for card in cards:
-        box = course.targets.layout.mailbox(card.target.mailbox or "")
-        assert card.ticks > 2 * box.every + card.target.reader
 
 
 def test_every_plan_fits_its_rack(

@@ -57,12 +57,6 @@ def test_what_did_not_strike_is_drawn_and_neither_injected_nor_detected() -> Non
     )
 
 
-def test_a_size_that_need_not_be_found_counts_nowhere() -> None:
-    small = judgement("sensor-bias", delay=None, is_judged=False, size=1e-4)
-    assert totals([small]).injected == 0
-    assert by_kind([small], TICK_NS) == {}
-
-
 def test_cycles_are_of_the_task_concerned_and_parts_of_each_bound() -> None:
     faults = [judgement(delay=2), judgement(delay=4), judgement(delay=12, cycle=12, bound=12)]
     figures = by_kind(faults, TICK_NS)["mute"]
@@ -75,13 +69,6 @@ def test_cycles_are_of_the_task_concerned_and_parts_of_each_bound() -> None:
 def test_kinds_stand_in_the_order_of_the_table_of_kinds_and_kills_from_outside_last() -> None:
     faults = [judgement(EXTERNAL), judgement("command-nan"), judgement("kill"), judgement("mute")]
     assert list(by_kind(faults, TICK_NS)) == ["kill", "mute", "command-nan", EXTERNAL]
-
-
-def test_recovery_is_in_ms_of_simulated_time() -> None:
-    faults = [judgement(recovery=100, reactions=("restart",)), judgement(recovery=200), judgement()]
-    figures = by_kind(faults, TICK_NS)["mute"]
-    assert figures.recovery_ms == Spread(375.0, 500.0)
-    assert figures.reactions == ["restart"]
 
 
 def test_a_death_is_measured_in_time_where_time_is_its_bound() -> None:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.config import load
-from rack.tools.faults.campaigns import trial
 from rack.tools.faults.campaigns.plan import Kill, Plan
-from rack.tools.faults.campaigns.trial import Killer, _watch, run_trial
+from rack.tools.faults.campaigns.trial import Killer, run_trial
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
@@ -104,60 +102,3 @@ def test_a_rack_that_a_fault_keeps_from_launching_is_tried_without_it(
     # Two seconds of simulated time.
     assert (found.again.cause, found.again.ticks) == ("time over", 800)
     assert (found.strikes, found.run) == ((), None)
-
-
-class Run:
-    """A run as a trial sees it: its ticks go on by `pace` at each look, and it ends when it is told
-    to, unless it is `stuck`."""
-
-    def __init__(self, pace: int, now: list[float], stuck: bool = False) -> None:
-        self.words = [0] * (System.SYSFAIL + 1)
-        self.segment = SimpleNamespace(words=self.words)
-        self.config = SimpleNamespace(clock_ns=PERIOD_NS)
-        self.stopped: list[str] = []
-        self.looks = 0
-        self._pace = pace
-        self._now = now
-        self._stuck = stuck
-
-    def start(self, seconds: float | None) -> None:
-        """Begin."""
-        self.seconds = seconds
-
-    def stop(self, why: str) -> None:
-        """Note it."""
-        self.stopped.append(why)
-
-    def watch(self, timeout_s: float) -> bool:
-        """Let half a second pass."""
-        self.looks += 1
-        self._now[0] += 0.5
-        self.words[System.TICK] += self._pace
-        return self._stuck or not self.stopped
-
-
-NO_KILLS = SimpleNamespace(due_in_s=lambda: 0.5, advance=lambda: None)
-LONG = "the trial takes too long"
-
-
-@pytest.mark.parametrize(
-    ("ticks", "seconds", "pace", "ends_at"),
-    [
-        # Four times the length, and a minute.
-        (1000, None, 1000, 4000 + 24_000),
-        (1000, 90.0, 1000, 4000 + 36_000),
-        # Half an hour where no length is known.
-        (0, None, 40_000, 720_000),
-    ],
-)
-def test_no_run_goes_on_for_ever(
-    monkeypatch: pytest.MonkeyPatch, ticks: int, seconds: float | None, pace: int, ends_at: int
-) -> None:
-    now = [100.0]
-    monkeypatch.setattr(trial, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    run = Run(pace, now)
-    _watch(run, NO_KILLS, ticks, seconds)  # type: ignore[arg-type]
-    assert run.stopped == [LONG]
-    assert run.seconds == seconds
-    # The look after it is the first beyond.
-    assert ends_at < run.words[System.TICK] <= ends_at + 2 * pace

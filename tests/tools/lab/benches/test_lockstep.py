@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.harness import Sample
 from rack.tools.lab.benches.lockstep import BARE, compare, differences, run_bare
@@ -48,19 +47,3 @@ def test_speeds_follow_from_times_and_the_ratios_from_the_baseline() -> None:
             "simulated seconds a second:"
             " nasrem 4.17 (this tree), nasrem 2 (base), nasrem 6.25 (no rack)"
         )
-
-
-def fails() -> None:
-    raise Failure("no reason")
-
-
-def exits() -> None:
-    raise SystemExit(4)
-
-
-@pytest.mark.slow
-def test_work_apart_raises_what_it_raised_and_says_when_it_ended() -> None:
-    with pytest.raises(Failure, match=r"^no reason$"):
-        apart(fails)
-    with pytest.raises(Failure, match="ended with status 4"):
-        apart(exits)

@@ -108,25 +108,6 @@ def test_the_verdict_comes_first_and_says_up_to_which_rate_and_why_no_further() 
 
 
 @pytest.mark.slow
-def test_a_rack_is_run_at_every_rate_and_who_is_absent_is_named(
-    waves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
-    found = measure(str(waves), (800, 400), Runs(0.8, 1, True), Progress())
-    assert [one.rate_hz for one in found.rates] == [400, 800]
-    assert [sample.case for sample in found.samples] == ["400 Hz", "800 Hz"]
-    for one, sample in zip(found.rates, found.samples, strict=True):
-        assert 0 < sample.count <= one.cycles <= 0.8 * one.rate_hz
-        assert (one.late, one.failure) == (None, "")
-    absent = {one.who: one.line for one in found.absent}
-    assert "apt-get install rt-tests" in absent[CYCLICTEST]
-    assert "missing cannot be opened" in absent[found.who + AWAKE]
-    assert found.conclusion == ""
-    # Without its baseline a case has no ratios.
-    assert all(found.ratio(sample) is None for sample in found.samples)
-
-
-@pytest.mark.slow
 def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
     waves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,9 +22,7 @@ from rack.tools.lab.reproduction.experiments import (
     response,
     sharing,
     systems,
-    tasks,
 )
-from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.sharing import WAITS
 from rack.tools.lab.reproduction.page import PaperClaim
 from rack.tools.lab.reproduction.rules import judge_layers
@@ -250,32 +248,6 @@ def test_claims_do_not_hold_in_a_rack_that_breaks_them(
         verdict = row.judge(workshop, CLAIMS[row.claim])
         assert row.unmet in describe_unmet(verdict.checks), verdict
         assert verdict.ruling is Ruling.FAILS
-
-
-HEALTHY = (
-    Breaking("two-levels", "", judge=lambda workshop, claim: claim.judge()),
-    Breaking("bounded-waits", "", {"nasrem": LOCKSTEP}, 3.5, ONE_LOSS),
-)
-"""Racks that keep a claim, where a run is short and needs no real time; test_rules.py and
-test_figures.py have the others, by data."""
-
-
-@pytest.mark.parametrize("row", HEALTHY, ids=lambda row: row.claim)
-def test_a_claim_holds_in_a_rack_that_keeps_it(row: Breaking, tmp_path: Path) -> None:
-    workshop = BreakingWorkshop(tmp_path, row.changes, row.seconds, row.scripts)
-    verdict = row.judge(workshop, CLAIMS[row.claim])
-    assert describe_unmet(verdict.checks) == ""
-    assert verdict.ruling is Ruling.HOLDS
-
-
-@pytest.mark.alone
-def test_a_task_that_takes_too_long_is_ended_and_not_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tasks, "PATIENCE", 0.5)
-    found = tasks.TASKS["hic"].make(Workshop(tmp_path, share=True))
-    assert found.ended == "stopped"
-    assert 0.0 < found.lasted_s < tasks.TASKS_S["hic"]
 
 
 def test_every_ruling_of_the_page_can_fail() -> None:

@@ -224,18 +224,6 @@ def test_an_operators_command_is_the_cause(ran: Run) -> None:
     assert [cycle["mailbox"] for cycle in chain] == boxes
 
 
-@pytest.mark.alone
-def test_a_run_in_real_time_is_not_repeated(ran: Run) -> None:
-    one = ran("one", REMEMBERING)
-    two = ran("two", REMEMBERING, "board.wave.params.factor=2", "clock.mode=realtime")
-    found = why(one, two)
-    assert found["repetition"] is None
-    # A cycle that was missed would be a cause of its own.
-    is_late = any(clue["kind"] in ("late", "skipped") for clue in found["chain"][-1]["clues"])
-    assert found["not_repeated"] == ("" if is_late else f"{two.folder} ran in real time")
-    assert why(one, one, repeats=False)["not_repeated"] == ""
-
-
 def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
     runs: tuple[Run, Recording, Recording], ran: Run, tmp_path: Path
 ) -> None:

@@ -77,13 +77,6 @@ def test_remnants_and_short_gaps_are_not_told_of_what_was_measured() -> None:
     assert order(*measured, detail=Detail()) == "P - R X - P -"
 
 
-def test_a_plan_in_its_executors_own_memory_is_read_without_communication() -> None:
-    times = {Unit.EXCHANGE: 10}
-    tight = replace(LANE, planner="a.planner")
-    assert Detail.measured(LANE, times).short_ns[Unit.EXCHANGE] < 10
-    assert Detail.measured(tight, times).short_ns[Unit.EXCHANGE] > 10
-
-
 @pytest.mark.parametrize("start", [0, 1, 799, 800])
 def test_patterns_begin_on_the_grid_and_in_the_stretch(start: int) -> None:
     chart, lane = simulate([EXECUTOR], 8000), lanes_of([EXECUTOR])[0]
