@@ -169,3 +169,12 @@ def test_a_rack_that_fits_is_left_alone(judge: Judge) -> None:
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts tell what this machine lacks: let every machine have two cores."""
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1})
+
+
+def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
+    loose = ["coupling=loose", "planner_slot=4", "planner_core=0", "budget.plan_ms=31"]
+    # 8.4 of every 40 are the upper level's.
+    judged = judge(*(f"board.lower.{setting}" for setting in loose))
+    assert {"planner_core": 2} in settings_for(judged)
+    # The upper level could go instead, at no cost.
+    assert changes_for(judged, "lower")[0].board == "upper"

@@ -206,3 +206,16 @@ def test_a_trial_that_falls_short_leaves_a_plan_that_repeats_it(make: MakeCampai
     (path,) = campaign.folder.glob("trial-*.toml")
     assert path.name == "trial-0001.toml"
     assert path.read_text() == trials.made[1].toml("small")
+
+
+def test_a_rack_that_is_done_in_time_is_run_as_often_as_fills_the_faultless_time(
+    make: MakeCampaign,
+) -> None:
+    campaign, trials = make(faultless_s=25.0, modes=(False,), kinds="mute", loads=(False,))
+    results = campaign.run()
+    faultless = [plan for plan in trials.made if plan.purpose == "faultless"]
+    # Each is done after 10 s.
+    (stretch,) = results.faultless
+    assert len(faultless) == len(stretch.runs) == 3
+    assert (stretch.load, stretch.seconds) == ("", 30.0)
+    assert not any(plan.lockstep for plan in faultless)

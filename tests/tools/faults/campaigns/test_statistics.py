@@ -9,6 +9,7 @@ from rack.tools.faults.campaigns.statistics import (
     EventRate,
     Spread,
     by_kind,
+    curve,
     rate,
     totals,
     wilson,
@@ -91,3 +92,15 @@ def test_a_rate_stays_below_what_so_few_events_leave_possible() -> None:
     assert rate(0, 3600.0) == EventRate(0.0, 2.996)
     assert rate(2, 7200.0) == EventRate(1.0, 3.148)
     assert rate(0, 0.0) is None
+
+
+def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
+    faults = [
+        judgement("sensor-bias", size=0.1),
+        judgement("sensor-bias", size=0.001, delay=None),
+        judgement(),
+    ]
+    assert [(point.size, point.delay_ms) for point in curve(faults, "sensor-bias", TICK_NS)] == [
+        (0.001, None),
+        (0.1, 12.5),
+    ]

@@ -94,13 +94,6 @@ def test_html_fetches_nothing_and_holds_every_word(document: str) -> None:
     } <= set(links.texts)
 
 
-def test_markdown_shows_pictures_next_to_it_and_keeps_tables_whole() -> None:
-    document = render_markdown(PAGE)
-    assert re.findall(r"!\[[^\]]*\]\(([^)]+)\)", document) == ["pictures/one.svg"]
-    assert "| servo: t_plan &lt; R_i | 1.5 | &lt; 1 | NO |" in document.splitlines()
-    assert "- [3.3 Higher levels](#section-3.3)\n  - ↯ [Equation 3.8](#equation-3.8)" in document
-
-
 def test_data_are_plain(tmp_path: Path) -> None:
     data = json.loads(json.dumps(PAGE.document()))
     assert (data["facts"], data["rulings"]) == ({"cores": "2"}, {"contradicts": 1, "holds": 0})

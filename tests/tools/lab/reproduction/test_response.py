@@ -3,21 +3,14 @@ serials."""
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
-from random import Random
 
 import pytest
 
-from rack.boards.config import load, rack_timing, wire
 from rack.boards.config.schema import CommandConfig
-from rack.levels.timing.command_path import command_paths
 from rack.tools.lab.reproduction.experiments import response
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.response import (
-    COMMANDS,
-    RUN_S,
-    draw_commands,
     first_difference,
     measure,
 )
@@ -25,20 +18,6 @@ from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
 pytestmark = pytest.mark.thorough
-
-
-def test_commands_are_drawn_with_room_for_each_response_and_a_seed_draws_the_same() -> None:
-    config = load("nasrem")
-    layout = wire(config)
-    found = command_paths(rack_timing(config, layout), layout)
-    drawn = draw_commands(found, config.clock_ns, Random(7))
-    assert 2 <= len(drawn) <= COMMANDS
-    assert drawn == draw_commands(found, config.clock_ns, Random(7))
-    assert drawn != draw_commands(found, config.clock_ns, Random(8))
-    ticks = [(command.tick or 0, found[command.level].longest) for command in drawn]
-    assert all(tick + longest < following for (tick, longest), (following, _) in pairwise(ticks))
-    assert ticks[-1][0] + ticks[-1][1] < RUN_S / 0.0025
-    assert [command.what for command in drawn] == ["hold", "resume"] * (len(drawn) // 2)
 
 
 @pytest.mark.slow

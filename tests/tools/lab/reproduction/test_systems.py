@@ -17,15 +17,6 @@ from tests.boards.conftest import PLAIN
 from tests.boards.vector_racks import JOINTED
 
 
-def test_what_a_config_promises_is_read_from_it_alone() -> None:
-    config = load("nasrem")
-    found = prediction(config)
-    assert found.levels == ("task", "elemental_move", "primitive", "servo")
-    assert found.rates_hz == pytest.approx((1, 4, 50, 400))
-    # The sum of the cycles, 1272.5 ms, and 10 ms until the primitive level's next read.
-    assert (found.command_ms, found.status_ms) == (1282.5, 2280.0)
-
-
 def test_the_highest_level_that_responds_within_the_run_is_held(tmp_path: Path) -> None:
     config = load("nasrem")
     found = {seconds: hold_for(config, seconds) for seconds in (10.0, 2.0, 0.1)}
