@@ -181,11 +181,8 @@ def story(rack: Link, kind: str, *parameters: float) -> dict[str, object]:
             name: getattr(statistics, name) for name in statistics.__slots__ if name != "forger"
         },
         "ends": [
-            writer.serial,
-            writer.bus_errors,
-            reader.serial,
-            reader.accesses,
-            reader.transfers,
+            *(writer.serial, writer.bus_errors),
+            *(reader.serial, reader.accesses, reader.transfers),
         ],
     }
 

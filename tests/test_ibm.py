@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,44 +27,29 @@ MUTES = [*(("servo", at) for at in np.arange(8.25, 27.0, 0.5)), ("motion", 10.0)
 lowered."""
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The folder of a run whose arm is braked again and again, and its report."""
-    folder = tmp_path_factory.mktemp("ibm")
-    script = folder / "mutes.toml"
+@pytest.mark.slow
+def test_brakings_while_each_block_is_lowered_count_as_no_touch_and_each_is_put_down(
+    tmp_path: Path,
+) -> None:
+    script = tmp_path / "mutes.toml"
     faults = [
         f'[[fault]]\nkind = "mute"\nboard = "{board}"\nat = {at}\ncycles = 5\n'
         for board, at in MUTES
     ]
     script.write_text("\n".join(faults))
     config = load("ibm", [f"name=test-ibm-{os.getpid()}", "clock.mode=lockstep"], str(script))
-    result = run_rack(config, None, folder / "run", Display())
-    assert result.recording == "complete"
-    return folder / "run", write_report(folder / "run")[0]
-
-
-@pytest.mark.slow
-def test_the_arm_was_braked_while_each_block_was_lowered(run: tuple[Path, dict[str, Any]]) -> None:
-    recording = Recording(run[0])
+    assert run_rack(config, None, tmp_path / "run", Display()).recording == "complete"
+    recording = Recording(tmp_path / "run")
     ticks, current = (recording.signal("motion.status", field) for field in ("tick", "current"))
     braked = recording.signal("arm.status", "tick")[recording.signal("arm.status", "braked") == 1]
     for request in GUARDED:
         lowering = ticks[current == request]
         assert len(set(braked) & set(range(lowering[0] + 1000, lowering[-1] - 500)))
 
-
-@pytest.mark.slow
-def test_no_braking_counts_as_touch_and_each_block_is_put_down(
-    run: tuple[Path, dict[str, Any]],
-) -> None:
-    printed = [event["text"] for event in Recording(run[0]).events if event["kind"] == "printed"]
+    printed = [event["text"] for event in recording.events if event["kind"] == "printed"]
     assert ["touched" in text for text in printed] == [True, True]
     assert [float(text.split()[-2]) for text in printed] == pytest.approx(TOUCHES, abs=4e-3)
-    report = run[1]
-    assert report["worked"]
-    assert report["outcome"]["cause"] == "task done"
-    ends = {end["object"]: end for end in report["objects"]}
-    assert list(ends) == ["block1", "block2"]
-    for end in ends.values():
-        assert end["off_mm"] < 5.0
-        assert end["drops"] == []
+    report = write_report(recording.folder)[0]
+    assert (report["worked"], report["outcome"]["cause"]) == (True, "task done")
+    assert [end["object"] for end in report["objects"]] == ["block1", "block2"]
+    assert all(end["off_mm"] < 5.0 and end["drops"] == [] for end in report["objects"])

@@ -9,17 +9,9 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.lockstep import differences, run_bare
-from rack.tools.lab.benches.observed import record
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
-from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
-from rack.tools.timing.charts.figure5 import lines
-from rack.tools.timing.operator_response import response_of
-from rack.tools.viewer.reading import read
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES
 from tests.tools.command_line import rack
@@ -74,14 +66,6 @@ def test_a_joint_that_does_not_fit_is_repaired_without_the_others(jointed: Path)
     assert [step[0]["board"] for step in found["steps"]] == ["joint2", "arm"]
 
 
-def test_figure_5_has_one_line_for_boards_of_one_cycle(jointed: Path) -> None:
-    rows = [line for line in lines(load(jointed)) if line.rstrip().endswith("no planner to couple")]
-    assert [row.rpartition(" ms:")[0] for row in rows] == [
-        "joint1 ... joint3, arm, 2.5",
-        "path, 20",
-    ]
-
-
 @pytest.mark.slow
 def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
     report, text = write_report(folder)
@@ -91,61 +75,3 @@ def test_the_response_is_measured_along_every_chain(folder: Path) -> None:
     assert [response[way]["measured_ms"]["max"] for way in ("command", "status")] == [25.0, 42.5]
     assert [response[way]["holds"] for way in ("command", "status")] == [True, True]
     assert f"{TOGETHER}: eq. 3.2 bound 60, eq. 3.3 sum 25" in text
-
-
-@pytest.mark.slow
-def test_a_slower_joint_has_a_response_of_its_own(
-    jointed: Path, rack_name: str, tmp_path: Path
-) -> None:
-    config = load(jointed, [f"name={rack_name}", "board.joint2.rate_hz=100"])
-    recording = record(config, 1.0, tmp_path / "run").recording
-    first = write_report(recording.folder)[0]["system_response"]
-    (other,) = first["others"]
-    assert first["levels"] == ["path", "joint2", "arm"]
-    assert other["levels"] == ["path", "joint1, joint3", "arm"]
-    assert [found["command"]["measured_ms"]["max"] for found in (first, other)] == [32.5, 25.0]
-    assert first["command"]["holds"]
-    assert other["command"]["holds"]
-    subjects = {
-        pair.subject
-        for pair in Analysis.of(recording).pairs
-        if pair.equation == "3.3" and pair.measured
-    }
-    assert subjects == {"system, path > joint2 > arm", "system, path > joint1, joint3 > arm"}
-
-
-@pytest.mark.slow
-def test_a_hold_acts_at_its_predicted_tick_through_every_joint(folder: Path) -> None:
-    response = response_of(Recording(folder))
-    assert response is not None
-    # Read at 104, by the joints at 112, by the arm at 113.
-    assert [(c.sampled, c.predicted, c.acts) for c in response.commands] == [
-        (104, 113, 113),
-        (168, 177, 177),
-    ]
-    assert response.held
-    assert response.paths["path"].levels == ("path", "joint1", "arm")
-
-
-@pytest.mark.slow
-def test_the_levels_alone_write_what_they_write_in_the_rack(
-    jointed: Path, rack_name: str, tmp_path: Path
-) -> None:
-    config = load(jointed, [f"name={rack_name}"])
-    recording = record(config, 0.5, tmp_path / "run").recording
-    bare = apart(run_bare, config, 200)
-    assert list(differences(recording, bare)) == []
-
-
-@pytest.mark.slow
-def test_the_graph_of_boards_has_a_row_for_every_level(folder: Path) -> None:
-    names = read(folder / "run.rrd", "/hierarchy", "GraphNodes:node_ids").values[0].ravel().tolist()
-    places = (
-        read(folder / "run.rrd", "/hierarchy", "GraphNodes:positions")
-        .values[0]
-        .reshape(-1, 2)
-        .tolist()
-    )
-    rows = {name: row for name, (_, row) in zip(names, places, strict=True)}
-    assert rows["path"] < rows["joint1"] == rows["joint2"] == rows["joint3"] < rows["arm"]
-    assert len({tuple(place) for place in places}) == len(names)

@@ -12,18 +12,10 @@ import pytest
 
 from rack.boards.config import budgets, load
 from rack.boards.config.files import names
-from rack.levels.timing.forecast import Forecast
-from rack.tools.console.tables import render_text
-from rack.tools.timing.inventory import inventory, inventory_blocks
 from rack.tools.timing.judged_config import JudgedConfig
-from rack.tools.timing.tables import forecast_blocks
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
-FITS = (
-    "--set",
-    "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }",
-)
 FAILS = ("--set", "board.lower.budget={ process_ms = 0.5, plan_ms = 12.0 }")
 FAILING = ("fig3", "fig4-overload")
 """Configs that show what does not fit."""
@@ -53,13 +45,6 @@ def failures(done: subprocess.CompletedProcess[str]) -> list[str]:
     return [line for line in done.stdout.splitlines() if "FAILS" in line]
 
 
-def test_a_rack_that_fits_ends_with_status_0(small: Path) -> None:
-    done = check(small, *FITS, *ALONE)
-    assert (done.returncode, failures(done)) == (0, [])
-    assert "to make it fit" not in done.stdout
-    assert "'upper' (no budget)" in done.stdout
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in names() if name not in FAILING])
 def test_a_shipped_rack_passes_its_own_check(name: str) -> None:
@@ -67,64 +52,23 @@ def test_a_shipped_rack_passes_its_own_check(name: str) -> None:
     assert (done.returncode, failures(done), done.stderr) == (0, [], "")
 
 
-@pytest.mark.parametrize("name", FAILING)
-def test_the_figures_of_overload_fail_their_check(name: str) -> None:
-    done = check(name)
-    assert done.returncode == 1
-    assert failures(done)
-
-
-def test_a_rack_that_fails_shows_where_and_which_changes_help(small: Path) -> None:
-    done = check(small, *FAILS, *ALONE)
-    assert done.returncode == 1
-    # First what fails, then the tables with the rest.
-    assert {line.split()[0] for line in failures(done)} == {"3.8", "1", "load:", "response", "load"}
-    assert "  board 'lower': within_cycles 4 -> 7 (a plan every 17.5 ms)" in done.stdout
-
-
-def test_a_rack_without_budgets_has_nothing_to_fail(small: Path) -> None:
-    done = check(small)
-    assert done.returncode == 0
-    assert "fits, as far as is known: no board has a budget" in done.stdout
-
-
-@pytest.mark.parametrize("width", [80, 120])
-def test_what_a_check_shows_fits_the_terminal(width: int) -> None:
-    found = load("nasrem")
-    judged = JudgedConfig.of(found)
-    lines = [*render_text(inventory_blocks(inventory(found, judged.layout, [])), width)]
-    lines += render_text(forecast_blocks(Forecast.of(judged.timing)), width)
-    # Other text is wrapped when it is printed.
-    rows = [line for line in lines if "  " in line.strip()]
-    assert len(rows) > 50
-    assert max(map(len, rows)) <= width
-
-
 def test_json_holds_everything_with_both_sides(small: Path) -> None:
     done = check(small, *FAILS, *ALONE, "--json")
     timing = json.loads(done.stdout)["timing"]
-    assert done.returncode == 1
-    assert not timing["holds"]
+    assert (done.returncode, timing["holds"], timing["context_switch_ns"]) == (1, False, 100_000)
     verdict = next(v for v in timing["verdicts"] if v["equation"] == "3.8")
-    assert (verdict["left"], verdict["sign"], verdict["right"]) == (3e6, "<", 1.8e6)
-    assert (verdict["margin"], verdict["holds"], verdict["subject"], verdict["unit"]) == (
-        -1.2e6,
-        False,
-        "lower",
-        "ns",
-    )
-    level = timing["levels"][0]
-    assert (level["cycle_ns"], level["residual_ns"], level["planning_ns"], level["slice_ns"]) == (
-        2_500_000,
-        2_000_000,
-        12_000_000,
-        10_000_000,
-    )
+    assert {
+        "subject": "lower",
+        "unit": "ns",
+        "sign": "<",
+        "holds": False,
+    }.items() <= verdict.items()
+    assert [verdict[side] for side in ("left", "right", "margin")] == [3e6, 1.8e6, -1.2e6]
+    times = ("cycle_ns", "residual_ns", "planning_ns", "slice_ns")
+    assert [timing["levels"][0][time] for time in times] == [2.5e6, 2e6, 12e6, 10e6]
     response = next(r for r in timing["responses"] if r["task"] == "lower.planner")
-    assert response["deadline_ns"] == 10_000_000
-    assert not response["holds"]
+    assert (response["deadline_ns"], response["holds"]) == (10_000_000, False)
     assert timing["loads"] == {"1": pytest.approx(0.7 / 2.5 + 12.2 / 10)}
-    assert timing["context_switch_ns"] == 100_000
     assert timing["repair"]["fits"]
     assert timing["repair"]["steps"][0][0]["settings"] == {"within_cycles": 7}
 
@@ -138,13 +82,12 @@ def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
     config = load(fixed)
     assert config.board["lower"].within_cycles == 7
     assert JudgedConfig.of(config).failing == ()
-    assert check(fixed).returncode == 0
-
-
-def test_a_fix_is_json_too(small: Path) -> None:
     document = json.loads(check(small, *FAILS, *ALONE, "--fix", "--json").stdout)
-    assert document["fits"]
-    assert "within_cycles = 7" in document["config"]
+    assert (document["fits"], "within_cycles = 7" in document["config"]) == (True, True)
+    # One that fits stays as it is.
+    again = check(fixed, "--fix")
+    assert (again.returncode, again.stderr) == (0, "nothing to change\n")
+    assert again.stdout == config.text()
 
 
 def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
@@ -153,26 +96,17 @@ def test_where_nothing_helps_no_config_is_printed(small: Path) -> None:
     assert done.stderr.startswith("no change helps with 3.1 of lower")
 
 
-def test_a_rack_that_fits_is_fixed_as_it_is(small: Path) -> None:
-    done = check(small, *FITS, *ALONE, "--fix")
-    assert (done.returncode, done.stderr) == (0, "nothing to change\n")
-    assert done.stdout == load(small, [*FITS[1:], *ALONE[1::2]]).text()
-
-
 @pytest.mark.slow
-def test_budgets_come_from_an_earlier_run(small: Path, recorded: Path) -> None:
+def test_budgets_come_from_an_earlier_run_and_are_in_a_fixed_config(
+    small: Path, recorded: Path, tmp_path: Path
+) -> None:
     done = check(small, "--from", recorded, "--percentile", 90, "--json")
     timing = json.loads(done.stdout)["timing"]
     assert done.returncode == (0 if timing["holds"] else 1)
     levels = {level["board"]: level for level in timing["levels"]}
-    assert set(levels) == {"upper", "lower"}
     assert all(0 < level["execution_ns"] < 1_000_000 for level in levels.values())
     assert levels["lower"]["plan_ns"] > 0
     assert levels["upper"]["plan_ns"] is None
-
-
-@pytest.mark.slow
-def test_a_fix_carries_the_measured_budgets(small: Path, recorded: Path, tmp_path: Path) -> None:
     # A cycle this short leaves the measured planner nothing; whatever helps is judged by what was
     # measured.
     done = check(small, "--from", recorded, "--percentile", 50, "--fix")
@@ -189,51 +123,17 @@ def test_a_run_of_another_rack_is_refused_in_one_line(recorded: Path) -> None:
     assert done.stderr == f"{recorded}: a run of other boards: lower, upper; 'fig2' has level\n"
 
 
-def test_a_folder_that_is_no_run_is_refused_in_one_line(small: Path, tmp_path: Path) -> None:
-    done = check(small, "--from", tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-
-
-def test_a_budget_of_a_planner_that_is_not_there_is_a_mistake(small: Path) -> None:
-    done = check(small, "--set", "board.upper.budget.plan_ms=6")
-    assert done.returncode == 2
-    assert (
-        done.stderr
-        == "board.upper.budget.plan_ms = 6.0: the board has no planner; remove it, or add one\n"
-    )
-
-
 @pytest.mark.slow
 def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
-    done = check(
-        "cyclic", "--set", "schedule.major_ms=40", "--set", "board.even.budget.process_ms=3.1"
-    )
-    rows = [line.split() for line in done.stdout.splitlines()]
-    assert (
-        "static schedule, ms: 10 frames of 4, 4 ticks; every budget with two context switches:"
-        in done.stdout
-    )
-    assert [
-        "1",
-        "0,",
-        "2",
-        "...",
-        "8",
-        "even",
-        "1",
-        "3.14",
-        "-0.14",
-        "end",
-        "of",
-        "frame",
-        "FAILS",
-    ] in rows
-    assert ["1", "1,", "3", "...", "9", "fast", "0", "0.94", "0.06", "odd", "ok"] in rows
+    settings = ("--set", "schedule.major_ms=40", "--set", "board.even.budget.process_ms=3.1")
+    done = check("cyclic", *settings)
     assert done.returncode == 1
-
-
-def test_the_static_schedule_is_in_the_json_document() -> None:
+    rows = {" ".join(line.split()) for line in done.stdout.splitlines()}
+    assert {
+        "static schedule, ms: 10 frames of 4, 4 ticks; every budget with two context switches:",
+        "1 0, 2 ... 8 even 1 3.14 -0.14 end of frame FAILS",
+        "1 1, 3 ... 9 fast 0 0.94 0.06 odd ok",
+    } <= rows
     found = json.loads(check("cyclic", "--json").stdout)["timing"]["schedule"]
     assert (found["minor_ms"], found["major_ms"]) == (4, 8)
     assert [(core["core"], core["frames"]) for core in found["cores"]] == [(1, [0]), (1, [1])]
@@ -244,34 +144,7 @@ def test_the_static_schedule_is_in_the_json_document() -> None:
 def test_verbose_shows_what_the_arm_does_while_no_torque_comes() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
     (line,) = (line for line in check(*words).stdout.splitlines() if line.startswith("patience: "))
-    assert line.startswith(
-        "patience: 'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms). "
-    )
-    assert (
-        "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque put in"
-        " 10.372 J" in line
-    )
-    assert "patience" not in rack("check", *words).stdout
+    assert "'servo' goes on with its last torque for 10 ms (4 cycles; permitted: 10.0 ms)" in line
+    assert "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque" in line
     (found,) = json.loads(check(*words, "--json").stdout)["patience"]
-    assert (found["board"], found["ms"], found["cycles"], found["energy_j"]) == (
-        "servo",
-        10.0,
-        4,
-        10.372,
-    )
-
-
-@pytest.mark.slow
-def test_verbose_shows_what_the_monitors_stand_for_an_arm_of_ones_own_more() -> None:
-    hardware = "configs/examples/own-hardware/hardware.toml"
-    (own,) = json.loads(check(hardware, "--json").stdout)["monitors"]
-    assert own == {
-        "board": "servo",
-        "position_mrad": [0.375] * 7,
-        "velocity_mrad_s": [3.5] * 7,
-        "jitter_ms": 0.125,
-    }
-    (simulated,) = json.loads(check("k1607", "--json").stdout)["monitors"]
-    assert (simulated["position_mrad"], simulated["jitter_ms"]) == ([0.025] * 7, 0.008)
-    lines = rack("check", hardware, "--verbose").stdout.splitlines()
-    assert sum(line.startswith("monitors: 'servo' takes samples for good") for line in lines) == 1
+    assert [found[key] for key in ("board", "ms", "cycles", "energy_j")] == ["servo", 10, 4, 10.372]

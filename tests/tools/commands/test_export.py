@@ -35,7 +35,7 @@ def test_every_message_is_there_as_it_was_written(run: Path, exported: Path) -> 
     clock_ns = recording.layout.clock_ns
     ticks: dict[str, list[int]] = {}
     states: dict[str, list[object]] = {}
-    times = []
+    times, events = [], []
     with exported.open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
             value = json.loads(message.data)
@@ -43,8 +43,11 @@ def test_every_message_is_there_as_it_was_written(run: Path, exported: Path) -> 
             states.setdefault(channel.topic, []).append(value.get("state"))
             assert message.log_time == value["tick"] * clock_ns
             times.append(message.log_time)
+            events += [value] if channel.topic == "events" else []
     assert times == sorted(times)
     del ticks["events"]
+    wanted = [event for event in recording.events if event.get("tick", -1) >= 0]
+    assert sorted(events, key=str) == sorted(wanted, key=str)
     assert {*ticks} == {*recording.mailboxes}
     for name, found in ticks.items():
         assert found == recording.signal(name, "tick").tolist()
@@ -70,13 +73,6 @@ def test_schemas_have_units_and_meanings(run: Path, exported: Path) -> None:
                 if not field.fields:
                     assert field.meaning in fields[field.name]["description"]
     assert schemas["lower.status"]["state"]["type"] == "string"
-
-
-def test_events_are_a_channel(run: Path, exported: Path) -> None:
-    wanted = [event for event in Recording(run).events if event.get("tick", -1) >= 0]
-    with exported.open("rb") as file:
-        found = [json.loads(m.data) for *_, m in make_reader(file).iter_messages(["events"])]
-    assert sorted(found, key=str) == sorted(wanted, key=str)
 
 
 def test_what_cannot_be_exported_is_one_line(

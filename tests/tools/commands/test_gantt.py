@@ -20,15 +20,11 @@ def run(tmp_path: Path) -> Path:
     """A run of fig2 that is exact to the millisecond, but for one late plan."""
     ms = (0, 0, 1, 3, 4)
     levels = [cycle(4 * n, 2000, *(1000 * (8 * n + at) for at in ms)) for n in range(20)]
-    plans = [
-        cycle(
-            4 * n,
-            2000,
-            *(1000 * (8 * n + at) for at in (4, 4, 4, 14, 15 if n != 10 else 23)),
-            planned=True,
-        )
-        for n in range(0, 20, 2)
-    ]
+    plans = []
+    for n in range(0, 20, 2):
+        moments = (4, 4, 4, 14, 23 if n == 10 else 15)
+        rows = (1000 * (8 * n + at) for at in moments)
+        plans.append(cycle(4 * n, 2000, *rows, planned=True))
     recorded(tmp_path / "run", load("fig2"), {"level": levels, "level.planner": plans})
     return tmp_path / "run"
 
@@ -67,33 +63,11 @@ def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_m
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("start_ms", [8000, 100_000])
-def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(
-    start_ms: int, tmp_path: Path
-) -> None:
-    window = ("--from-ms", start_ms, "--to-ms", start_ms + 40)
-    rack("gantt", "nasrem", *window, "--out", tmp_path)
+def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(tmp_path: Path) -> None:
+    rack("gantt", "nasrem", "--from-ms", 100_000, "--to-ms", 100_040, "--out", tmp_path)
     # matplotlib draws letters as shapes, and names each text in a comment.
     labels = re.findall(r"<!-- ([\d.+e]+) -->", (tmp_path / "gantt.svg").read_text())
-    assert labels == [str(start_ms + ms) for ms in (0, 20, 40)]
-
-
-@pytest.mark.slow
-def test_json_is_one_document_with_spans_jobs_and_patterns(tmp_path: Path) -> None:
-    shown = rack("gantt", "fig3", "--to-ms", 24, "--out", tmp_path, "--json")
-    assert shown.stderr == ""
-    found = json.loads(shown.stdout)
-    (panel,) = found["panels"]
-    assert (panel["kind"], panel["from_ms"], panel["to_ms"]) == ("schedule", 0, 24)
-    update = next(span for span in panel["spans"] if span["unit"] == "U")
-    assert (update["start_ms"], update["end_ms"], update["task"]) == (22, 23, "level.planner")
-    late = [(job["task"], job["release_ms"], job["end_ms"]) for job in panel["jobs"] if job["late"]]
-    assert late == [("level.planner", 0, 23)]
-    assert (
-        sum(panel["patterns"]["level"]["plans"].values())
-        == panel["counts"]["level.planner"]["jobs"]
-    )
-    assert [Path(path).name for path in found["pictures"]] == ["gantt.png", "gantt.svg"]
+    assert labels == ["100000", "100020", "100040"]
 
 
 @pytest.mark.slow
@@ -113,54 +87,19 @@ def test_a_run_is_shown_above_the_schedule_of_its_config(run: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_without_budgets_is_shown_alone(tmp_path: Path) -> None:
+def test_without_budgets_a_run_is_shown_alone_and_a_config_has_no_schedule(tmp_path: Path) -> None:
     config = load("fig2")
     level = config.board["level"].model_copy(update={"budget": None})
+    bare = config.model_copy(update={"board": {"level": level}})
     rows = [cycle(4 * n, 2000, *[8000 * n] * 4, 8000 * n + 1000) for n in range(9)]
-    recorded(
-        tmp_path / "run", config.model_copy(update={"board": {"level": level}}), {"level": rows}
-    )
-    shown = rack("gantt", tmp_path / "run", "--json")
-    found = json.loads(shown.stdout)
+    recorded(tmp_path / "run", bare, {"level": rows})
+    found = json.loads(rack("gantt", tmp_path / "run", "--json").stdout)
     assert [panel["kind"] for panel in found["panels"]] == ["measured"]
     assert "no board has a budget" in found["notes"][0]
-
-
-@pytest.mark.slow
-def test_a_run_in_lockstep_has_its_schedule_alone_and_says_why(tmp_path: Path) -> None:
-    recorded(
-        tmp_path / "run",
-        load("fig2", ["clock.mode=lockstep"]),
-        {"level": [cycle(0, 2000, 0, 0, 0, 0, 1000)]},
-    )
-    shown = rack("gantt", tmp_path / "run")
-    assert "fig2: schedule, 0 to 32 ms" in shown.stdout
-    assert "ran in lockstep: time stood still" in shown.stdout
-    assert "measured" not in shown.stdout
-
-
-@pytest.mark.slow
-def test_any_rack_has_a_schedule_where_it_has_budgets(tmp_path: Path) -> None:
-    settings = (
-        "board.servo.budget.process_ms=0.5",
-        "board.primitive.budget.process_ms=1",
-        "board.world.budget.read_ms=1",
-    )
-    words = [word for setting in settings for word in ("--set", setting)]
-    shown = json.loads(rack("gantt", "nasrem", *words, "--out", tmp_path, "--json").stdout)
-    lanes = {lane["board"]: lane["core"] for lane in shown["panels"][0]["lanes"]}
-    assert {"servo": 1, "primitive": 0, "world": 0}.items() <= lanes.items()
-
-
-@pytest.mark.slow
-def test_a_static_schedule_is_drawn_with_its_frames(tmp_path: Path) -> None:
-    shown = rack("gantt", "cyclic", "--out", tmp_path, "--json")
-    (panel,) = json.loads(shown.stdout)["panels"]
-    assert (panel["frame_ms"], panel["to_ms"]) == (4, 8)
-    text = rack("gantt", "cyclic", "--out", tmp_path, "--from-ms", 4, "--to-ms", 16).stdout
-    assert [line.split() for line in text.splitlines() if line.startswith("frame")] == [
-        ["frame", "|1", "|2", "|3"]
-    ]
+    (tmp_path / "bare.toml").write_text(bare.text())
+    shown = rack("gantt", tmp_path / "bare.toml")
+    assert (shown.returncode, shown.stdout) == (2, "")
+    assert "no board has a budget: give [board.<name>.budget]" in shown.stderr
 
 
 def test_without_matplotlib_a_chart_is_printed_alone(
@@ -189,17 +128,12 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["nosuch"], "no such file; by name: "),
-        (["runs/nosuch"], "runs/nosuch: no such run's folder, and no such config"),
         (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),
         (["fig2", "--figure", "3"], "--figure 3: permitted: 5"),
         (
             ["fig2", "--process", "arm=3"],
             "--process arm: no board of that name has a budget; boards: level",
-        ),
-        (
-            ["fig2", "--from-ms", "5", "--to-ms", "5"],
-            "5 to 5 ms: --to-ms must be later than --from-ms",
         ),
         (["fig2", "--out", "README.md"], "--out README.md: no folder for pictures: File exists"),
     ],
@@ -209,16 +143,6 @@ def test_bad_arguments_are_refused_in_one_line(words: list[str], message: str) -
     assert (shown.returncode, shown.stdout) == (2, "")
     assert message in shown.stderr
     assert len(shown.stderr.splitlines()) == 1
-
-
-def test_a_rack_without_budgets_has_no_schedule(tmp_path: Path) -> None:
-    config = load("fig2")
-    level = config.board["level"].model_copy(update={"budget": None})
-    path = tmp_path / "bare.toml"
-    path.write_text(config.model_copy(update={"board": {"level": level}}).text())
-    shown = rack("gantt", path)
-    assert (shown.returncode, shown.stdout) == (2, "")
-    assert "no board has a budget: give [board.<name>.budget]" in shown.stderr
 
 
 def test_a_run_cannot_be_asked_for_what_it_does_not_have(run: Path) -> None:

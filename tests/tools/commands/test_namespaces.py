@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.segment import Segment, racks
-from rack.backplane.words import System
-from tests.boards.table_racks import counting
-from tests.processes import RACK, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack
+from rack.backplane.segment import racks
+from tests.processes import RACK
+from tests.tools.command_line import BOUND_S, ROOT
+from tests.tools.held_racks import held_rack
 
 INSIDE = ("unshare", "--pid", "--fork", "--kill-child", "--mount-proc")
 
@@ -43,18 +42,9 @@ def inside(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture
 def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A recorded rack of this namespace, held before tick 0."""
-    path = tmp_path / "counting.toml"
-    path.write_text(counting(tmp_path))
-    options = ("--out", str(tmp_path / "run"), "--lockstep", "--step", "--set", f"name={rack_name}")
-    with subprocess.Popen([*RACK, "run", str(path), *options], cwd=ROOT) as process:
-        wait_until(lambda: rack_name in racks(), BOUND_S)
-        segment = Segment.attach(rack_name)
-        wait_until(lambda: segment.words[System.HELD], BOUND_S)
+    """The launcher of a recorded rack of this namespace, held before tick 0."""
+    with held_rack(tmp_path, rack_name, "--out", tmp_path / "run") as (process, _):
         yield process
-        segment.close()
-        process.kill()
-    rack("clean")
 
 
 def seen(name: str) -> dict[str, object]:

@@ -16,41 +16,16 @@ from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, System
 from tests.boards.table_racks import counting
-from tests.processes import RACK, wait_until
-from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.processes import wait_until
+from tests.tools.command_line import BOUND_S, rack
+from tests.tools.held_racks import held_rack
 
 
 @pytest.fixture
-def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A rack that counts, held before tick 0."""
-    path = tmp_path / "counting.toml"
-    path.write_text(counting(tmp_path))
-    command = [
-        *RACK,
-        "run",
-        str(path),
-        "--no-record",
-        "--lockstep",
-        "--step",
-        "--set",
-        f"name={rack_name}",
-    ]
-    process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    wait_until(lambda: is_held(rack_name), BOUND_S)
-    yield process
-    process.kill()
-    process.communicate()
-    rack("clean")
-
-
-def is_held(name: str) -> bool:
-    """Return whether a rack is there and held."""
-    try:
-        return bool(Segment.attach(name).words[System.HELD])
-    except Exception:
-        return False
+def held(rack_name: str, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """The launcher of a rack that counts, held before tick 0."""
+    with held_rack(tmp_path, rack_name) as (process, _):
+        yield process
 
 
 def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
@@ -63,7 +38,7 @@ def stepped(name: str, *options: str) -> tuple[int, dict[str, str]]:
 
 @pytest.mark.slow
 def test_a_held_rack_goes_on_by_cycles_and_ticks(
-    held: subprocess.Popen[str], rack_name: str
+    held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     assert [stepped(rack_name)[0] for _ in range(3)] == [1, 9, 17]
     assert stepped(rack_name, "--ticks", "3")[0] == 20
@@ -84,7 +59,7 @@ def test_a_held_rack_goes_on_by_cycles_and_ticks(
 
 @pytest.mark.slow
 def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
-    held: subprocess.Popen[str], rack_name: str
+    held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     waits = f"waits: the rack is held before tick 0; 'rack step {rack_name}' lets it go on"
     for words, before in {
@@ -108,7 +83,7 @@ def test_what_a_held_rack_is_asked_to_do_waits_and_is_done_when_it_goes_on(
 
 @pytest.mark.slow
 def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(
-    held: subprocess.Popen[str], rack_name: str
+    held: subprocess.Popen[bytes], rack_name: str
 ) -> None:
     assert rack("step", rack_name, "--run").stdout == f"rack '{rack_name}' runs on\n"
     words = Segment.attach(rack_name).words
@@ -121,7 +96,7 @@ def test_a_rack_let_go_runs_is_held_again_and_ends_in_order(
 
 
 @pytest.mark.slow
-def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[str], rack_name: str) -> None:
+def test_a_held_rack_ends_with_its_launcher(held: subprocess.Popen[bytes], rack_name: str) -> None:
     clock = Segment.attach(rack_name).words[System.CLOCK_PID]
     os.kill(held.pid, signal.SIGKILL)
     wait_until(lambda: not Path(f"/proc/{clock}").exists(), BOUND_S)

@@ -37,22 +37,9 @@ class Run:
         self.name, self.folder = name, folder
         seconds = () if moment == "cycle" else ("--seconds", "0.5")
         self.process = subprocess.Popen(
-            [
-                *RACK,
-                "run",
-                str(small),
-                "--set",
-                f"name={name}",
-                "--out",
-                folder,
-                *seconds,
-            ],
+            [*RACK, "run", str(small), "--set", f"name={name}", "--out", folder, *seconds],
             cwd=ROOT,
-            env={
-                **os.environ,
-                "MOMENT": moment,
-                "SIGNALS": " ".join(str(int(number)) for number in numbers),
-            },
+            env={**os.environ, "MOMENT": moment, "SIGNALS": " ".join(str(int(n)) for n in numbers)},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -73,9 +60,8 @@ class Run:
     def reported(self, said: str) -> bool:
         """Return whether there is a report; a slow machine has no time for it in 2 s, and then it
         says so."""
-        return (
-            self.folder / "report.json"
-        ).is_file() or "no time for the report: 'rack report" in said
+        is_there = (self.folder / "report.json").is_file()
+        return is_there or "no time for the report: 'rack report" in said
 
     def leaves_nothing(self) -> bool:
         """Return whether no shared memory is left; the boards die with the crate, a moment
@@ -117,14 +103,7 @@ def test_a_signal_while_the_report_is_made_ends_the_command_after_it(
 
 
 @pytest.mark.slow
-def test_a_second_signal_ends_a_run_at_once(small: Path, rack_name: str, tmp_path: Path) -> None:
-    run = Run(small, rack_name, tmp_path / "run", "cycle", (TERM, INT))
-    assert run.ended()[0] in (128 + TERM, 128 + INT)
-    assert run.leaves_nothing()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("delay_s", [0.02, 0.1, 0.25, 0.4, 0.6, 0.9])
+@pytest.mark.parametrize("delay_s", [0.02, 0.25, 0.6])
 def test_a_signal_to_the_whole_group_after_any_time_leaves_nothing(
     small: Path, rack_name: str, tmp_path: Path, delay_s: float
 ) -> None:

@@ -46,10 +46,6 @@ def test_columns_that_may_be_missing_go_before_anything_is_wrapped() -> None:
     ]
 
 
-def test_a_table_without_rows_is_its_head() -> None:
-    assert list(table(HEAD, [], 80)) == ["task  count  what it says of itself"]
-
-
 def test_in_a_pipe_a_table_is_neither_cut_nor_coloured_nor_read_as_markup() -> None:
     rows = [["[red]a[/red]", "x" * 5000, ":smile:"]]
     assert list(table(("a", "b", "c"), rows))[1].split() == rows[0]

@@ -11,7 +11,6 @@ from rack.backplane.fault_table import NEVER, FaultTable, Stage
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Run, System
 from rack.boards.config import load, resolve
-from rack.boards.errors import ConfigError
 from rack.tools.console.answer import Failure
 from rack.tools.faults import live
 from rack.tools.faults.live import LiveRack
@@ -151,38 +150,3 @@ def test_waits_have_an_end(rack: Running, monkeypatch: pytest.MonkeyPatch) -> No
         rack.live.inject(later, True)
     with pytest.raises(Failure, match=f"rack '{rack.segment.rack}': its run is over"):
         rack.live.inject(later, False)
-
-
-@pytest.mark.parametrize(
-    ("given", "why"),
-    [
-        ({"kind": "self-test"}, "a running rack has passed its self-tests"),
-        ({"kind": "kill", "tick": TICK}, f"has passed; the rack is at tick {TICK}"),
-        ({"kind": "hog", "for": 0.1}, "hog needs real time"),
-        ({"kind": "kill", "speed": 2}, "kill has no such parameter"),
-    ],
-)
-def test_what_a_running_rack_cannot_have_is_refused(
-    rack: Running, given: dict[str, object], why: str
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        rack.live.inject({"board": "lower", **given}, False)
-    assert why in str(caught.value)
-    assert rack.live.faults() == []
-
-
-def test_the_table_has_what_each_waits_for_and_no_numbers_that_are_not_known(
-    rack: Running,
-) -> None:
-    for tick in (TICK + 1, TICK + 2):
-        rack.live.inject({"board": "lower", "kind": "kill", "tick": tick}, False)
-    rack.begin(1)
-    entry = rack.table.entries[1]
-    entry.struck_tick = 0
-    _, first, second = map(str.rstrip, rack.live.text())
-    numbers = first.removesuffix(f"  tick {TICK + 1}; the rack is at tick {TICK}").split()
-    assert numbers[-5:] == ["waiting", str(TICK + 1), "-", "-", "0"]
-    # Begins, first acted, until, acted.
-    assert second.split()[-4:] == [str(TICK + 1), "0", str(TICK + 9), "0"]
-    # Two faults of one run do not draw the same random numbers.
-    assert rack.table.entries[0].seed != rack.table.entries[1].seed

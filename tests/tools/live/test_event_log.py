@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from rack.boards.events import Event
 from rack.tools.live.display import Display
 from rack.tools.live.folder import EventLog
@@ -19,23 +21,20 @@ def codes(path: Path) -> list[str]:
     return [entry.get("code", entry["kind"]) for entry in entries]
 
 
-def test_a_log_has_events_as_they_become_known_and_at_the_end_by_tick(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_ended", [True, False])
+def test_a_log_has_events_as_they_become_known_and_at_the_end_by_tick(
+    tmp_path: Path, is_ended: bool
+) -> None:
     path = tmp_path / "events.jsonl"
     log = EventLog(Display())
     log.open(path)
     for code, tick in KNOWN:
         log.add(Event(0, tick, "detection", "", "", code))
     assert codes(path) == [code for code, _ in KNOWN]
-    log.end({"rack": "nasrem"})
-    assert codes(path) == ["launch", "died", "brakes", "rejoined", "opened", "outcome"]
-    assert [*tmp_path.iterdir()] == [path]
-
-
-def test_a_log_that_is_not_ended_stays_as_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "events.jsonl"
-    log = EventLog(Display())
-    log.open(path)
-    for code, tick in KNOWN:
-        log.add(Event(0, tick, "detection", "", "", code))
-    log.close()
-    assert codes(path) == [code for code, _ in KNOWN]
+    if is_ended:
+        log.end({"rack": "nasrem"})
+        assert codes(path) == ["launch", "died", "brakes", "rejoined", "opened", "outcome"]
+        assert [*tmp_path.iterdir()] == [path]
+    else:
+        log.close()
+        assert codes(path) == [code for code, _ in KNOWN]

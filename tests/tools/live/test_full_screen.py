@@ -12,9 +12,7 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input
 
-from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment, racks
-from rack.backplane.words import System
 from rack.tools.live.full_screen import RackScreen
 from tests.processes import wait_until
 from tests.tools.command_line import BOUND_S, rack
@@ -52,17 +50,12 @@ def seen(pilot: Pilot[None]) -> str:
     return unescape(pilot.app.export_screenshot()).replace("\N{NO-BREAK SPACE}", " ")
 
 
-async def shows(pilot: Pilot[None], *words: str) -> None:
-    """Wait until the screen shows all of these."""
+async def shows(pilot: Pilot[None], *words: str, not_any_more: str = "") -> None:
+    """Wait until the screen shows all of these, and does not show a text any more."""
     async with asyncio.timeout(BOUND_S):
-        while not all(word in seen(pilot) for word in words):
-            await pilot.pause(0.05)
-
-
-async def hides(pilot: Pilot[None], word: str) -> None:
-    """Wait until the screen does not show this any more."""
-    async with asyncio.timeout(BOUND_S):
-        while word in seen(pilot):
+        while not all(word in seen(pilot) for word in words) or (
+            not_any_more and not_any_more in seen(pilot)
+        ):
             await pilot.pause(0.05)
 
 
@@ -94,76 +87,13 @@ def test_keys_hold_a_level_and_let_it_resume(running: str) -> None:
         await pilot.press("h")
         await shows(pilot, "upper held by the operator", f"rack command {running} upper resume")
         await pilot.press("r")
-        await hides(pilot, "held by the operator")
+        await shows(pilot, not_any_more="held by the operator")
         await pilot.press("l", "h")
         await shows(pilot, "lower held by the operator")
         await pilot.press("r")
-        await hides(pilot, "held by the operator")
+        await shows(pilot, not_any_more="held by the operator")
 
     on_screen(running, act, (100, 30))
-
-
-def test_keys_set_the_emergency_stop_and_reset_it(running: str) -> None:
-    segment = Segment.attach(running)
-    stop = UtilityLines(segment)
-
-    async def act(pilot: Pilot[None]) -> None:
-        await pilot.press("e")
-        assert stop.emergency_stop
-        await shows(pilot, "EMERGENCY STOP")
-        await pilot.press("E")
-        assert not stop.emergency_stop
-
-    on_screen(running, act)
-
-
-def test_what_cannot_be_done_is_answered(running: str) -> None:
-    segment = Segment.attach(running)
-    before = segment.words[System.COMMANDED], segment.words[System.INJECTED]
-    answers = {
-        "upper": "'upper': permitted: LEVEL WHAT",
-        "nobody hold": "nobody",
-        "upper goto nowhere": "'nowhere': not a goal",
-        "upper fly": "fly",
-        "inject upper flop": "flop",
-        "inject upper mute for=ages": "ages",
-    }
-
-    async def act(pilot: Pilot[None]) -> None:
-        await pilot.press("3")
-        for text, answer in answers.items():
-            await write(pilot, text)
-            await shows(pilot, answer)
-
-    on_screen(running, act, (100, 40))
-    assert (segment.words[System.COMMANDED], segment.words[System.INJECTED]) == before
-
-
-def test_a_screen_of_twenty_by_five_loses_nothing_and_the_rack_runs_on(running: str) -> None:
-    segment = Segment.attach(running)
-
-    async def act(pilot: Pilot[None]) -> None:
-        for pane in "1234":
-            await pilot.press(pane, "i", "escape", "c", "escape")
-            await pilot.resize_terminal(20, 5)
-            await pilot.pause(0.3)
-            await pilot.resize_terminal(120, 40)
-        before = segment.words[System.TICK]
-        await pilot.press("1")
-        await shows(pilot, "upper", "lower", "executing")
-        assert segment.words[System.TICK] > before
-
-    on_screen(running, act)
-
-
-def test_a_low_screen_has_its_few_lines_for_the_rack(running: str) -> None:
-    async def act(pilot: Pilot[None]) -> None:
-        await shows(pilot, "running", "missed")
-        assert "hold" not in seen(pilot)
-        await pilot.resize_terminal(60, 24)
-        await shows(pilot, "1 boards", "hold")
-
-    on_screen(running, act, (60, 5))
 
 
 def test_a_fault_of_the_menu_strikes_the_chosen_level(running: str) -> None:

@@ -21,12 +21,24 @@ FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
 
 
 @pytest.mark.slow
-def test_status_and_report_show_how_full_a_queue_is_and_what_it_refused(
+def test_status_check_and_report_show_how_full_a_queue_is_and_what_it_refused(
     tmp_path: Path, rack_name: str
 ) -> None:
     path = tmp_path / "queues.toml"
     path.write_text(QUEUES)
     config = load(path, [f"name={rack_name}", *FULL])
+    (line,) = (
+        line
+        for line in render_text(inventory_blocks(inventory(config, wire(config), [])))
+        if "upper.requests " in line
+    )
+    assert "queue of 7" in line
+    with Rack(config) as rack:
+        (empty,) = queue_fills(Newest(rack.segment))
+        assert empty.line == "queue upper.requests: 0 of 7 unread"
+        rack.run(1.0)
+        (full,) = queue_fills(Newest(rack.segment))
+    assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
     result = run_rack(config, 2.0, tmp_path / "run", Display())
     report, text = write_report(tmp_path / "run")
     (queue,) = report["queues"]
@@ -35,27 +47,3 @@ def test_status_and_report_show_how_full_a_queue_is_and_what_it_refused(
     assert (queue["taken"], queue["waiting"], queue["capacity"]) == (2 * 7, 6, 7)
     assert result.refused == {"upper.requests": queue["refused"]}
     assert f"at most 6 waiting, room for 7, {queue['refused']} refused" in text
-
-
-@pytest.mark.slow
-def test_a_running_rack_shows_its_queues(tmp_path: Path, rack_name: str) -> None:
-    path = tmp_path / "queues.toml"
-    path.write_text(QUEUES)
-    with Rack(load(path, [f"name={rack_name}", *FULL])) as rack:
-        (empty,) = queue_fills(Newest(rack.segment))
-        assert empty.line == "queue upper.requests: 0 of 7 unread"
-        rack.run(1.0)
-        (full,) = queue_fills(Newest(rack.segment))
-    assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
-
-
-def test_check_shows_the_depth_of_a_queue(tmp_path: Path) -> None:
-    path = tmp_path / "queues.toml"
-    path.write_text(QUEUES)
-    config = load(path, list(FULL))
-    (line,) = (
-        line
-        for line in render_text(inventory_blocks(inventory(config, wire(config), [])))
-        if "upper.requests " in line
-    )
-    assert "queue of 7" in line

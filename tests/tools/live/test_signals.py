@@ -3,14 +3,11 @@ tick."""
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator
 
 import pytest
-from rich.console import Console
 
-from rack.tools.live.signals import Lines, Plot, SignalTap, Strip
+from rack.tools.live.signals import SignalTap, Strip
 from rack.tools.recording.signal import Signal
 from tests.backplane.bus import NAME
 from tests.link import Link, links
@@ -30,7 +27,9 @@ def signals(link: Link) -> list[Signal]:
     return [Signal.of(f"{NAME}.{name}", boxes) for name in ("row[3]", "id")]
 
 
-def test_every_message_is_taken_once(link: Link, signals: list[Signal]) -> None:
+def test_every_message_is_taken_once_and_what_is_overwritten_is_counted(
+    link: Link, signals: list[Signal]
+) -> None:
     tap = SignalTap(link.segment, signals)
     taken = []
     for first in range(0, 60, 20):
@@ -40,11 +39,7 @@ def test_every_message_is_taken_once(link: Link, signals: list[Signal]) -> None:
             taken += zip(written.ticks.tolist(), written.messages["id"].tolist(), strict=True)
     assert taken == [(tick, tick) for tick in range(0, 60, 2)]
     assert [*tap.take()] == []
-
-
-def test_what_is_overwritten_is_counted(link: Link, signals: list[Signal]) -> None:
-    tap = SignalTap(link.segment, signals)
-    link.run(0, 400)
+    link.run(60, 460)
     (written,) = tap.take()
     assert written.lost + len(written.ticks) == 200
     assert written.lost > 0
@@ -73,44 +68,3 @@ def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Sig
     strip.take()
     assert strip.table(5, 6) == [(6, [6, 6])]
     assert strip.time_s(6) == 0.015
-
-
-def test_a_strip_counts_only_what_is_overwritten_after_it_began(
-    link: Link, signals: list[Signal]
-) -> None:
-    link.run(0, 400)
-    strip = Strip(link.segment, signals, span=20)
-    assert strip.lost == 0
-    link.run(400, 800)
-    strip.take()
-    assert strip.lost > 0
-
-
-def test_lines_are_as_far_apart_as_was_asked(
-    link: Link, signals: list[Signal], capsys: pytest.CaptureFixture[str]
-) -> None:
-    strip = Strip(link.segment, signals, span=100)
-    link.run(0, 40)
-    strip.take()
-    lines = Lines(strip, first=4, every=10, as_json=True)
-    for last in (3, 15, 16, 39):
-        lines.show(last)
-    found = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [line["tick"] for line in found] == [4, 14, 24, 34]
-    assert found[0] == {"time_s": 0.01, "tick": 4, f"{NAME}.row[3]": 4, f"{NAME}.id": 4}
-    Lines(strip, first=36, every=0, as_json=False).show(39)
-    assert capsys.readouterr().out.splitlines() == ["    0.0900  36  36", "    0.0950  38  38"]
-
-
-def test_a_plot_has_a_curve_for_each_number(link: Link) -> None:
-    boxes = link.segment.layout.mailboxes
-    signals = [Signal.of(f"{NAME}.{name}", boxes) for name in ("row[3]", "id", "text")]
-    strip = Strip(link.segment, signals, span=100)
-    link.run(0, 40)
-    strip.take()
-    terminal = Console(force_terminal=True, color_system=None, width=90, height=30)
-    with terminal.capture() as drawn, Plot(strip, 40, terminal) as plot:
-        plot.show(39)
-    # Text has no curve.
-    assert {*re.findall(rf"{NAME}\S+", drawn.get())} == {f"{NAME}.row[3]", f"{NAME}.id"}
-    assert "simulated time, s" in drawn.get()

@@ -85,23 +85,17 @@ def test_restarts_are_the_writers_that_came_after_the_first(segment: Segment) ->
     assert row(segment, "lower").restarts == 0
     for _ in range(3):
         open_writer(segment, "lower.status").close()
-    assert [row(segment, name).restarts for name in ("lower", "lower.planner", "upper")] == [
-        2,
-        0,
-        0,
-    ]
+    names = ("lower", "lower.planner", "upper")
+    assert [row(segment, name).restarts for name in names] == [2, 0, 0]
 
 
-def test_a_fault_is_shown_while_it_is_active(segment: Segment) -> None:
+def test_active_faults_and_what_is_demanded_of_the_arm_are_shown(segment: Segment) -> None:
     entry = FaultTable(segment).entries[0]
     seen = []
     for stage in (Stage.WAITING, Stage.ACTIVE, Stage.OVER):
         entry.stage = stage
         seen.append(RackMonitor(segment).look().faults)
     assert seen == [(), ("mute of lower",), ()]
-
-
-@pytest.mark.parametrize("demand", Demand)
-def test_what_is_demanded_of_the_arm_is_shown(segment: Segment, demand: Demand) -> None:
-    segment.words[System.DEMAND] = demand
-    assert RackMonitor(segment).look().demand == demand.name.lower()
+    for demand in Demand:
+        segment.words[System.DEMAND] = demand
+        assert RackMonitor(segment).look().demand == demand.name.lower()

@@ -10,7 +10,6 @@ import socket
 import ssl
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -23,9 +22,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure
-from rack.tools.network import estop
 from rack.tools.network.certificates import make_credentials
-from rack.tools.network.estop import EstopSession, check_reach
+from rack.tools.network.estop import check_reach
 from rack.tools.viewer.window import free_port
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S, RACK, wait_until
@@ -81,27 +79,23 @@ def afar(*commands: str) -> list[Ended]:
     return [Ended(one.returncode, *text) for one, text in zip(started, texts, strict=True)]
 
 
-def started(folder: Path, mode: str) -> Iterator[Far]:
-    """Start a rack that runs until it is stopped, and stop it at the end."""
-    name, port = f"test-afar-{mode}-{os.getpid()}", free_port()
+@pytest.fixture(scope="module")
+def far(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
+    """A rack on this machine that runs until it is stopped, to be reached by its address."""
+    folder = tmp_path_factory.mktemp("far")
+    name, port = f"test-afar-{os.getpid()}", free_port()
     peer = f"{name}-peer"
     config, log = folder / "far.toml", folder / "log"
     config.write_text(COMMANDED + OF_LAN.format(port=port, peer=peer))
     people = dict.fromkeys((peer, "operator", "nobody"), ())
     make_credentials(folder / "certs", {name: ["127.0.0.1"], **people}, 1)
-    given = [
-        word for setting in (f"name={name}", f"clock.mode={mode}") for word in ("--set", setting)
-    ]
-    with log.open("w") as out, ExitStack() as stack:
-        patch = stack.enter_context(pytest.MonkeyPatch.context())
+    command = [*RACK, "run", str(config), "--no-record", f"--set=name={name}"]
+    with log.open("w") as out, pytest.MonkeyPatch.context() as patch:
         patch.setenv("RACK_CERTIFICATES", str(folder / "certs"))
         process = subprocess.Popen(
-            [*RACK, "run", str(config), "--no-record", *given], cwd=ROOT, stdout=out, stderr=out
+            [*command, "--set=clock.mode=realtime"], cwd=ROOT, stdout=out, stderr=out
         )
         try:
-            if mode == "lockstep":
-                # It steps with its peer, and waits for that.
-                stack.enter_context(partner(config, peer, name, port))
             wait_until(lambda: f"{name} " in log.read_text() or process.poll() is not None)
             assert process.poll() is None, log.read_text()
             yield Far(name, f"127.0.0.1:{port}/{name}", log)
@@ -112,31 +106,10 @@ def started(folder: Path, mode: str) -> Iterator[Far]:
 
 
 @contextmanager
-def partner(config: Path, name: str, other: str, port: int) -> Iterator[None]:
-    """Run a rack that steps with the other one."""
-    lan = (f'connect=["tls/127.0.0.1:{port}"]', "listen=[]", f'peers=["{other}"]')
-    settings = (f"name={name}", *(f"adapter.lan.{setting}" for setting in lan))
-    given = [word for setting in settings for word in ("--set", setting)]
-    with client("run", str(config), "--lockstep", "--no-record", *given):
-        try:
-            yield
-        finally:
-            rack("stop", name)
-
-
-@contextmanager
 def client(*words: str) -> Iterator[subprocess.Popen[str]]:
     """Run a command in a process of its own, which is killed at the end, should it still run."""
-    pipe = subprocess.PIPE
-    is_ready = "--ready" in words
-    process = subprocess.Popen(
-        [*RACK, *words],
-        cwd=ROOT,
-        stdin=pipe if is_ready else None,
-        stdout=pipe,
-        stderr=pipe if is_ready else None,
-        text=True,
-    )
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    process = subprocess.Popen([*RACK, *words], cwd=ROOT, text=True, **pipes)
     try:
         yield process
     finally:
@@ -144,20 +117,8 @@ def client(*words: str) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-IN_REAL_TIME = pytest.param("realtime", marks=pytest.mark.alone)
-"""Next to racks in real time of other tests the one asked falls silent, and counts as gone."""
-REALTIME = pytest.mark.parametrize("far", [IN_REAL_TIME], indirect=True)
-IN_BOTH = pytest.mark.parametrize("far", [IN_REAL_TIME, "lockstep"], indirect=True)
-
-
-@pytest.fixture(scope="module")
-def far(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
-    """A rack on this machine, to be reached by its address."""
-    yield from started(tmp_path_factory.mktemp("far"), request.param)
-
-
 @pytest.mark.slow
-@IN_BOTH
+@pytest.mark.alone
 def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> None:
     segment = Segment.attach(far.name)
     (stopped,) = afar(f"estop {far.address} --json")
@@ -174,52 +135,35 @@ def test_an_emergency_stop_is_set_from_afar_and_reset_at_the_rack(far: Far) -> N
 
 
 @pytest.mark.slow
-@IN_BOTH
+@pytest.mark.alone
 def test_nobody_stops_a_rack_who_may_not_or_has_no_key_to_press(far: Far) -> None:
     nobody = f"no rack '{far.name}' at {far.port}; racks there: none that knows 'nobody'; "
     where = "it waits to stop a rack of another machine, HOST/RACK"
-    for command, status, lines in (
-        ("{} --as nobody", 1, [f"{nobody}its certificate and yours must be of one authority"]),
-        ("{} --as nobody --certificates=", 1, [f"{nobody}one with TLS needs --certificates"]),
-    ):
-        (ended,) = afar(f"estop {command.format(far.address)}")
-        assert (ended.status, ended.err.splitlines()) == (status, lines)
-    ended = afar(
-        f"estop {far.port}/other",
-        f"estop {far.address} --as {far.name}-peer",
-        f"estop {far.address} --reset",
-        f"estop {far.address} --ready",
-        f"estop {far.name} --ready",
-        f"estop {far.address} --ready --reset",
-        f"status {far.address}",
-    )
-    assert [(one.status, one.err.splitlines()) for one in ended] == [
-        (1, [f"no rack 'other' at {far.port}; racks there: {far.name}"]),
-        (
+    peer = f"{far.name}-peer"
+    reset = f"rack '{far.name}' resets an emergency stop on its own machine alone"
+    refused = {
+        f"estop {far.address} --as nobody": (
             1,
-            [
-                f"rack '{far.name}' does not permit '{far.name}-peer' to stop it; its config:"
-                " adapter.lan.estop_from"
-            ],
+            f"{nobody}its certificate and yours must be of one authority",
         ),
-        (
+        f"estop {far.port}/other": (1, f"no rack 'other' at {far.port}; racks there: {far.name}"),
+        f"estop {far.address} --as {peer}": (
             1,
-            [
-                f"rack '{far.name}' resets an emergency stop on its own machine alone: rack estop"
-                f" {far.name} --reset"
-            ],
+            f"rack '{far.name}' does not permit '{peer}' to stop it; its config:"
+            " adapter.lan.estop_from",
         ),
-        (1, [f"ready to stop rack '{far.address}'", "stdin has ended, and no stop was set"]),
-        (2, [f"--ready, {far.name}: {where}"]),
-        (2, [f"--ready, --reset: {where}"]),
-        (
+        f"estop {far.address} --reset": (1, f"{reset}: rack estop {far.name} --reset"),
+        f"estop {far.address} --ready": (1, "stdin has ended, and no stop was set"),
+        f"estop {far.name} --ready": (2, f"--ready, {far.name}: {where}"),
+        f"estop {far.address} --ready --reset": (2, f"--ready, --reset: {where}"),
+        f"status {far.address}": (
             2,
-            [
-                f"RACK = {far.address}: this command works on the rack's own machine alone, as in:"
-                " ssh HOST rack status; from another machine only: rack estop"
-            ],
+            f"RACK = {far.address}: this command works on the rack's own machine alone, as in:"
+            " ssh HOST rack status; from another machine only: rack estop",
         ),
-    ]
+    }
+    ended = afar(*refused)
+    assert [(one.status, one.err.splitlines()[-1]) for one in ended] == [*refused.values()]
     segment = Segment.attach(far.name)
     assert segment.words[System.EMERGENCY_STOP] == 0
     segment.close()
@@ -254,7 +198,7 @@ def shaking_hands(port: int) -> Iterator[Callable[[], int]]:
 
 
 @pytest.mark.slow
-@REALTIME
+@pytest.mark.alone
 def test_a_stop_that_is_ready_waits_for_no_handshake_of_strangers(far: Far) -> None:
     segment = Segment.attach(far.name)
     port = int(far.port.rpartition(":")[2])
@@ -279,7 +223,7 @@ def test_a_stop_that_is_ready_waits_for_no_handshake_of_strangers(far: Far) -> N
 
 
 @pytest.mark.slow
-@REALTIME
+@pytest.mark.alone
 def test_whoever_is_ready_is_told_when_the_run_ends(far: Far) -> None:
     with client("estop", far.address, "--ready") as ready:
         assert ready.stderr is not None
@@ -321,38 +265,3 @@ def test_another_machine_is_not_asked_without_certificates(monkeypatch: pytest.M
         pytest.raises(Failure, match="not this machine, so it needs certificates"),
     ):
         check_reach(RackAddress("127.0.0.1", server.getsockname()[1], "cell"), Operator())
-
-
-class Line(EstopSession):
-    """A session in which each request gets the next of these answers; None: it comes back without
-    one. The last is repeated."""
-
-    def __init__(self, *answers: int | None, wait_s: float = 0.0) -> None:
-        self._address, self._operator = RackAddress("127.0.0.1", 7447, "cell"), Operator()
-        self._launches = {"cell": 1}
-        self._changes = lambda: iter(())
-        self._answers = [*answers]
-        self._wait_s = wait_s
-
-    def _request(self, launch: int, flags: int) -> int | None:
-        time.sleep(self._wait_s)
-        return self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
-
-
-def test_a_stop_is_repeated_while_the_way_to_the_rack_is_not_there_yet() -> None:
-    assert Line(*[None] * 15, 40).set_stop(1) == 40
-
-
-def test_a_rack_that_never_answers_does_not_permit_it_or_does_not_cycle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(estop, "DENIED_S", 0.1)
-    monkeypatch.setattr(estop, "PATIENCE_S", 0.3)
-    monkeypatch.setattr(estop, "ANSWER_S", 0.04)
-    with pytest.raises(Failure, match="rack 'cell' does not permit 'operator' to stop it"):
-        Line(None).set_stop(1)
-    # A request that does not come back at once was taken.
-    with pytest.raises(Failure, match=r"has not answered for 0\.3 s"):
-        Line(None, wait_s=0.03).set_stop(1)
-    with pytest.raises(Failure, match="has ended, or is out of reach"):
-        Line(None).set_stop(2)

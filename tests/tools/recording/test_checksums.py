@@ -9,13 +9,12 @@ import random
 import shutil
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.checkpoint.format import read as read_checkpoint
 from rack.boards.config import RackConfig, load
@@ -27,7 +26,6 @@ from rack.tools.recording.parquet import CONFIG, HEAD
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import tally
 from rack.tools.timing.analysis.report import write_report
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
@@ -35,7 +33,7 @@ from tests.tools.command_line import rack
 BOUND_S = 30
 """Bound of a command on a damaged run."""
 SIGNALS = "signals/*/*"
-FLIPS = 25
+FLIPS = 15
 
 
 @pytest.fixture(scope="module")
@@ -129,76 +127,32 @@ def test_a_flipped_bit_is_named_or_changes_no_value(damaged: Path, pattern: str)
 
 
 @pytest.mark.slow
-def test_a_flipped_bit_in_the_spool_of_a_killed_recorder_is_named(
-    config: RackConfig, tmp_path: Path
+@pytest.mark.parametrize(
+    ("record", "pattern", "why"),
+    [("", SPOOL, r"recorder\.spool: "), ('record={ keep = "60 s" }', "stretches/*", "stretches/")],
+    ids=["killed", "flight"],
+)
+def test_a_flipped_bit_in_what_a_recorder_leaves_is_named(
+    small: Path, rack_name: str, tmp_path: Path, record: str, pattern: str, why: str
 ) -> None:
-    folder = tmp_path / "killed"
+    config = load(small, [f"name={rack_name}", *([record] if record else [])])
+    folder, copy = tmp_path / "run", tmp_path / "copy"
     folder.mkdir()
     (folder / CONFIG).write_text(config.text())
     with Rack(config) as running, Recorder(running.segment, folder) as recorder:
         running.run(0.5)
         recorder.drain()
         recorder._spool.flush(now=True)
-        shutil.copytree(folder, tmp_path / "copy")
-    for path, content in flipped_bits(tmp_path / "copy", SPOOL, FLIPS):
-        again = Path(shutil.copytree(path.parent, tmp_path / "again"))
-        (again / SPOOL).write_bytes(content)
-        with pytest.raises(Failure, match=r"recorder\.spool: "):
+        # As one that is killed leaves it.
+        shutil.copytree(folder, copy)
+    assert [*copy.glob(pattern)]
+    for path, content in flipped_bits(copy, pattern, FLIPS):
+        again = Path(shutil.copytree(copy, tmp_path / "again"))
+        (again / path.relative_to(copy)).write_bytes(content)
+        with pytest.raises(Failure, match=why):
             Recording(again)
         shutil.rmtree(again)
-    assert values(tmp_path / "copy")
-
-
-@pytest.mark.slow
-def test_a_flipped_bit_in_a_stretch_of_a_flight_recorder_is_named(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
-    config = load(small, [f"name={rack_name}", 'record={ keep = "60 s" }'])
-    folder = tmp_path / "flight"
-    folder.mkdir()
-    (folder / CONFIG).write_text(config.text())
-    with Rack(config) as running, Recorder(running.segment, folder) as recorder:
-        running.run(0.5)
-        recorder.drain()
-    assert len([*folder.glob("stretches/*")]) > 1
-    for path, content in flipped_bits(folder, "stretches/*", FLIPS):
-        before = path.read_bytes()
-        path.write_bytes(content)
-        with pytest.raises(Failure, match=path.name):
-            tally(folder)
-        path.write_bytes(before)
-    assert values(folder)
-
-
-@pytest.mark.slow
-def test_an_error_in_a_recorder_costs_no_row(
-    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A recorder without memory for a block of rows ends; the next one takes them from its
-    spool."""
-    (tmp_path / CONFIG).write_text(config.text())
-
-    def fail(*arguments: object, **named: object) -> None:
-        raise MemoryError
-
-    with Rack(config) as running, bounded():
-        segment = running.segment
-        running.run_in_background(3.0)
-        with ExitStack() as stack:
-            recorder = stack.enter_context(Recorder(segment, tmp_path))
-            while segment.words[System.TICK] < 1000:
-                recorder.drain()
-            monkeypatch.setattr("rack.tools.recording.run_files.RunFiles.add", fail)
-            with pytest.raises(MemoryError) as error:
-                recorder.drain()
-            monkeypatch.undo()
-            stack.pop_all().__exit__(error.type, error.value, error.tb)
-        with Recorder(segment, tmp_path) as recorder:
-            recorder.follow()
-        recording = Recording(tmp_path)
-        assert recording.missing(segment) == {}
-    serials = recording.signal("lower.status", "serial")
-    assert np.array_equal(serials, np.arange(1, 1201))
+    assert values(copy)
 
 
 def test_a_value_that_is_not_a_number_is_null_in_json_and_comes_back() -> None:
@@ -230,12 +184,11 @@ def test_nan_in_a_sensor_leaves_strict_json(tmp_path: Path, rack_name: str) -> N
     assert Event(**event).code == "sensor_range"
 
 
-def take_fifo(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def take_device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
+PLACES: tuple[Callable[[Path], None], ...] = (
+    os.mkfifo,
+    lambda path: path.symlink_to("/dev/zero"),
+)
+"""Ways to put something else in a file's place."""
 
 
 COMMANDS: dict[str, Callable[[Path, Path], tuple[object, ...]]] = {
@@ -250,18 +203,25 @@ COMMANDS: dict[str, Callable[[Path, Path], tuple[object, ...]]] = {
     "entries": lambda run, out: ("run", "fig2", "--lockstep", "--entries", run, "--out", out / "r"),
     "from": lambda run, out: ("run", "--from", f"{run}@1", "--out", out / "r"),
 }
-READ = ("cycles.parquet", "signals/lower.status.parquet/0001.parquet", CHECKSUMS, CONFIG)
+
+
+NEEDED = ("cycles.parquet", "signals/lower.status.parquet/0001.parquet", CHECKSUMS, CONFIG)
 """Files without which no command can read a run."""
+CASES = [
+    *((command, CONFIG) for command in COMMANDS if command != "report"),
+    *(("report", name) for name in (*NEEDED, "events.jsonl", "origin.json")),
+]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", READ)
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(("command", "name"), CASES)
 def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
     damaged: Path, tmp_path: Path, command: str, name: str
 ) -> None:
-    for take_place in (take_fifo, take_device):
-        (damaged / name).unlink()
+    # Otherwise the report that is there is right.
+    (damaged / "report.json").unlink()
+    for take_place in PLACES:
+        (damaged / name).unlink(missing_ok=True)
         take_place(damaged / name)
         with bounded():
             done = rack(*COMMANDS[command](damaged, tmp_path))
@@ -271,36 +231,25 @@ def test_every_command_on_a_run_refuses_a_fifo_or_a_device_for_a_file(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("take_place", [take_fifo, take_device])
-@pytest.mark.parametrize("name", ["events.jsonl", "origin.json", "report.json", "report.md"])
-def test_a_report_reads_regular_files_only(
-    damaged: Path, name: str, take_place: Callable[[Path], None]
-) -> None:
-    """What it needs is named; its own files are replaced."""
+@pytest.mark.parametrize("name", ["report.json", "report.md"])
+def test_a_report_replaces_its_own_files_whatever_they_are(damaged: Path, name: str) -> None:
     whole = rack("report", damaged).stdout
-    if not name.startswith("report"):
-        # Otherwise the report that is there is right.
-        (damaged / "report.json").unlink()
-    (damaged / name).unlink(missing_ok=True)
-    take_place(damaged / name)
-    with bounded():
-        done = rack("report", damaged)
-    if name.startswith("report"):
+    for take_place in PLACES:
+        (damaged / name).unlink()
+        take_place(damaged / name)
+        with bounded():
+            done = rack("report", damaged)
         assert (done.returncode, done.stdout) == (0, whole)
         assert (damaged / name).is_file()
         assert not (damaged / name).is_symlink()
-    else:
-        assert done.returncode == 2
-        assert f"{name}: not a regular file" in done.stderr
 
 
-@pytest.mark.parametrize("take_place", [take_fifo, take_device])
-def test_a_checkpoint_is_read_from_a_regular_file_only(
-    tmp_path: Path, take_place: Callable[[Path], None]
-) -> None:
-    take_place(tmp_path / "400.checkpoint")
-    with bounded(), pytest.raises(CheckpointError, match="not a regular file"):
-        read_checkpoint(tmp_path / "400.checkpoint")
+def test_a_checkpoint_is_read_from_a_regular_file_only(tmp_path: Path) -> None:
+    for number, take_place in enumerate(PLACES):
+        path = tmp_path / f"{number}.checkpoint"
+        take_place(path)
+        with bounded(), pytest.raises(CheckpointError, match="not a regular file"):
+            read_checkpoint(path)
 
 
 def test_a_damaged_file_of_the_viewer_is_named(damaged: Path) -> None:

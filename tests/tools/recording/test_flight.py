@@ -3,7 +3,7 @@ stay, and every row that had to be kept is proved to be there."""
 
 from __future__ import annotations
 
-import re
+import os
 import signal
 from pathlib import Path
 
@@ -16,10 +16,10 @@ from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.checkpoint.format import checkpoints
 from rack.boards.config import RackConfig, load
-from rack.tools.commands.replay import merge, replay
+from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.live.launch import RunResult, run_rack
 from rack.tools.live.snapshot import Snapshot
 from rack.tools.recording.divergence import first_difference
 from rack.tools.recording.occasions import Retention
@@ -32,9 +32,7 @@ from rack.tools.recording.spool import STRETCHES
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.sink import ViewSink
-from rack.tools.viewer.window import free_port
-from tests.tools.command_line import rack
+from tests.conftest import SMALL
 from tests.tools.recording.struck_recorders import Held
 
 pytestmark = [pytest.mark.slow, pytest.mark.thorough]
@@ -56,12 +54,12 @@ class Measuring(Display):
     period_s = 0.05
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self.counts: dict[int, int] = {}
 
     def show(self, snapshot: Snapshot) -> None:
         """Count."""
-        stretches = len([*(self._folder / STRETCHES).glob("*")])
+        stretches = len([*(self.folder / STRETCHES).glob("*")])
         self.counts[snapshot.tick // SECOND] = stretches
 
 
@@ -71,17 +69,26 @@ def config(small: Path, rack_name: str) -> RackConfig:
     return load(small, [f"name={rack_name}", RECORD, FAULT])
 
 
+@pytest.fixture(scope="module")
+def long_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, Measuring]:
+    """A run of a minute: its result, and how many stretches there were meanwhile."""
+    folder = tmp_path_factory.mktemp("flight")
+    (folder / "small.toml").write_text(SMALL)
+    config = load(folder / "small.toml", [f"name=test-flight-{os.getpid()}", RECORD, FAULT])
+    display = Measuring(folder / "run")
+    return run_rack(config, LONG_S, folder / "run", display), display
+
+
 def test_a_long_run_does_not_grow_and_what_surrounds_a_fault_stays(
-    config: RackConfig, tmp_path: Path
+    long_run: tuple[RunResult, Measuring],
 ) -> None:
-    folder, display = tmp_path / "run", Measuring(tmp_path / "run")
-    result = run_rack(config, LONG_S, folder, display)
+    result, display = long_run
+    folder = display.folder
     assert (result.worked, result.recording) == (True, "complete")
     late = {second: count for second, count in display.counts.items() if second > 2 * KEEP_S}
     # The fault's end and the message that was missed by its reader are occasions, too.
     assert max(late.values()) <= KEEP_S + 2 * AROUND_S + 1 + LEEWAY
     assert max(late.values(), default=0) > KEEP_S - LEEWAY
-    assert not (folder / "cycles.parquet").exists()
     recording = Recording(folder)
     assert not (folder / STRETCHES).exists()
     around, last = recording.kept
@@ -101,10 +108,9 @@ def test_a_long_run_does_not_grow_and_what_surrounds_a_fault_stays(
 
 
 def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
-    config: RackConfig, tmp_path: Path
+    long_run: tuple[RunResult, Measuring], tmp_path: Path
 ) -> None:
-    folder = tmp_path / "run"
-    run_rack(config, LONG_S, folder, Display())
+    folder, made = long_run[1].folder, tmp_path / "made.rrd"
     report, text = write_report(folder)
     recording = Recording(folder)
     assert recording.kept_text.startswith("kept ")
@@ -114,22 +120,19 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     assert (report["rows_lost"], report["gaps"], report["untraced"]) == ({}, [], {})
     # No plan was as old as the stretch that is missing.
     assert report["tasks"]["lower"]["plan_age_ms"]["max"] < 100
-    merge([folder], folder / FILE)
     with pytest.raises(Failure, match=r"the rest was not kept.*cannot be compared"):
         first_difference(recording, recording)
-
-
-def test_a_run_that_is_shorter_than_what_is_kept_is_as_any_other(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
-    names = [f"name={rack_name}"]
-    for folder, settings in (("whole", names), ("flight", [*names, RECORD])):
-        assert run_rack(load(small, settings), 3.0, tmp_path / folder, Display()).worked
-    whole, flight = (Recording(tmp_path / name) for name in ("whole", "flight"))
-    assert (flight.kept, flight.kept_text) == ([], "")
-    assert first_difference(whole, flight) is None
-    for name in ("lower", "upper", *whole.mailboxes):
-        assert len(flight.rows(name)) == len(whole.rows(name))
+    assert not (folder / FILE).exists()
+    replay([folder], made)
+    shown = read(made, "/signals/lower.status/count")
+    assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
+    # No age is shown where nothing was kept.
+    ages = read(made, "/ages/lower.status").ticks
+    assert len(ages)
+    (_, gone), (back, _) = recording.kept
+    assert not ((ages > gone + SECOND) & (ages < back - SECOND)).any()
+    logged = RrdReader(str(made)).stream().filter(content="/log/recorder").to_chunks()
+    assert recording.kept_text in str([chunk.to_record_batch().to_pydict() for chunk in logged])
 
 
 def test_a_recorder_that_is_killed_goes_on_with_the_next_stretch(
@@ -176,6 +179,9 @@ def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(
     folder = tmp_path / "run"
     with Rack(early) as rack:
         segment = rack.segment
+        nothing = tmp_path / "nothing"
+        nothing.mkdir()
+        Recorder(segment, nothing).close()
         fly(rack, folder, seconds=10.0).close()
         assert what_lacks(segment, folder) == (set(), [])
         stretches = sorted((folder / STRETCHES).iterdir())
@@ -194,16 +200,7 @@ def test_a_recording_is_complete_only_if_all_that_had_to_be_kept_is_there(
         lacking, absent = what_lacks(segment, folder)
         assert lacking
         assert not absent
-
-
-def test_rows_that_a_flight_recorder_did_not_take_are_missing(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    tmp_path.joinpath(CONFIG).write_text(config.text())
-    with Rack(config) as rack:
-        Recorder(rack.segment, tmp_path).close()
-        rack.run(0.5)
-        lacking, absent = what_lacks(rack.segment, tmp_path)
+        lacking, absent = what_lacks(segment, nothing)
     assert {"lower", "lower.status", "upper"} <= lacking
     assert absent
 
@@ -222,44 +219,3 @@ def test_what_is_kept_is_saved_while_the_run_goes_on(config: RackConfig, tmp_pat
     ticks = part.trace("lower")["tick"]
     assert len(ticks) > SECOND
     assert np.isin(ticks, whole.trace("lower")["tick"]).all()
-
-
-def test_a_viewer_is_served_and_its_file_is_not_written(config: RackConfig, tmp_path: Path) -> None:
-    (tmp_path / CONFIG).write_text(config.text())
-    with Rack(config) as rack:
-        view = ViewSink(rack.segment, tmp_path, free_port())
-        with Recorder(rack.segment, tmp_path, view) as recorder:
-            rack.run(0.5)
-            recorder.drain()
-    assert not (tmp_path / FILE).exists()
-    assert len(Recording(tmp_path).trace("lower")) == SECOND // 2
-
-
-def test_a_run_ends_with_where_it_is_recorded_and_how_big_it_is(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    name = ("--set", f"name={rack_name}", "--set", RECORD)
-    done = rack("run", small, "--seconds", 2, *name, "--out", run)
-    assert done.returncode == 0, done.stderr
-    last = done.stdout.splitlines()[-1]
-    assert re.fullmatch(rf"recorded into {run}: [0-9.]+ MB, [0-9.]+ MB/s", last)
-
-
-def test_the_viewers_file_is_made_of_what_was_kept_and_its_log_says_so(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    folder, made = tmp_path / "run", tmp_path / "made.rrd"
-    run_rack(config, LONG_S, folder, Display())
-    assert not (folder / FILE).exists()
-    replay([folder], made)
-    recording = Recording(folder)
-    shown = read(made, "/signals/lower.status/count")
-    assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
-    # No age is shown where nothing was kept.
-    ages = read(made, "/ages/lower.status").ticks
-    assert len(ages)
-    (_, gone), (back, _) = recording.kept
-    assert not ((ages > gone + SECOND) & (ages < back - SECOND)).any()
-    logged = RrdReader(str(made)).stream().filter(content="/log/recorder").to_chunks()
-    assert recording.kept_text in str([chunk.to_record_batch().to_pydict() for chunk in logged])

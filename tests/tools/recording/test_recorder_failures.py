@@ -3,16 +3,13 @@ and the user gets a message."""
 
 from __future__ import annotations
 
-import re
 import signal
-import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from rerun.chunk import RrdReader
 
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
@@ -31,12 +28,8 @@ from rack.tools.recording.run_files import mend
 from rack.tools.recording.spool import Spool, locked
 from rack.tools.timing.analysis.analysis import Analysis
 from rack.tools.timing.analysis.report import write_report
-from rack.tools.viewer.reading import read
-from rack.tools.viewer.window import executable
-from tests.shared_runs import small_run
 from tests.tools.analysis_text import text as analysis_text
 from tests.tools.recording.struck_recorders import (
-    FIRST_BLOCK,
     LONG_S,
     AtTick,
     Held,
@@ -56,14 +49,6 @@ def config(small: Path, rack_name: str) -> RackConfig:
     return load(small, [f"name={rack_name}"])
 
 
-def test_a_rack_without_an_arm_is_recorded_too(tmp_path_factory: pytest.TempPathFactory) -> None:
-    recording = Recording(small_run(tmp_path_factory))
-    for field, mailbox in (("count", "lower.status"), ("goal", "upper.command")):
-        rows = read(recording.folder / "run.rrd", f"/signals/{mailbox}/{field}")
-        assert np.array_equal(rows.values.ravel(), recording.signal(mailbox, field))
-        assert np.array_equal(rows.ticks, recording.signal(mailbox, "tick"))
-
-
 @pytest.mark.slow
 def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
     config: RackConfig, tmp_path: Path
@@ -73,10 +58,8 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
-    assert (
-        notes_of(recording)[0]
-        == "the recorder ended with status -9; restarted, 1 of at most 3 times"
-    )
+    restarted = "the recorder ended with status -9; restarted, 1 of at most 3 times"
+    assert notes_of(recording)[0] == restarted
     # In lockstep the clock waits for the next one as it did for the first: not one row is missing.
     serials = recording.signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
@@ -89,39 +72,61 @@ def test_a_recorder_that_is_killed_is_restarted_and_goes_on_where_it_was(
 
 
 @pytest.mark.slow
-def test_recorders_killed_before_their_first_block_cost_no_row(
-    config: RackConfig, tmp_path: Path
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_a_recorder_that_is_stopped_is_replaced_without_a_loss(
+    config: RackConfig, tmp_path: Path, mode: str
 ) -> None:
-    # Each new one, too, is struck as soon as it is there.
-    display = Held(config.name, signal.SIGKILL, tick=0, times=recorder_process.RESTARTS)
-    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
-    assert len(display.struck) == recorder_process.RESTARTS
-    assert (result.worked, result.recording, result.rows_lost) == (True, "complete", {})
-    serials = Recording(tmp_path / "run").signal("lower.status", "serial")
-    assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
-
-
-@pytest.mark.slow
-def test_a_recorder_that_is_stopped_is_replaced_and_lockstep_waits(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    display = Held(config.name, signal.SIGSTOP)
-    result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
+    display: AtTick = Held(config.name, signal.SIGSTOP)
+    if mode == "realtime":
+        # The rings hold two seconds: the whole run.
+        display, config = AtTick(signal.SIGSTOP), realtime(config)
+    seconds = LONG_S if mode == "lockstep" else 2.0
+    result = run_rack(config, seconds, tmp_path / "run", display, step=mode == "lockstep")
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
     assert notes_of(recording)[0] == "the recorder is not responding: killed"
-    assert len(recording.signal("lower.status", "serial")) == result.outcome.ticks
+    rows = len(recording.signal("lower.status", "serial"))
+    assert rows == result.outcome.ticks or mode == "realtime"
 
 
 @pytest.mark.slow
-def test_lockstep_waits_for_a_recorder_that_comes_late(
-    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_lockstep_waits_for_a_recorder_that_comes_late_and_real_time_does_not(
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
-    result = run_rack(config, LONG_S, tmp_path / "run", Display())
-    assert notes_of(Recording(tmp_path / "run"))[:2] == [NO_RECORDER, "the recorder has begun"]
+    config = config if mode == "lockstep" else realtime(config)
+    result = run_rack(config, 3.0, tmp_path / "run", Display())
     assert (result.worked, result.recording) == (True, "complete")
+    notes = notes_of(Recording(tmp_path / "run"))
+    assert notes[0] == NO_RECORDER
+    assert mode == "realtime" or notes[1] == "the recorder has begun"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "board"),
+    [
+        ("kind = 'drop', at = 0.4, for = '0.4s'", "lower"),
+        ("kind = 'masquerade', at = 0.4", "lower"),
+        # In each cycle as many messages as the ring of a slow task holds in a second.
+        ("kind = 'babble', at = 0.4, for = '1s', writes = 25", "upper"),
+    ],
+    ids=["drop", "masquerade", "babble"],
+)
+def test_no_message_is_missing_or_taken_twice_though_some_are_faulty_and_a_recorder_is_killed(
+    small: Path, rack_name: str, fault: str, board: str
+) -> None:
+    faults = f"fault=[{{ {fault}, board = '{board}' }}]"
+    folder = small.parent / "run"
+    config, display = load(small, [f"name={rack_name}", faults]), Held(rack_name, signal.SIGKILL)
+    result = run_rack(config, LONG_S / 2, folder, display, step=True)
+    assert display.struck
+    assert result.faults[0].count >= 1
+    assert result.recording == "complete"
+    serials = Recording(folder).signal("lower.status", "serial")
+    assert np.all(np.diff(serials) > 0)
 
 
 @pytest.mark.slow
@@ -136,22 +141,16 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
     taken = counts(recording)
     missing = {name: ticks - taken[name] for name in ("lower", "lower.status")}
     assert missing["lower"] > ticks / 4
-    assert (
-        {name: result.rows_lost[name] for name in missing}
-        == missing
-        == {n: recording.lost[n] for n in missing}
-    )
+    assert missing.items() <= result.rows_lost.items()
+    assert missing.items() <= recording.lost.items()
     worst = max(result.rows_lost, key=lambda name: (result.rows_lost[name], name))
     (gap,) = recording.gaps()
     # Slow rings lack what came since their last message.
     assert (gap.first <= taken["lower"], gap.last) == (True, ticks - 1)
     assert set(gap.rings) == set(result.rows_lost)
-    assert (
-        result.recording
-        == f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing (and rows of"
-        f" {len(result.rows_lost) - 1} more tasks and mailboxes); {gap}; the recorder ended with"
-        " status -9"
-    )
+    others = f"and rows of {len(result.rows_lost) - 1} more tasks and mailboxes"
+    lacking = f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing ({others})"
+    assert result.recording == f"{lacking}; {gap}; the recorder ended with status -9"
     assert result.failure().endswith(result.recording)
     report, text = write_report(tmp_path / "run")
     assert f"Times of lower are from {taken['lower']:,} of {ticks:,} cycles." in text
@@ -160,84 +159,6 @@ def test_a_run_whose_recorder_is_killed_too_often_has_not_worked_and_says_what_i
     assert f"lower: judged by {taken['lower']:,} of {ticks:,} cycles" in analysis_text(
         Analysis.of(recording)
     )
-
-
-@pytest.mark.slow
-def test_rows_that_no_recorder_took_are_missing(config: RackConfig, tmp_path: Path) -> None:
-    taken, left = tmp_path / "taken", tmp_path / "left"
-    with Rack(config) as rack:
-        for folder in (taken, left):
-            folder.mkdir()
-            (folder / CONFIG).write_text(config.text())
-        with Recorder(rack.segment, left):
-            rack.run(0.5)
-        with Recorder(rack.segment, taken) as recorder:
-            recorder.drain()
-        assert Recording(taken).missing(rack.segment) == {}
-        missing = Recording(left).missing(rack.segment)
-    assert (missing["lower.status"], missing["lower"]) == ((200, 200), (200, 200))
-    assert missing["upper.status"] == (25, 25)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["drop", "corrupt", "delay", "reorder", "masquerade"])
-def test_messages_that_readers_reject_are_not_missing_nor_taken_twice(
-    small: Path, rack_name: str, kind: str
-) -> None:
-    """Faults of messages, and a recorder that is killed after them."""
-    lasts = "" if kind == "masquerade" else ", for = '0.4s'"
-    faults = f"fault=[{{ kind = '{kind}', board = 'lower', at = 0.4{lasts} }}]"
-    folder = small.parent / "run"
-    config, display = load(small, [f"name={rack_name}", faults]), Held(rack_name, signal.SIGKILL)
-    result = run_rack(config, LONG_S, folder, display, step=True)
-    assert display.struck
-    assert result.recording == "complete"
-    serials = Recording(folder).signal("lower.status", "serial")
-    assert np.all(np.diff(serials) > 0)
-
-
-@pytest.mark.slow
-def test_lockstep_waits_for_its_recorder_while_a_task_floods_the_rings(
-    small: Path, rack_name: str
-) -> None:
-    """In each cycle as many messages as the ring of a slow task holds in a second."""
-    faults = "fault=[{ kind = 'babble', board = 'upper', at = 0.4, for = '1s', writes = 25 }]"
-    result = run_rack(
-        load(small, [f"name={rack_name}", faults]), LONG_S, small.parent / "run", Display()
-    )
-    assert result.faults[0].count > 1
-    assert result.recording == "complete"
-
-
-@pytest.mark.slow
-def test_what_a_killed_recorder_took_is_readable(
-    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder_process, "RESTARTS", 0)
-    display = AtTick(signal.SIGKILL, view=tmp_path / "run" / "run.rrd")
-    result = run_rack(realtime(config), LONG_S, tmp_path / "run", display)
-    # The run went well, but is not recorded as wanted.
-    assert (result.outcome.worked, result.worked) == (True, False)
-    assert re.fullmatch(
-        r"[0-9,]+ of [0-9,]+ rows of lower.* are missing .*ended with status -9", result.recording
-    )
-    report, _ = write_report(tmp_path / "run")
-    assert (report["worked"], report["recording"]) == (False, result.recording)
-    assert report["rows_lost"] == result.rows_lost
-    assert notes_of(Recording(tmp_path / "run")) == [
-        "the recorder ended with status -9; the run continues, unrecorded"
-    ]
-    ticks = pq.read_table(tmp_path / "run" / "signals" / "lower.status.parquet")["tick"].to_numpy()
-    assert ticks.max() > FIRST_BLOCK / 2
-    repaired = tmp_path / "repaired.rrd"
-    for command in (
-        ["optimize", tmp_path / "run" / "run.rrd", "-o", repaired],
-        ["verify", repaired],
-    ):
-        subprocess.run(
-            [executable(), "rrd", *command], check=True, capture_output=True, timeout=WATCHDOG_S
-        )
-    assert RrdReader(str(repaired)).stream().filter(content="/boards/**").to_chunks()
 
 
 @pytest.mark.slow
@@ -253,26 +174,6 @@ def test_a_recorder_that_dies_over_the_viewers_file_is_reported(
     assert notes_of(Recording(tmp_path / "run")) == [
         "the recorder ended with status 70; run.rrd may lack its end"
     ]
-
-
-@pytest.mark.slow
-def test_a_recorder_that_is_stopped_is_replaced_in_real_time_too(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    result = run_rack(realtime(config), 2.0, tmp_path / "run", AtTick(signal.SIGSTOP))
-    assert result.outcome.worked
-    # The rings hold two seconds: the whole run.
-    assert (result.worked, result.recording) == (True, "complete")
-
-
-@pytest.mark.slow
-def test_a_recorder_that_comes_late_delays_no_run(
-    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder_process, "ATTACH_S", 0.0)
-    result = run_rack(realtime(config), 3.0, tmp_path / "run", Display())
-    assert (result.worked, result.recording) == (True, "complete")
-    assert notes_of(Recording(tmp_path / "run"))[:1] == [NO_RECORDER]
 
 
 @pytest.mark.slow
@@ -354,24 +255,3 @@ def test_a_gap_stays_where_it_was_after_the_recorder_is_gone(
     assert [str(gap) for gap in Recording(tmp_path).gaps()] == [
         "ticks 120 to 219 of lower are not recorded"
     ]
-
-
-@pytest.mark.slow
-def test_a_recorder_that_comes_after_the_start_says_of_how_many_cycles_its_figures_are(
-    config: RackConfig, tmp_path: Path
-) -> None:
-    (tmp_path / CONFIG).write_text(config.text())
-    with Rack(config) as rack:
-        # The rings hold two seconds.
-        rack.run(4.0)
-        with Recorder(rack.segment, tmp_path) as recorder:
-            recorder.drain()
-    recording = Recording(tmp_path)
-    taken = len(recording.cycles["lower"])
-    assert recording.untraced()["lower"] == (taken, 1600)
-    (gap,) = recording.gaps()
-    assert (gap.first, set(gap.rings)) == (
-        0,
-        {name for name, lost in recording.lost.items() if lost},
-    )
-    assert f"lower: judged by {taken:,} of 1,600 cycles" in analysis_text(Analysis.of(recording))

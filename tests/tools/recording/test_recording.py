@@ -86,23 +86,6 @@ def test_a_part_is_missing_where_its_number_is(damaged: Path) -> None:
     refused(damaged, "0001.parquet is missing")
 
 
-@pytest.mark.parametrize("name", PARQUET)
-def test_a_parquet_file_of_something_else_is_named(damaged: Path, name: str) -> None:
-    pq.write_table(pa.table({"a": [1, 2]}), damaged / name)
-    refused(damaged, name)
-
-
-def test_a_table_that_is_not_there_is_named(damaged: Path) -> None:
-    shutil.rmtree(damaged / TABLE)
-    refused(damaged, TABLE)
-
-
-def test_a_trace_without_its_layout_is_named(damaged: Path) -> None:
-    path = damaged / PARQUET[0]
-    pq.write_table(pq.read_table(path).replace_schema_metadata(None), path)
-    refused(damaged, path.name)
-
-
 def messages(recording: Recording) -> dict[str, list[bytes]]:
     return {box.name: recording.rows(box.name).tolist() for box in recording.layout.timed}
 
@@ -209,9 +192,3 @@ def test_a_reason_cannot_command_the_terminal_that_shows_a_report(damaged: Path)
     _, text = write_report(damaged)
     assert "\x1b" not in text
     assert r"\x1b[2J" in text
-
-
-def test_a_run_without_events_has_a_report_all_the_same(damaged: Path) -> None:
-    (damaged / "events.jsonl").unlink()
-    report, _ = write_report(damaged)
-    assert report["recording"] == "without the end of the run"

@@ -47,6 +47,14 @@ def test_a_sink_that_fails_is_reported_once_and_not_called_again() -> None:
     assert notes == ["run.rrd ends here: the disk is full"]
     assert sink.blocks == 2
 
+    def opened() -> Failing:
+        raise ImportError("no viewer here")
+
+    safe = SafeSink(opened, notes.append)
+    safe.add("servo", np.zeros(1))
+    safe.close(1, {})
+    assert notes[1:] == ["run.rrd ends here: no viewer here"]
+
 
 class Taking:
     """A sink that takes everything, and keeps the calls."""
@@ -67,104 +75,66 @@ class Taking:
         self.calls.append("end")
 
 
+class Opening:
+    """Opens a sink when it may."""
+
+    def __init__(self) -> None:
+        self.may, self.sink = threading.Event(), Taking()
+
+    def __call__(self) -> Taking:
+        assert self.may.wait(WATCHDOG_S)
+        return self.sink
+
+
 def test_rows_wait_for_a_sink_that_takes_long_to_open() -> None:
-    may_open, sink = threading.Event(), Taking()
-
-    def opened() -> Taking:
-        assert may_open.wait(WATCHDOG_S)
-        return sink
-
-    safe = SafeSink(opened, pytest.fail, in_background=True)
+    opening = Opening()
+    safe = SafeSink(opening, pytest.fail, in_background=True)
     for tick in range(3):
         safe.add("servo", np.array([tick]))
         safe.advance(tick, {})
-    assert sink.calls == []
-    may_open.set()
+    calls = opening.sink.calls
+    assert calls == []
+    opening.may.set()
     safe.close(3, {})
-    assert sink.calls == [("servo", [0]), 0, ("servo", [1]), 1, ("servo", [2]), 2, "end"]
+    assert calls == [("servo", [0]), 0, ("servo", [1]), 1, ("servo", [2]), 2, "end"]
 
 
-def test_a_recorder_in_a_hurry_does_without_a_sink_that_is_not_open(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("rack.tools.recording.recorder.recorder.HURRIED_S", 0.05)
-    may_open, sink, notes = threading.Event(), Taking(), list[str]()
-
-    def opened() -> Taking:
-        assert may_open.wait(WATCHDOG_S)
-        return sink
-
-    safe = SafeSink(opened, notes.append, in_background=True)
-    safe.add("servo", np.zeros(1))
-    safe.hurry()
-    safe.close(1, {})
-    may_open.set()
-    assert sink.calls == []
-    assert len(notes) == 1
-    assert notes[0].startswith("run.rrd is missing: ")
-
-
+@pytest.mark.parametrize(
+    ("bound", "bound_s", "hurries"),
+    [
+        ("HURRIED_S", 0.05, True),
+        ("OPENED_S", 0.05, False),
+        # One whose opening uses no processor time is not waited for.
+        pytest.param("LOOK_S", 0.02, False, marks=pytest.mark.slow),
+    ],
+)
 def test_a_recorder_does_not_wait_for_ever_for_a_sink_whose_opening_hangs(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, bound: str, bound_s: float, hurries: bool
 ) -> None:
-    monkeypatch.setattr("rack.tools.recording.recorder.recorder.OPENED_S", 0.05)
-    may_open, notes = threading.Event(), list[str]()
-
-    def opened() -> Taking:
-        assert may_open.wait(WATCHDOG_S)
-        return Taking()
-
-    safe = SafeSink(opened, notes.append, in_background=True)
+    monkeypatch.setattr(f"rack.tools.recording.recorder.recorder.{bound}", bound_s)
+    opening, notes = Opening(), list[str]()
+    safe = SafeSink(opening, notes.append, in_background=True)
+    safe.add("servo", np.zeros(1))
+    if hurries:
+        safe.hurry()
     safe.close(1, {})
     assert is_opening()
-    may_open.set()
-    why = "the viewer's library has not opened it; 'rack replay' makes it"
-    assert notes == [f"run.rrd is missing: {why}"]
-
-
-def test_a_sink_that_cannot_be_opened_is_reported_once() -> None:
-    notes: list[str] = []
-
-    def opened() -> Taking:
-        raise ImportError("no viewer here")
-
-    safe = SafeSink(opened, notes.append)
-    safe.add("servo", np.zeros(1))
-    safe.close(1, {})
-    assert notes == ["run.rrd ends here: no viewer here"]
-
-
-@pytest.mark.slow
-def test_a_sink_whose_opening_uses_no_processor_time_is_not_waited_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("rack.tools.recording.recorder.recorder.LOOK_S", 0.02)
-    may_open, notes = threading.Event(), list[str]()
-
-    def opened() -> Taking:
-        assert may_open.wait(WATCHDOG_S)
-        return Taking()
-
-    safe = SafeSink(opened, notes.append, in_background=True)
-    safe.close(1, {})
-    assert not may_open.is_set()
-    may_open.set()
-    assert len(notes) == 1
-    assert notes[0].startswith("run.rrd is missing: ")
+    opening.may.set()
+    assert opening.sink.calls == []
+    (note,) = notes
+    assert note.startswith("run.rrd is missing: ")
+    assert bound != "OPENED_S" or note.endswith(
+        "the viewer's library has not opened it; 'rack replay' makes it"
+    )
 
 
 def test_neither_mode_waits_for_the_library_of_the_viewer(
     small: Path, rack_name: str, tmp_path: Path
 ) -> None:
-    may_open = threading.Event()
-
-    def opened() -> Taking:
-        assert may_open.wait(WATCHDOG_S)
-        return Taking()
-
+    opening = Opening()
     for mode in ("lockstep", "realtime"):
         config = load(small, [f"name={rack_name}", f"clock.mode={mode}"])
         with Rack(config) as running:
-            assert SafeSink.of(running.segment, None, opened, pytest.fail) is not None
+            assert SafeSink.of(running.segment, None, opening, pytest.fail) is not None
             assert is_opening()
-    may_open.set()
+    opening.may.set()

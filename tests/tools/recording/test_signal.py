@@ -12,7 +12,7 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Field, MessageType
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
-from rack.tools.recording.signal import Signal, Trigger, signals_of
+from rack.tools.recording.signal import Signal, Trigger
 
 
 class Gait(IntEnum):
@@ -87,26 +87,18 @@ def test_a_text_is_shown_with_escapes_in_place_of_control_characters(messages: n
     assert signal.in_message(messages[0]) == shown
 
 
-def test_units_are_those_of_numbers() -> None:
-    units = {signal.path[0]: signal.unit for signal in signals_of(BOX)}
-    assert units == {"gait": "", "speed": "m/s", "name": "", "legs": "rad"}
-    heads = [Signal.of(f"walker.status.{name}", [BOX]).head for name in ("gait", "legs.angle[1]")]
-    assert heads == ["walker.status.gait", "walker.status.legs.angle[1], rad"]
+UNKNOWN = {
+    "walker.status.sped": "no such signal; nearest: walker.status.speed",
+    "xyz": "no such signal; mailboxes: walker.status",
+    "walker.status.speed]": "no such signal; nearest: walker.status.speed",
+    "walker.status.legs.angle[2]": (
+        "no such index; permitted: walker.status.legs.angle[0 to 1][0 to 1]"
+    ),
+    "walker.status.speed[0]": "no such index; permitted: walker.status.speed",
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [
-        ("walker.status.sped", "no such signal; nearest: walker.status.speed"),
-        ("xyz", "no such signal; mailboxes: walker.status"),
-        ("walker.status.speed]", "no such signal; nearest: walker.status.speed"),
-        (
-            "walker.status.legs.angle[2]",
-            "no such index; permitted: walker.status.legs.angle[0 to 1][0 to 1]",
-        ),
-        ("walker.status.speed[0]", "no such index; permitted: walker.status.speed"),
-    ],
-)
+@pytest.mark.parametrize(("name", "why"), UNKNOWN.items())
 def test_a_name_that_is_not_known_is_one_line(name: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
         Signal.of(name, [BOX])
@@ -130,27 +122,21 @@ def test_a_condition_compares_a_number(messages: np.ndarray, text: str, holds: l
     assert Trigger.of(text, [BOX]).holds(messages).tolist() == holds
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        (
-            "walker.status.speed",
-            '"walker.status.speed": not a condition; permitted: as in'
-            ' "servo.status.position[2] > 1.2"',
-        ),
-        (
-            "walker.status.legs.angle[0] > 1",
-            "walker.status.legs.angle[0]: numbers of shape [2]; a condition needs a single number",
-        ),
-        ("walker.status.name == 1", "walker.status.name: text; a condition needs a single number"),
-        ("walker.status.speed > x", '"walker.status.speed > x": x is not a number'),
-        (
-            "walker.status.gait == runs",
-            '"walker.status.gait == runs": runs is not a number or one of stands, walks',
-        ),
-    ],
-)
+UNFIT = {
+    "walker.status.speed": (
+        '"{}": not a condition; permitted: as in "servo.status.position[2] > 1.2"'
+    ),
+    "walker.status.legs.angle[0] > 1": (
+        "walker.status.legs.angle[0]: numbers of shape [2]; a condition needs a single number"
+    ),
+    "walker.status.name == 1": "walker.status.name: text; a condition needs a single number",
+    "walker.status.speed > x": '"{}": x is not a number',
+    "walker.status.gait == runs": '"{}": runs is not a number or one of stands, walks',
+}
+
+
+@pytest.mark.parametrize(("text", "why"), UNFIT.items())
 def test_a_condition_that_is_none_is_one_line(text: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
         Trigger.of(text, [BOX])
-    assert (str(failure.value), failure.value.status) == (why, 2)
+    assert (str(failure.value), failure.value.status) == (why.format(text), 2)

@@ -76,14 +76,6 @@ def test_one_rack_twice_and_two_modes_are_refused(tmp_path: Path) -> None:
         on_one_time_line([one, stepped])
 
 
-def test_in_lockstep_ticks_are_the_time_line(tmp_path: Path) -> None:
-    a, b = replace(A, mode="lockstep"), replace(B, mode="lockstep")
-    place = on_one_time_line([recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b")])[1]
-    assert (place.times_ns(np.arange(TICKS), 3) == np.arange(TICKS) * CLOCK_NS + 3).all()
-    assert place.uncertainty_ns == 0
-    assert "lockstep" in place.note
-
-
 def test_in_lockstep_what_one_took_must_be_what_the_other_wrote(tmp_path: Path) -> None:
     a, b = replace(A, mode="lockstep"), replace(B, mode="lockstep")
     one, other = recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b", counts_from=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ from rack.levels.errors import RobotError
 from rack.tools.robot.arm import ArmParts, find_arm
 from rack.tools.robot.draft import Wishes, draft
 from rack.tools.robot.source import read_source
-from tests.tools.command_line import ROOT, rack
+from tests.tools.command_line import ROOT
 from tests.tools.robot.models import joint, link, urdf, written
 
 DESK_ARM = (ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml").read_text()
@@ -127,26 +126,6 @@ def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) 
     assert model.joint("flex1").stiffness[0] == 20.0
     assert model.nu == len(JOINTS)
     assert any(note.startswith("passive, beyond the arm: flex1, loose;") for note in made.notes)
-
-
-@pytest.mark.slow
-def test_a_body_that_something_outside_moves_is_left_out_with_its_weld(tmp_path: Path) -> None:
-    hand = '<body name="drag" mocap="true"/></worldbody>'
-    weld = '<equality><weld body1="drag" body2="flange"/></equality></mujoco>'
-    text = DESK_ARM.replace("</worldbody>", hand).replace("</mujoco>", weld)
-    made = draft(read_source(written(tmp_path, text, "arm.xml")), Wishes(), tmp_path, "drafted")
-    assert "left out, as nothing holds it: drag" in made.notes
-    assert made.cell().model.neq == 0
-
-
-@pytest.mark.thorough
-def test_an_arm_with_springs_at_its_tip_does_its_task(tmp_path: Path) -> None:
-    done = rack("robot", "new", written(tmp_path, FLEXIBLE, "springy.xml"), folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    words = ("--lockstep", "--json", "--out", tmp_path / "run", "--set", "name=springy-of-test")
-    done = rack("run", "springy", *words, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["worked"]
 
 
 BASE = 'inertia ixx="{}" iyy="0.01" izz="0.01" ixy="{}"'

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.tools.command_line import ROOT, rack
-from tests.tools.robot.models import urdf, written
+from tests.tools.robot.models import written
 
 EXAMPLE = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.toml"
 pytestmark = pytest.mark.slow
@@ -47,21 +47,6 @@ def test_contacts_at_home_bodies_that_nothing_holds_and_endless_falls_fail(tmp_p
     assert "desk" in found["contacts at home"] or "world" in found["contacts at home"]
     assert found["bodies that nothing holds"] == "flap"
     assert found["objects"] == "'cup' falls without end"
-
-
-def test_of_a_model_file_the_arm_is_drafted_first(tmp_path: Path) -> None:
-    found = checked(tmp_path, written(tmp_path, urdf()), 0)
-    assert found["robot"] == "small"
-    texts = {one["about"]: one["text"] for one in found["findings"]}
-    assert texts["actuators"] == "1 motor"
-    assert texts["fingers"].startswith("fingers on both sides; 80 mm open")
-    assert "home" in texts["guessed"]
-
-
-def test_a_single_finger_and_its_jaw_are_named(tmp_path: Path) -> None:
-    found = checked(tmp_path, written(tmp_path, urdf(jaw=True)), 0)
-    texts = {one["about"]: one["text"] for one in found["findings"]}
-    assert texts["fingers"].startswith("one finger, which closes on a fixed jaw; ")
 
 
 @pytest.mark.parametrize("name", ["a.xml", "a.sdf"])

@@ -45,17 +45,6 @@ def test_dry_friction_of_light_links_is_what_the_equation_of_motion_says(tmp_pat
 
 
 @pytest.mark.slow
-def test_what_a_model_says_of_its_friction_stays(tmp_path: Path) -> None:
-    source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
-    for joint in source.spec.joints:
-        joint.solref_friction[:] = [0.005, 1.0]
-    said = written(tmp_path, source.spec.to_xml(), "said.xml")
-    made = draft(read_source(said), Wishes(), tmp_path, "drafted")
-    assert made.cell().model.dof_solref[:, 0].tolist() == [0.005] * 6
-    assert "dry friction acts within 1 ms" not in made.notes
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "bandwidth"), [(0.2, None), (1.0, STIFF), (30.0, 100.0)])
 def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
     friction: float, bandwidth: float | None, tmp_path: Path

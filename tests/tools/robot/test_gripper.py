@@ -32,12 +32,6 @@ def test_a_finger_that_nothing_couples_follows_and_that_is_a_guess(tmp_path: Pat
     assert "right_finger follow" in made.guessed["gripper"]
 
 
-def test_a_finger_that_mimics_needs_no_entry(tmp_path: Path) -> None:
-    made = drafted(tmp_path, written(tmp_path, urdf()))
-    assert gripper_of(made).follow == ()
-    assert "gripper" not in made.guessed
-
-
 def test_one_drive_closes_a_hand_of_two_with_the_force_of_both(tmp_path: Path) -> None:
     fingers = grippers.sides(grippers.SLIDE)
     robot, _ = grippers.hand(tmp_path, fingers, grippers.SLIDING, "", MOTOR)
@@ -45,25 +39,6 @@ def test_one_drive_closes_a_hand_of_two_with_the_force_of_both(tmp_path: Path) -
     assert gripper.follow == (FollowConfig(joint="finger_right", ratio=1.0),)
     assert (gripper.actuator, gripper.joint) == ("grip", "finger_left")
     assert gripper.force == 40.0 + 15.0
-
-
-def test_a_drive_of_unknown_force_gets_what_dry_friction_takes(tmp_path: Path) -> None:
-    fingers = grippers.sides(grippers.SLIDE).replace("damping", 'frictionloss="30" damping')
-    motor = MOTOR.replace('forcerange="-15 15"', "")
-    robot, _ = grippers.hand(tmp_path, fingers, grippers.SLIDING, "", motor)
-    made = drafted(tmp_path, robot.model)
-    # One states 60 N, the other nothing.
-    assert gripper_of(made).force == 60.0 + 20.0 + 30.0
-    assert made.guessed["gripper"].startswith("force")
-
-
-def test_soft_tendons_that_stay_within_the_residual_are_accepted(tmp_path: Path) -> None:
-    robot, _ = grippers.soft(tmp_path)
-    made = drafted(tmp_path, robot.model)
-    assert gripper_of(made).follow == ()
-    gripper = made.cell().gripper
-    assert gripper is not None
-    assert gripper.linkage.yields
 
 
 def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: Path) -> None:

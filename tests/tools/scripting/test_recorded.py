@@ -75,18 +75,6 @@ def test_a_run_is_resumed_from_a_time_in_the_background(tmp_path: Path, rack_nam
         rack.open_run(run).at(1.2025).resume("board.upper.more=1")
 
 
-def test_a_name_with_a_typo_gets_the_nearest(small: Path) -> None:
-    run = rack.open_run(small)
-    with pytest.raises(rack.Failure, match=r"no such signal; nearest: lower\.status\.count"):
-        run.signals["lower.status.cuont"]
-    with pytest.raises(rack.Failure, match=r"lower\.statsu: no such mailbox; nearest: low"):
-        run.to_pandas("lower.statsu")
-    with pytest.raises(rack.Failure, match="no such index"):
-        run.signals["lower.status.count[0]"]
-    with pytest.raises(rack.Failure, match=r"not a run: it has no config\.toml"):
-        rack.open_run(small.parent)
-
-
 def test_events_and_report_are_those_of_the_run(small: Path) -> None:
     run = rack.open_run(small)
     assert [event.kind for event in run.events if event.kind in ("start", "end")] == [

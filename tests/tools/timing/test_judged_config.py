@@ -8,7 +8,6 @@ from math import inf
 import pytest
 
 from rack.boards.config import load
-from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.timing.judged_config import JudgedConfig
 from tests.tools.timing.conftest import Judge
 
@@ -40,6 +39,7 @@ UNEVEN = "board.lower={ rate_hz = 57.142857142857146 }"
 """8 and 7 ticks: 15, and 6 of waiting going down, 7 going up; twice the longest is 16."""
 GOAL = "timing.response_ms=35"
 """10 and 20 ms are 30, upwards 40 with the wait for the grid; R_max is half of the goal."""
+LOCKED = "protocol.mailbox={ 'lower.plan' = 'lock' }"
 SHARED = ("board.lower.core=0", "board.lower.within_cycles=2")
 
 
@@ -59,10 +59,8 @@ SHARED = ("board.lower.core=0", "board.lower.within_cycles=2")
         # Up, a status waits for the release of a level half as fast.
         ((), "3.2", "system", [(30, "<=", 40, True), (40, "<=", 40, True)]),
         ((UNEVEN,), "3.3", "system", [(37.5, "<=", 40, True)]),
-        ((GOAL,), "3.3", "system", [(30, "<=", 35, True)]),
         ((GOAL,), "3.2", "system", [(30, "<=", 35, True), (40, "<=", 35, False)]),
         ((GOAL,), "3.1", "upper", [(20, "<=", 17.5, False), (4, "<=", 20, True)]),
-        ((GOAL,), "3.1", "lower", [(10, "<=", 17.5, True), (4.25, "<=", 10, True)]),
         ((GOAL,), "3.4", "lower", [(3, "<", 17.5, True)]),
         # A goal is simulated time, budgets are of the wall clock.
         (("timing.response_ms=40", "clock.speed=2"), "3.3", "system", [(15, "<=", 20, True)]),
@@ -70,8 +68,6 @@ SHARED = ("board.lower.core=0", "board.lower.within_cycles=2")
         # Every chain of levels is judged, and has one longest cycle.
         ((JOINT,), "3.3", "system, upper > lower", [(30, "<=", 40, True)]),
         ((JOINT,), "3.3", "system, upper > joint", [(60, "<=", 80, True)]),
-        ((JOINT,), "3.4", "upper", [(2, "<", 40, True)]),
-        ((JOINT,), "3.4", "lower", [(3, "<", 40, True)]),
         ((JOINT,), "3.4", "joint", [(1, "<", 40, True)]),
         # A loose planner has its slice.
         (LOOSE, "fig. 4", "lower", [(8.5, "<=", 40, True)]),
@@ -85,12 +81,7 @@ SHARED = ("board.lower.core=0", "board.lower.within_cycles=2")
         (("timing.clock_ms=0.4",), "load", "core 0", [(0.6 / 2.5 + 4.2 / 20, "<=", 1, True)]),
         # A critical update blocks the executor.
         ((), "response time", "lower", [(4.45, "<=", 10, True)]),
-        (
-            ("protocol.mailbox={ 'lower.plan' = 'lock' }",),
-            "response time",
-            "lower",
-            [(4.95, "<=", 10, True)],
-        ),
+        ((LOCKED,), "response time", "lower", [(4.95, "<=", 10, True)]),
     ],
 )
 def test_each_equation_shows_both_sides(
@@ -115,13 +106,11 @@ LATE_PLANS = {("response time", "lower.planner"), ("load", "core 1")}
         ((), set()),
         ((UNEVEN,), {("3.2", "system")}),
         (("timing.response_ms=29",), {("3.1", "upper"), ("3.2", "system"), ("3.3", "system")}),
-        (("timing.response_ms=40",), set()),
         # 8.5 / 1 < 5.55; its response 8.7 + 1 * 4.45 > 10.
         (("board.lower.within_cycles=1",), {("3.8", "lower"), *LATE_PLANS}),
         # C + U = 1.25 of 10.
         (("board.lower.budget.update_ms=1.0",), {("3.10", "lower")}),
         (("board.lower.budget.plan_within_ms=39",), {("plan within", "lower")}),
-        (("board.lower.budget.plan_within_ms=40",), set()),
         # 9 + 1.25 is more than the cycle, and leaves nothing to plan in.
         (
             ("board.lower.budget.process_ms=9",),
@@ -141,20 +130,6 @@ def test_what_does_not_fit_fails_by_its_equations_and_no_others(
     judge: Judge, settings: tuple[str, ...], expected: set[tuple[str, str]]
 ) -> None:
     assert failing(judge(*settings)) == expected
-
-
-@pytest.mark.parametrize(
-    ("settings", "expected"),
-    [
-        (("board.lower.budget.process_ms=20",), ("3.4", "lower")),
-        ((*LOOSE, "board.lower.budget.plan_ms=40"), ("fig. 4", "lower")),
-        (("clock.speed=4",), ("3.1", "lower")),
-    ],
-)
-def test_among_what_fails_is_an_equation(
-    judge: Judge, settings: tuple[str, ...], expected: tuple[str, str]
-) -> None:
-    assert expected in failing(judge(*settings))
 
 
 @pytest.mark.parametrize(
@@ -178,28 +153,6 @@ def test_a_response_without_bound_is_none_as_plain_data(judge: Judge) -> None:
     assert (verdict.document()["left"], verdict.document()["margin"]) == (None, None)
 
 
-def test_a_board_without_a_budget_is_not_judged(budgeted: object) -> None:
-    judged = JudgedConfig.of(load(str(budgeted)), {})
-    assert {verdict.subject for verdict in judged.verdicts} == {"system"}
-
-
-def test_verdicts_stand_in_the_order_of_the_equations(judge: Judge) -> None:
-    order = [verdict.equation for verdict in judge(*LOOSE).verdicts]
-    found = list(dict.fromkeys(order))
-    assert found == [
-        "3.1",
-        "3.2",
-        "3.3",
-        "3.4",
-        "3.5",
-        "3.6",
-        "3.7",
-        "fig. 4",
-        "response time",
-        "load",
-    ]
-
-
 @pytest.mark.parametrize(
     ("rack", "expected"),
     [
@@ -213,7 +166,3 @@ def test_the_papers_figures_are_predicted_as_the_paper_has_them(
     rack: str, expected: set[str]
 ) -> None:
     assert {v.equation for v in JudgedConfig.of(load(rack)).failing} == expected
-
-
-def test_a_margin_is_what_the_right_side_has_left() -> None:
-    assert EquationVerdict("3.1", "servo", 3.0, "<=", 2.5, "t_proc + t_c <= R_i").margin == -0.5

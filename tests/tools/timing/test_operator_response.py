@@ -11,10 +11,9 @@ import pytest
 
 from rack.boards.config import load
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.tools.console.answer import Failure
 from rack.tools.console.tables import render_text
 from rack.tools.lab.benches.observed import record, with_commands
-from rack.tools.timing.operator_response import OperatorResponse, plot, response_of, show
+from rack.tools.timing.operator_response import OperatorResponse, plot, response_of
 from tests.boards.commanded_racks import COMMANDED
 
 MakeConfig = Callable[..., RackConfig]
@@ -92,23 +91,3 @@ def test_a_response_off_its_tick_or_beyond_a_bound_is_seen(response: OperatorRes
     assert replace(response, commands=(late,)).beyond == []
     lost = replace(response.commands[0], acts=101 + 40)
     assert replace(response, commands=(lost,), lockstep=False).beyond == [lost]
-
-
-@pytest.mark.slow
-def test_a_run_without_commands_has_no_response(config: MakeConfig, tmp_path: Path) -> None:
-    recording = record(config(), 0.5, tmp_path / "run").recording
-    assert response_of(recording) is None
-    with pytest.raises(Failure, match="no operator commanded a level"):
-        show(recording, tmp_path, as_json=False)
-
-
-@pytest.mark.slow
-def test_a_run_in_real_time_has_responses_by_the_wall_clock(
-    config: MakeConfig, tmp_path: Path
-) -> None:
-    given = [CommandConfig(level="upper", what="hold", tick=101)]
-    response = measured(config("clock.mode=realtime"), tmp_path / "run", *given)
-    (command,) = response.commands
-    assert command.wall_ms is not None
-    # Given at tick 101, its cycle begins at 112 or later.
-    assert command.wall_ms > 10 * 2.5

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rack.boards.config import budgets, load, loads
+from rack.boards.config import load, loads
 from rack.tools.timing.judged_config import Change, JudgedConfig
 from rack.tools.timing.repair import changes_for, first_that, repair
 from tests.tools.timing.conftest import Judge
@@ -30,20 +30,10 @@ def test_the_first_that_works_is_found_in_few_attempts() -> None:
 
     assert first_that(range(10_000), attempt) == 700
     assert len(attempts) < 25
-    assert [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 7, 100)] == [
-        None,
-        None,
-        5,
-        5,
-        5,
-    ]
-    assert [
-        first_that(range(30), lambda k, least=least: k if k >= least else None)
-        for least in range(30)
-    ] == [*range(30)]
+    found = [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 100)]
+    assert found == [None, None, 5, 5]
 
 
-LOOSE = ("coupling=loose", "planner_slot=4")
 ELSEWHERE = {"coupling": "loose", "planner_slot": 4, "planner_core": 2}
 LATE = "within_cycles=1"
 """8.5 of planning, 5.55 left in a cycle."""
@@ -73,29 +63,6 @@ LATE = "within_cycles=1"
         ),
         pytest.param(
             ("budget.process_ms=9",), (), 2, [{"every": 8, "rate_hz": None}], id="too long a cycle"
-        ),
-        pytest.param(
-            # 24.7 of planning need 5 cycles on the core of its executor or of the upper level, 3
-            # alone.
-            (*LOOSE, "planner_core=1", "within_cycles=2", "budget.plan_ms=24"),
-            ("board.upper.budget.process_ms=6",),
-            3,
-            [{"within_cycles": 3, "planner_core": 2}, {"within_cycles": 5}],
-            id="a core of its own with older plans ranks by their age",
-        ),
-        pytest.param(
-            # 29.5 of planning into the 20 ms that a cycle of 30 leaves: too much. In two cycles of
-            # 15 on another core: just.
-            (
-                "budget.process_ms=9",
-                "budget.plan_ms=29",
-                "budget.plan_within_ms=30",
-                "budget.exchange_ms=0",
-            ),
-            ("timing.context_switch_ms=0", "board.upper.rate_hz=16.666666666666668"),
-            2,
-            [{**ELSEWHERE, "within_cycles": 2, "every": 6, "rate_hz": None}],
-            id="a planner elsewhere and a longer cycle together are a last resort",
         ),
         pytest.param(
             (LATE,),
@@ -139,27 +106,6 @@ def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
     assert first.after.failing == ()
 
 
-def test_a_longer_cycle_of_a_board_on_the_same_core_is_a_change_too(judge: Judge) -> None:
-    # Every 40 ms 4 cycles of each level, 4.45 and 3.2, and 11.7 of planning: 42.3; with half of the
-    # upper level's 35.9.
-    settings = ("core=1", "priority=85", "rate_hz=100", "budget.process_ms=1")
-    full = ("timing.clock_ms=2.2", "board.lower.budget.plan_ms=11")
-    judged = judge(*(f"board.upper.{setting}" for setting in settings), *full)
-    change = next(change for change in changes_for(judged, "lower") if change.board == "upper")
-    assert change.settings == {"every": 8, "rate_hz": None}
-    assert change.after.failing == ()
-
-
-def test_a_plan_many_times_as_old_is_no_change(judge: Judge) -> None:
-    # 16 cycles leave 88.8 for a plan.
-    late = [
-        settings_for(judge("board.lower.within_cycles=1", f"board.lower.budget.plan_ms={ms}"))
-        for ms in (88, 89)
-    ]
-    assert [{"within_cycles": 16} in found for found in late] == [True, False]
-    assert all(change.get("within_cycles", 0) <= 16 for found in late for change in found)
-
-
 def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1")
     for change in changes_for(judged, "lower"):
@@ -173,40 +119,12 @@ def test_the_next_smaller_change_would_not_do(judge: Judge) -> None:
     assert not judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=11").failing
 
 
-def test_a_new_core_is_asked_for_where_no_used_one_has_room(judge: Judge) -> None:
-    judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=14")
-    change = change_of(judged, "planner_core")
-    assert change.settings["planner_core"] == 2
-    assert "planner_core 2 (not shared" in change.text
-    assert "this machine has no core 2, uses core 0" in change.text
-
-
-def test_a_core_of_unknown_load_is_left_alone(judge: Judge, budgeted: object) -> None:
-    config = load(str(budgeted), ["board.lower.within_cycles=1"])
-    known = {name: budget for name, budget in budgets(config).items() if name == "lower"}
-    assert change_of(JudgedConfig.of(config, known), "planner_core").settings["planner_core"] == 2
-
-
 def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
     loosened = change_of(judged, "coupling")
     assert loosened.after.layout.mailbox("lower.plan").protocol == "time-slice"
     assert loosened.document()["protocols"] == {"lower.plan": "time-slice"}
     assert "lower.plan by time-slice" in loosened.text
-
-
-def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
-    loose = ["coupling=loose", "planner_slot=4", "planner_core=0", "budget.plan_ms=31"]
-    # 8.4 of every 40 are the upper level's.
-    judged = judge(*(f"board.lower.{setting}" for setting in loose))
-    assert {"planner_core": 2} in settings_for(judged)
-    # The upper level could go instead, at no cost.
-    assert changes_for(judged, "lower")[0].board == "upper"
-
-
-def test_a_longer_cycle_is_told_with_the_response_of_the_system(judge: Judge) -> None:
-    (change,) = changes_for(judge("board.lower.budget.process_ms=9"), "lower")
-    assert "every 4 -> 8 (cycle 10 -> 20 ms; R_s 30 -> 40 ms)" in change.text
 
 
 def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() -> None:
@@ -217,19 +135,6 @@ def test_a_longer_cycle_gives_a_plan_fewer_of_them_where_its_age_is_bounded() ->
         {"coupling": "loose", "planner_slot": 3, "planner_core": 0},
         {"within_cycles": 2, "every": 4},
     ]
-
-
-def test_more_cycles_would_do_for_figure_3_if_plans_could_be_old() -> None:
-    config = load("fig3", ["board.level.budget.plan_within_ms=24"])
-    assert {"within_cycles": 4} in settings_for(JudgedConfig.of(config), "level")
-
-
-def test_a_board_that_waits_for_others_gets_a_core_of_its_own(judge: Judge) -> None:
-    judged = judge(
-        "board.upper.core=1", "board.upper.budget.process_ms=13", "board.lower.budget.plan_ms=1"
-    )
-    assert {verdict.subject for verdict in judged.failing} >= {"upper"}
-    assert {"core": 0} in settings_for(judged, "upper")
 
 
 def test_boards_are_mended_one_after_another(judge: Judge) -> None:
@@ -264,3 +169,12 @@ def test_a_rack_that_fits_is_left_alone(judge: Judge) -> None:
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts tell what this machine lacks: let every machine have two cores."""
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1})
+
+
+def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
+    loose = ["coupling=loose", "planner_slot=4", "planner_core=0", "budget.plan_ms=31"]
+    # 8.4 of every 40 are the upper level's.
+    judged = judge(*(f"board.lower.{setting}" for setting in loose))
+    assert {"planner_core": 2} in settings_for(judged)
+    # The upper level could go instead, at no cost.
+    assert changes_for(judged, "lower")[0].board == "upper"

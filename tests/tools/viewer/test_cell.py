@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rack.tools.viewer.cell import STEP_RAD, in_pieces, moving_bodies
-from rack.tools.viewer.shapes import colour, placed, shape_of
+from rack.tools.viewer.shapes import placed, shape_of
 
 MODEL = """
 <mujoco>
@@ -79,32 +79,6 @@ def test_a_mesh_lies_where_its_file_says_though_mujoco_recentres_it(model: mujoc
     mujoco.mju_quat2Mat(rotation, quaternion)
     given = np.vstack((np.zeros(3), np.eye(3))) @ rotation.reshape(3, 3).T + [0.1, 0.2, 0.3]
     assert corners == pytest.approx(np.unique(np.round(given, 5), axis=0), abs=2e-5)
-
-
-def test_faces_look_outwards(model: mujoco.MjModel) -> None:
-    corners = column(model, "mesh", "vertex_positions").reshape(-1, 3, 3)
-    outwards = corners.mean(axis=1) - corners.reshape(-1, 3).mean(axis=0)
-    normals = column(model, "mesh", "vertex_normals").reshape(-1, 3, 3)[:, 0]
-    assert (np.sum(outwards * normals, axis=1) > 0).all()
-
-
-def test_a_height_field_stands_as_high_as_its_data(model: mujoco.MjModel) -> None:
-    corners = column(model, "hfield", "vertex_positions")
-    assert np.unique(np.round(corners[:, 2], 5)) == pytest.approx(
-        np.arange(12) / 11 * 0.5 - 1.0, abs=1e-5
-    )
-    assert corners[:, :2].max(axis=0) == pytest.approx([2.0, 1.0])
-    assert len(corners) == 3 * 2 * 2 * 3
-
-
-def test_an_endless_plane_has_an_end_to_look_at(model: mujoco.MjModel) -> None:
-    corners = column(model, "plane", "vertex_positions")
-    assert np.abs(corners).max(axis=0) == pytest.approx([2 * model.stat.extent, 3.0, 0.0])
-
-
-def test_a_material_goes_before_a_geoms_own_colour(model: mujoco.MjModel) -> None:
-    assert colour(model, model.geom("capsule").id).tolist() == [255, 0, 0, 255]
-    assert colour(model, model.geom("cylinder").id).tolist() == [0, 255, 0, 128]
 
 
 def test_points_of_a_geom_are_placed_as_mujoco_places_them(model: mujoco.MjModel) -> None:

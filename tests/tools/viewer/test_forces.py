@@ -10,11 +10,8 @@ import rerun.blueprint as rrb
 
 from rack.backplane.message import MessageType
 from rack.backplane.segment import Launch
-from rack.levels.arm.simulation import save_state
-from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
-from rack.tools.viewer.cell import Poses
 from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
@@ -59,30 +56,6 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     assert arrows.values[:, 0] == pytest.approx(
         np.array([[0.0, 0.0, tick / 60.0] for tick in (0, 20, 40)])
     )
-
-
-def test_the_arrows_frame_is_at_the_tool_and_turns_with_the_world(
-    tmp_path: Path, cell: Cell
-) -> None:
-    data, state = cell.start(), np.zeros(sizes(cell)["state"])
-    save_state(cell.model, data, state)
-    written = Written(tmp_path)
-    written.write(
-        ARM_STATE,
-        cell,
-        Poses(written.stream, cell).write,
-        state=np.tile(state, (ROWS, 1)),
-    )
-    frames = read(written.file, "/frames", "Transform3D:child_frame").values.ravel()
-    row = frames.tolist().index(contacts_of(cell)[0].frame)
-    place = read(written.file, "/frames", "Transform3D:translation").values[row, 0]
-    assert place == pytest.approx(data.site_xpos[cell.tool], abs=1e-6)
-    assert read(written.file, "/frames", "Transform3D:quaternion").values[row, 0].tolist() == [
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    ]
 
 
 def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(

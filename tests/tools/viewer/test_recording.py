@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-
 import mujoco
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from rack.levels.robot.state import view_state
 from rack.tools.recording.recording import Recording
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
-from rack.tools.viewer.window import executable
 from tests.shared_runs import NASREM_S, nasrem_run
 
 
@@ -32,14 +29,6 @@ def cell(run: Recording) -> Cell:
 
 
 @pytest.mark.slow
-def test_the_file_is_whole(run: Recording) -> None:
-    verified = subprocess.run(
-        [executable(), "rrd", "verify", run.folder / "run.rrd"], capture_output=True, text=True
-    )
-    assert verified.returncode == 0, verified.stderr
-
-
-@pytest.mark.slow
 def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
     ticks = run.signal("servo.status", "tick")
     for at, joint in enumerate(load("nasrem").robot.joints):
@@ -50,14 +39,6 @@ def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
                 [run.signal("servo.status", field)[:, at] for field in fields]
             )
             assert np.array_equal(rows.values, expected)
-
-
-@pytest.mark.slow
-def test_limits_are_the_arms(run: Recording, cell: Cell) -> None:
-    rows = read(run.folder / "run.rrd", "/joints/j2/position/limits")
-    assert np.array_equal(rows.values, np.tile(cell.bounds.position[1], (len(rows.values), 1)))
-    assert rows.ticks[0] == 0
-    assert rows.ticks[-1] == run.signal("servo.status", "tick")[-1]
 
 
 @pytest.mark.slow
@@ -84,16 +65,6 @@ def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
 
 
 @pytest.mark.slow
-def test_the_planned_path_begins_where_the_tool_is(run: Recording) -> None:
-    file = run.folder / "run.rrd"
-    line = read(file, "/cell/planned_path", "LineStrips3D:strips").values[0][0]
-    points = read(file, "/cell/way_points", "Points3D:positions")
-    tool = run.signal("servo.scene", "tool_position")[0]
-    assert line[0] == pytest.approx(tool, abs=2e-3)
-    assert line[-1] == pytest.approx(points.values[0][-1], abs=1e-6)
-
-
-@pytest.mark.slow
 def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
     for task in run.layout.tasks:
         rows = read(
@@ -105,17 +76,6 @@ def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
         work = "process" if task.role == "executor" else "plan"
         assert np.array_equal(rows.ticks, np.repeat(cycles["tick"], 4))
         assert rows.values.ravel().tolist() == ["read", work, "write", "wait"] * len(cycles)
-
-
-@pytest.mark.slow
-def test_spans_of_a_lane_follow_one_another_and_stay_in_their_slices(run: Recording) -> None:
-    for task in run.layout.tasks:
-        times = sim_times(run, f"/boards/{task.slot}-{task.board}/{task.role}")
-        slice_ns = task.every * task.within_cycles * run.layout.clock_ns
-        assert (np.diff(times) >= 0).all()
-        assert (
-            times < np.repeat(run.cycles[task.name]["tick"], 4) * run.layout.clock_ns + slice_ns
-        ).all()
 
 
 @pytest.mark.slow
@@ -132,21 +92,6 @@ def test_an_age_is_that_of_the_newest_visible_message(run: Recording) -> None:
     # Read at once by a board of its own rate or by a slower one: the age is the sampling delay of
     # the paper.
     assert rows.values.min() == pytest.approx(250.0)
-
-
-@pytest.mark.slow
-def test_everything_has_all_three_timelines_within_the_run(run: Recording) -> None:
-    end_ns = round(NASREM_S * 1e9)
-    for chunk in (
-        RrdReader(str(run.folder / "run.rrd")).stream().filter(is_static=False).to_chunks()
-    ):
-        if chunk.entity_path.startswith("/__"):
-            continue
-        assert {"sim_time", "tick", "wall"} <= set(chunk.timeline_names), chunk.entity_path
-        times = chunk.to_record_batch().column("sim_time").to_numpy().astype(np.int64)
-        assert times.min() >= 0, chunk.entity_path
-        # A plan shows from the tick at which it can be used, which may be after the end.
-        assert times.max() <= end_ns + 2 * 10**9, chunk.entity_path
 
 
 @pytest.mark.slow
@@ -194,24 +139,3 @@ def test_no_view_of_it_fails_in_the_viewer(run: Recording) -> None:
         pytest.skip(str(error))
     assert look.complaints == ()
     assert look.picture.startswith(b"\x89PNG")
-
-
-def sim_times(run: Recording, entity: str) -> np.ndarray:
-    chunks = (
-        RrdReader(str(run.folder / "run.rrd"))
-        .stream()
-        .filter(content=entity, has_timeline="tick")
-        .to_chunks()
-    )
-    return np.concatenate(
-        [c.to_record_batch().column("sim_time").to_numpy().astype(np.int64) for c in chunks]
-    )
-
-
-@pytest.mark.slow
-def test_lockstep_shows_no_time_that_is_held_against_the_clock(run: Recording) -> None:
-    lateness, execution, deadline = read(run.folder / "run.rrd", "/times/servo").values.T
-    assert np.isnan([lateness, deadline]).all()
-    assert (execution > 0.0).all()
-    with pytest.raises(KeyError):
-        read(run.folder / "run.rrd", "/load/servo")

@@ -13,7 +13,6 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.recording.spool import rings
 from rack.tools.viewer import sink
-from rack.tools.viewer.parts import next_file, parts_of
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import executable
@@ -52,11 +51,3 @@ def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
     assert [len(ticks) for ticks in later] == [PART] * 2
     # The first one's reader goes on in the others.
     assert np.array_equal(whole, np.arange(TICKS))
-
-
-def test_parts_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
-    for _ in range(11):
-        next_file(tmp_path).touch()
-    numbers = ["", *(f"-{number}" for number in range(2, 12))]
-    assert parts_of(tmp_path / "run.rrd") == [tmp_path / f"run{number}.rrd" for number in numbers]
-    assert parts_of(tmp_path / "other.rrd") == []

@@ -13,8 +13,8 @@ import pytest
 from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.faults.campaigns import campaign as module
-from rack.tools.faults.campaigns.campaign import Campaign, Order, _text
-from rack.tools.faults.campaigns.plan import Kill, Plan
+from rack.tools.faults.campaigns.campaign import Campaign, Order
+from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.results import TrialResult
 from rack.tools.faults.campaigns.workers import TrialJob
 from tests.tools.faults.campaigns.test_report import RUN
@@ -141,22 +141,6 @@ def test_what_did_not_strike_is_drawn_again_and_in_the_end_said(make: MakeCampai
     assert results.lacking == [f"mute: struck 0 of 3 times, in {module.ROUNDS} rounds"]
 
 
-def test_trials_of_one_fault_come_after_those_of_many(make: MakeCampaign) -> None:
-    def not_at_first(plan: Plan) -> TrialResult:
-        found = struck(plan)
-        unseen = [replace(one, seen="not struck") for one in found.faults]
-        return replace(found, faults=tuple(unseen)) if plan.number == 1 else found
-
-    campaign, trials = make(not_at_first, kinds="mute,self-test")
-    campaign.run()
-    first, *later = [[table["kind"] for table in plan.faults] for plan in trials.made[1:]]
-    alone = [kinds for kinds in later if kinds == ["self-test"]]
-    assert (set(first), alone) == ({"mute"}, [["self-test"]] * 3)
-    drawn_again = later[: -len(alone)]
-    assert later[-len(alone) :] == alone
-    assert sum(map(len, drawn_again)) == 3 - len(first) + 2 * len(first)
-
-
 def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
     first, trials = make()
     before = first.run()
@@ -222,36 +206,6 @@ def test_a_trial_that_falls_short_leaves_a_plan_that_repeats_it(make: MakeCampai
     (path,) = campaign.folder.glob("trial-*.toml")
     assert path.name == "trial-0001.toml"
     assert path.read_text() == trials.made[1].toml("small")
-
-
-def test_a_plan_is_said_in_a_few_words() -> None:
-    hang, mute = {"kind": "hang"}, {"kind": "mute"}
-    kills = (Kill("upper", 3, 0.0), Kill("lower", 4, 0.0))
-    assert _text(Plan(7, "faults", True, (hang, mute, hang))) == "trial 7, 2 hang, mute"
-    assert _text(Plan(8, "kills", False, (), kills)) == "trial 8, 2 external kill"
-    assert _text(Plan(0, "nominal", True)) == "nominal"
-
-
-def test_an_order_is_for_faults_of_all_kinds_and_nothing_else_unless_it_says_so() -> None:
-    order = Order(name="nasrem", config=load("nasrem"), injections=3, seed=0, modes=(True,))
-    assert (order.kinds, order.kills, order.sizes, order.faultless_s) == (None, 0, 0, 0.0)
-    assert (order.loads, order.seconds) == ((False, True), None)
-
-
-def test_after_a_signal_nothing_is_drawn_again(
-    make: MakeCampaign, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(plan: Plan) -> TrialResult:
-        if plan.faults:
-            monkeypatch.setattr(module.INTERRUPT, "number", 2)
-        found = struck(plan)
-        return replace(found, faults=tuple(replace(f, seen="not struck") for f in found.faults))
-
-    campaign, trials = make(interrupted)
-    results = campaign.run()
-    kinds = [table["kind"] for plan in trials.made for table in plan.faults]
-    assert (kinds.count("mute"), kinds.count("drop")) == (3, 3)
-    assert results.is_interrupted
 
 
 def test_a_rack_that_is_done_in_time_is_run_as_often_as_fills_the_faultless_time(

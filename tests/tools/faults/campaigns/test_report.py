@@ -128,28 +128,6 @@ def test_the_figures_are_of_the_runs_that_they_are_about(report: dict[str, Any])
     assert report["shortfalls"] == ["trial 2: late", "overrun: did not strike"]
 
 
-def test_a_kind_counts_the_trials_in_which_it_struck(report: dict[str, Any]) -> None:
-    kinds = report["by_kind"]
-    assert {kind: (f["trials"], f["tasks_done"]) for kind, f in kinds.items()} == {
-        # One of them at tick 0.
-        "mute": (2, 1),
-        "sensor-bias": (1, 0),
-    }
-    points = report["sizes"]["sensor-bias"]["curve"]
-    assert [(point["size"], point["delay"]) for point in points] == [(0.01, None), (0.02, 5)]
-    assert [(fault["trial"], fault["kind"]) for fault in report["faults"]] == [
-        (1, "mute"),
-        (1, "mute"),
-        (2, "mute"),
-        (2, "sensor-bias"),
-    ]
-    assert [(trial["number"], trial["faults"]) for trial in report["trials"]] == [
-        (1, 2),
-        (2, 2),
-        (3, 0),
-    ]
-
-
 def test_the_text_says_what_the_document_holds(made: CampaignReport) -> None:
     lines = made.markdown().splitlines()
     assert lines[0] == "# Campaign on small, seed 9: fell short"
@@ -182,12 +160,6 @@ def test_a_campaign_without_shortfalls_has_passed() -> None:
     assert not any(
         word in text for word in ("Shortfalls", "Faults by kind", "Faultless", "of these without")
     )
-
-
-def test_faults_that_ended_their_task_as_permitted_are_recovered_from() -> None:
-    faults = (judgement(is_latched=True), judgement(is_latched=True), judgement())
-    text = report_of(Results(RUN, [run(1, faults=faults)])).markdown()
-    assert "3, of which 2 ended the task, as permitted" in text
 
 
 def test_the_text_shows_the_first_of_many_shortfalls() -> None:

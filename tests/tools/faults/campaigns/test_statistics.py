@@ -11,7 +11,6 @@ from rack.tools.faults.campaigns.statistics import (
     by_kind,
     curve,
     rate,
-    spread,
     totals,
     wilson,
 )
@@ -59,12 +58,6 @@ def test_what_did_not_strike_is_drawn_and_neither_injected_nor_detected() -> Non
     )
 
 
-def test_a_size_that_need_not_be_found_counts_nowhere() -> None:
-    small = judgement("sensor-bias", delay=None, is_judged=False, size=1e-4)
-    assert totals([small]).injected == 0
-    assert by_kind([small], TICK_NS) == {}
-
-
 def test_cycles_are_of_the_task_concerned_and_parts_of_each_bound() -> None:
     faults = [judgement(delay=2), judgement(delay=4), judgement(delay=12, cycle=12, bound=12)]
     figures = by_kind(faults, TICK_NS)["mute"]
@@ -79,35 +72,11 @@ def test_kinds_stand_in_the_order_of_the_table_of_kinds_and_kills_from_outside_l
     assert list(by_kind(faults, TICK_NS)) == ["kill", "mute", "command-nan", EXTERNAL]
 
 
-def test_recovery_is_in_ms_of_simulated_time() -> None:
-    faults = [judgement(recovery=100, reactions=("restart",)), judgement(recovery=200), judgement()]
-    figures = by_kind(faults, TICK_NS)["mute"]
-    assert figures.recovery_ms == Spread(375.0, 500.0)
-    assert figures.reactions == ["restart"]
-
-
 def test_a_death_is_measured_in_time_where_time_is_its_bound() -> None:
     assert judgement(delay=1, bound=2, delay_ms=4.0, bound_ms=5.0).part_of_bound == 0.8
     assert judgement(delay=1, bound=2, delay_ms=4.0).part_of_bound == 0.5
     assert judgement(delay=0, bound=0, delay_ms=0.0).part_of_bound is None
     assert judgement(delay=None, bound=2).part_of_bound is None
-
-
-def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
-    faults = [
-        judgement("sensor-bias", size=0.1),
-        judgement("sensor-bias", size=0.001, delay=None),
-        judgement(),
-    ]
-    assert [(point.size, point.delay_ms) for point in curve(faults, "sensor-bias", TICK_NS)] == [
-        (0.001, None),
-        (0.1, 12.5),
-    ]
-
-
-def test_nothing_has_no_median() -> None:
-    assert spread([]) is None
-    assert by_kind([judgement(delay=None)], TICK_NS)["mute"].ticks is None
 
 
 def test_bounds_of_a_share_are_wilsons() -> None:
@@ -125,10 +94,13 @@ def test_a_rate_stays_below_what_so_few_events_leave_possible() -> None:
     assert rate(0, 0.0) is None
 
 
-def test_every_share_of_a_kind_has_its_bounds() -> None:
-    faults = [judgement(), judgement(delay=12), judgement(is_recovered=False)]
-    assert by_kind(faults, TICK_NS)["mute"].wilson == {
-        "detected": wilson(3, 3),
-        "within_bound": wilson(2, 3),
-        "recovered": wilson(2, 3),
-    }
+def test_a_curve_goes_from_small_to_large_and_keeps_what_was_not_seen() -> None:
+    faults = [
+        judgement("sensor-bias", size=0.1),
+        judgement("sensor-bias", size=0.001, delay=None),
+        judgement(),
+    ]
+    assert [(point.size, point.delay_ms) for point in curve(faults, "sensor-bias", TICK_NS)] == [
+        (0.001, None),
+        (0.1, 12.5),
+    ]

@@ -9,7 +9,6 @@ import pytest
 
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
 
@@ -44,13 +43,6 @@ def test_each_trial_leaves_a_file_and_no_process_stays(config: RackConfig, tmp_p
     assert [process.returncode is not None for process in processes] == [True] * len(processes)
 
 
-def test_alone_there_is_one_at_a_time(config: RackConfig, tmp_path: Path) -> None:
-    with Workers(config) as workers:
-        found = [one.plan.number for one in workers.run([job(tmp_path, k) for k in (5, 6)], True)]
-        assert found == [5, 6]
-        assert len(workers._processes) == 1
-
-
 def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
     config: RackConfig, tmp_path: Path
 ) -> None:
@@ -60,12 +52,3 @@ def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
         pytest.raises(Failure, match=r"^trial 7: ConfigError: .*nobody"),
     ):
         list(workers.run([bad], alone=False))
-
-
-def test_after_a_signal_nothing_is_begun(
-    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(INTERRUPT, "number", 2)
-    with Workers(config) as workers:
-        assert list(workers.run([job(tmp_path, 8)], alone=True)) == []
-        assert workers._processes == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.checkout import RackCommand, checkout, rack_commands
-from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.tools.command_line import BOUND_S, ROOT
 
 PYTHON = """#!/bin/sh
 [ -z "$PYTHONPATH$VIRTUAL_ENV" ] || exit 9
@@ -67,14 +66,3 @@ def test_a_tree_without_an_environment_of_its_own_is_refused_in_one_line(tmp_pat
         assert str(refused.value).startswith(f"{tree}: {reason}")
         assert len(str(refused.value).splitlines()) == 1
         assert refused.value.status == 2
-
-
-@pytest.mark.parametrize("bench", ["cycle", "lockstep"])
-def test_a_bench_against_no_checkout_is_a_usage_error(bench: str, tmp_path: Path) -> None:
-    done = rack("bench", bench, "--against", tmp_path / "nowhere", "--json")
-    reason = f"{tmp_path / 'nowhere'}: not a checkout of rack: it has no tools/cli.py"
-    assert (done.returncode, done.stderr.strip(), json.loads(done.stdout)["error"]) == (
-        2,
-        reason,
-        [reason],
-    )

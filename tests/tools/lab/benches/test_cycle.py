@@ -3,7 +3,6 @@ recorded run."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,9 @@ from rack.backplane.trace import RECORD
 from rack.boards.config import load, wire
 from rack.levels.arm.simulation import sleeping
 from rack.tools.console.answer import Failure
-from rack.tools.console.progress import Progress
 from rack.tools.lab.benches import physics
 from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.cycle import PARTS, PHYSICS, costs, measure, parts_of
+from rack.tools.lab.benches.cycle import PARTS, PHYSICS, costs, parts_of
 from rack.tools.lab.benches.physics import replay
 from rack.tools.recording.cycles import Cycles
 from tests.shared_runs import nasrem_run
@@ -45,20 +43,13 @@ def cycles(processor_us: int, count: int = 5) -> Cycles:
 def test_the_parts_of_a_cycle_are_its_whole_processor_time() -> None:
     found = parts_of(cycles(50))
     assert tuple(found) == PARTS
-    assert [times.tolist() for times in found.values()] == [
-        [us] * 4 for us in (8.0, 3.0, 30.0, 4.0, 5.0)
-    ]
-
-
-def test_interrupted_bookkeeping_counts_without_the_interruption() -> None:
+    assert [set(times) for times in found.values()] == [{8.0}, {3.0}, {30.0}, {4.0}, {5.0}]
+    # Interrupted bookkeeping counts without the interruption.
     one = cycles(50)
     one.rows["closed_ns"][1:] = one.rows["end_ns"][:-1] + 90_000
     one.rows["start_ns"][1:] = one.rows["closed_ns"][1:] + 2000
     assert [times[0] for times in parts_of(one).values()] == [2.0, 3.0, 30.0, 4.0, 11.0]
-
-
-def test_start_up_and_stalls_are_not_judged() -> None:
-    one = cycles(50)
+    # Start-up and stalls are not judged.
     one.is_judged[[0, 3]] = False
     assert len(parts_of(one)["process"]) == 3
 
@@ -74,34 +65,6 @@ def test_a_board_is_compared_with_another_checkout_or_the_servo_with_its_physics
         assert own is not None
         assert (own.median, own.count, found.ratio(own)) == (50.0, 15, ratio)
         assert found.sample("servo, lockstep", PHYSICS) is not None
-
-
-def test_a_single_cycle_has_no_parts() -> None:
-    found = costs({**THIS_TREE, ("task, lockstep", "this tree"): [cycles(50, count=1)]}, [], None)
-    assert list(found.parts) == [("servo, lockstep", "this tree")]
-    assert found.sample("task, lockstep", "this tree") is not None
-
-
-@pytest.mark.slow
-def test_a_short_bench_measures_every_board_of_real_racks() -> None:
-    found = measure(None, 0.6, 1, Progress(), share=True)
-    document = found.document()
-    assert json.loads(json.dumps(document)) == document
-    # In so short a run the task level has no cycle beyond those that a new process spends warming
-    # up.
-    boards = ("empty", "servo", "primitive", "elemental_move", "world")
-    modes = ("real time", "lockstep")
-    assert {case for case, _ in found.parts} == {
-        f"{board}, {mode}" for board in boards for mode in modes
-    }
-    for place, parts in found.parts.items():
-        sample = found.sample(*place)
-        assert sample is not None
-        assert set(parts) == set(PARTS)
-        assert min(parts.values()) >= 0.0
-        assert sample.median > parts["process"]
-    assert found.baselines == {"servo, lockstep": PHYSICS}
-    assert sum(PHYSICS in line for line in found.lines(100)) == 1
 
 
 @pytest.mark.slow

@@ -37,16 +37,6 @@ def test_wakes_beyond_the_histogram_count_as_the_latest(
     assert found.max() == 150_000.0
 
 
-def test_idle_cores_are_left_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = f"open({str(tmp_path / 'words')!r}, 'w').write(' '.join(sys.argv))"
-    monkeypatch.setenv(
-        "PATH", str(peers.program(tmp_path, "cyclictest", f"{peers.CYCLICTEST}{told}\n"))
-    )
-    cyclictest(GRID)
-    # Without it cyclictest itself holds every core awake.
-    assert "--laptop" in (tmp_path / "words").read_text().split()
-
-
 def test_a_refusal_is_a_failure_in_its_own_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from importlib.machinery import ModuleSpec
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,6 @@ from rack.tools.lab.benches.harness import (
     Sample,
     absent_package,
     absent_program,
-    interleaved,
     turns,
 )
 
@@ -67,29 +67,14 @@ def test_ratios_are_to_the_baseline_of_the_same_case() -> None:
 
 def test_the_document_has_every_figure_and_says_who_is_absent() -> None:
     missing = Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
-    found = Comparison(
-        "pair", "Two contestants", SAMPLES, {"small": "theirs"}, (missing,)
-    ).document()
+    found = replace(BOTH, absent=(missing,)).document()
     assert json.loads(json.dumps(found)) == found
     names = ("case", "who", "unit", "count", "median", "best", "ratio")
-    assert [found["samples"][0][name] for name in names] == [
-        "small",
-        "ours",
-        "us",
-        3,
-        2.0,
-        1.0,
-        0.5,
-    ]
-    assert found["samples"][0]["p99"] == pytest.approx(2.98)
-    assert found["samples"][0]["p99_ratio"] == pytest.approx(2.98 / 9.88)
-    assert found["absent"] == [
-        {
-            "who": "cyclictest",
-            "reason": "no program 'cyclictest'",
-            "install": "apt-get install rt-tests",
-        }
-    ]
+    first = found["samples"][0]
+    assert [first[name] for name in names] == ["small", "ours", "us", 3, 2.0, 1.0, 0.5]
+    assert first["p99"] == pytest.approx(2.98)
+    assert first["p99_ratio"] == pytest.approx(2.98 / 9.88)
+    assert found["absent"] == [asdict(missing)]
 
 
 def test_the_table_fits_the_terminal_and_names_who_is_absent() -> None:
@@ -102,22 +87,18 @@ def test_the_table_fits_the_terminal_and_names_who_is_absent() -> None:
     assert max(map(len, list(found.lines(50))[1:-1])) <= 50
 
 
-def test_a_package_that_cannot_be_imported_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_or_a_program_that_is_not_there_is_absent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     assert not absent_package("JSON", "json")
     monkeypatch.setattr(sys, "meta_path", [Hidden("iceoryx2"), *sys.meta_path])
     monkeypatch.delitem(sys.modules, "iceoryx2", raising=False)
-    assert absent_package("blackboard", "iceoryx2") == (
-        Absent("blackboard", "No module named 'iceoryx2'", EXTRA),
-    )
-
-
-def test_a_program_that_is_not_on_the_path_is_absent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+    hidden = Absent("blackboard", "No module named 'iceoryx2'", EXTRA)
+    assert absent_package("blackboard", "iceoryx2") == (hidden,)
     assert not absent_program("shell", "sh", "dash")
     monkeypatch.setenv("PATH", str(tmp_path))
-    (found,) = absent_program("cyclictest", "cyclictest", "rt-tests")
-    assert found == Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
+    missing = Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
+    assert absent_program("cyclictest", "cyclictest", "rt-tests") == (missing,)
 
 
 def test_everybody_has_one_turn_a_round_and_no_fixed_neighbour() -> None:
@@ -128,12 +109,3 @@ def test_everybody_has_one_turn_a_round_and_no_fixed_neighbour() -> None:
     pairs = Counter((one[1], other[1]) for one, other in pairwise(order) if one[0] == other[0])
     assert len(pairs) == 12
     assert max(pairs.values()) < 30
-
-
-def test_results_are_kept_by_contestant_in_the_order_of_rounds() -> None:
-    calls: list[str] = []
-    contestants = {
-        name: lambda name=name: (calls.append(name), calls.count(name))[1] for name in "xyz"
-    }
-    assert interleaved(contestants, 3) == {name: [1, 2, 3] for name in "xyz"}
-    assert len(calls) == 9

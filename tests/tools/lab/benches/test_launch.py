@@ -10,12 +10,9 @@ import pytest
 
 from rack.boards.config import load
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.checkout import rack_commands
 from rack.tools.lab.benches.launch import (
-    BOUND_S,
     fastest,
     first_cycle_ns,
-    launch_s,
     measure_kills,
 )
 
@@ -41,16 +38,6 @@ def test_a_run_without_a_cycle_of_the_task_is_a_failure(tmp_path: Path) -> None:
 def test_the_fastest_executor_is_looked_for(small: Path) -> None:
     assert fastest(load(small)) == "lower"
     assert fastest(load("nasrem")) == "servo"
-
-
-@pytest.mark.slow
-def test_a_launch_takes_longer_than_nothing_and_leaves_no_folder(
-    small: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "runs").mkdir()
-    this = rack_commands(None)[0]
-    assert 0.0 < launch_s(this, str(small), tmp_path / "runs", share=False) < BOUND_S
-    assert not list((tmp_path / "runs").iterdir())
 
 
 def test_a_rack_without_an_arm_has_no_brakes(small: Path) -> None:

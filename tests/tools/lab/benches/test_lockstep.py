@@ -3,18 +3,15 @@ from given times."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.tools.console.answer import Failure
-from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.harness import Sample
-from rack.tools.lab.benches.lockstep import BARE, compare, differences, measure, run_bare
+from rack.tools.lab.benches.lockstep import BARE, compare, differences, run_bare
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
@@ -50,27 +47,3 @@ def test_speeds_follow_from_times_and_the_ratios_from_the_baseline() -> None:
             "simulated seconds a second:"
             " nasrem 4.17 (this tree), nasrem 2 (base), nasrem 6.25 (no rack)"
         )
-
-
-@pytest.mark.slow
-def test_a_short_bench_runs_a_rack_and_its_levels_alone() -> None:
-    found = measure(None, {"fig4": 0.5}, 1, Progress())
-    assert {(sample.who, sample.count) for sample in found.samples} == {("this tree", 1), (BARE, 1)}
-    assert found.baselines == {"fig4": BARE}
-    assert json.loads(json.dumps(found.document())) == found.document()
-
-
-def fails() -> None:
-    raise Failure("no reason")
-
-
-def exits() -> None:
-    raise SystemExit(4)
-
-
-@pytest.mark.slow
-def test_work_apart_raises_what_it_raised_and_says_when_it_ended() -> None:
-    with pytest.raises(Failure, match=r"^no reason$"):
-        apart(fails)
-    with pytest.raises(Failure, match="ended with status 4"):
-        apart(exits)

@@ -37,12 +37,6 @@ def test_a_board_that_overslept_grid_points_is_late_from_the_first_of_them() -> 
     assert lateness_us(Overslept(), "board1").tolist() == [100.0, 5100.0]
 
 
-def test_shares_are_of_all_tasks_together() -> None:
-    tasks = [{"missed": 1, "skipped": 1, "due": 100}, {"missed": 0, "skipped": 0, "due": 300}]
-    assert count_cycles(tasks).share == 0.005
-    assert count_cycles([]).share == 0.0
-
-
 @pytest.mark.slow
 def test_a_chain_passes_a_message_on_in_every_cycle(tmp_path: Path) -> None:
     chain = Chain(2, 400, "lockstep")
@@ -50,9 +44,3 @@ def test_a_chain_passes_a_message_on_in_every_cycle(tmp_path: Path) -> None:
     assert result.outcome.ticks == 40
     assert count_cycles(result.tasks[name] for name in chain.names) == (0, 80)
     assert recording.signal("board2.status", "sent").tolist() == [-1, *range(39)]
-
-
-def test_a_chain_of_boards_fills_the_crate() -> None:
-    layout = wire(loads(Chain(20, 400).text()))
-    assert [task.slot for task in layout.tasks] == list(range(2, 22))
-    assert layout.mailbox("board19.status").readers == ("board20",)

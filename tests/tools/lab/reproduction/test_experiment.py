@@ -13,7 +13,6 @@ from rack.tools.lab.reproduction.experiments import experiment
 from rack.tools.lab.reproduction.experiments.experiment import (
     KEPT,
     Experiment,
-    Kept,
     Lacking,
     Workshop,
     depends,
@@ -51,13 +50,17 @@ def workshop(tmp_path: Path) -> Workshop:
     return found
 
 
-def test_a_result_is_kept_until_the_program_changes(
+def test_a_result_is_kept_until_the_program_changes_or_its_picture_is_gone(
     workshop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = Counted().experiment()
     assert kept(one, workshop.folder) is None
     first = made(one, workshop)
     assert kept(one, workshop.folder) == first
+    # What it depends on stands next to it.
+    document = json.loads((workshop.folder / KEPT / "counted.json").read_text())
+    assert document["depends"] == json.loads(json.dumps(depends()))
+    assert {"program", "machine"} <= set(document["depends"])
     monkeypatch.setattr(experiment, "program", lambda: "another")
     assert kept(one, workshop.folder) is None
     assert made(one, workshop).found["times"] == 2
@@ -88,15 +91,6 @@ def test_what_the_machine_lacks_is_kept_as_a_reason_and_a_failure_is_not(
     with pytest.raises(Failure, match="did not run"):
         made(failing, workshop)
     assert kept(failing, workshop.folder) is None
-
-
-def test_what_a_result_depends_on_stands_next_to_it(workshop: Workshop) -> None:
-    one = Counted().experiment()
-    found = made(one, workshop)
-    document = json.loads((workshop.folder / KEPT / "counted.json").read_text())
-    assert document["depends"] == json.loads(json.dumps(depends()))
-    assert {"program", "machine"} <= set(document["depends"])
-    assert isinstance(found, Kept)
 
 
 def test_results_depend_on_the_program_but_not_on_what_writes_the_page() -> None:

@@ -34,22 +34,23 @@ def ran(late: int, jobs: int = 100) -> FigureRun:
     return FigureRun(counts, 0, 0)
 
 
-@pytest.mark.parametrize(
-    ("name", "late", "ruling"),
-    [
-        ("figure-2", (0,), Ruling.HOLDS),
-        ("figure-2", (3,), Ruling.BOUNDED),
-        ("figure-2", (97,), Ruling.FAILS),
-        ("figure-4-overload", (97,), Ruling.HOLDS),
-        ("figure-4-overload", (3,), Ruling.FAILS),
-        ("figure-3", (97, 97), Ruling.HOLDS),
-        ("figure-3", (97, 0), Ruling.BOUNDED),
-        ("figure-3", (0, 97), Ruling.FAILS),
-        ("figure-2-x", (0, 100), Ruling.CONTRADICTS),
-        # Runs that do not confirm the contradiction make it no finding.
-        ("figure-2-x", (0, 0), Ruling.FAILS),
-    ],
-)
+FIGURES = [
+    ("figure-2", (0,), Ruling.HOLDS),
+    ("figure-2", (3,), Ruling.BOUNDED),
+    ("figure-2", (97,), Ruling.FAILS),
+    ("figure-4", (97,), Ruling.FAILS),
+    ("figure-4-overload", (97,), Ruling.HOLDS),
+    ("figure-4-overload", (3,), Ruling.FAILS),
+    ("figure-3", (97, 97), Ruling.HOLDS),
+    ("figure-3", (97, 0), Ruling.BOUNDED),
+    ("figure-3", (0, 97), Ruling.FAILS),
+    ("figure-2-x", (0, 100), Ruling.CONTRADICTS),
+    # Runs that do not confirm the contradiction make it no finding.
+    ("figure-2-x", (0, 0), Ruling.FAILS),
+]
+
+
+@pytest.mark.parametrize(("name", "late", "ruling"), FIGURES)
 def test_a_figure_is_judged_by_its_runs(name: str, late: tuple[int, ...], ruling: Ruling) -> None:
     assert rule_on(name, *map(ran, late)).ruling is ruling
 

@@ -7,14 +7,13 @@ import os
 import re
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from rack.tools.lab.reproduction.experiments.deadline import DEADLINE
 from rack.tools.lab.reproduction.experiments.experiment import KEPT, kept
-from tests.processes import wait_until
+from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, rack
 
 pytestmark = [pytest.mark.thorough, pytest.mark.timeout(200)]
@@ -25,17 +24,7 @@ SECTION = "3"
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a page whose command was killed in the middle of a run."""
     folder = tmp_path_factory.mktemp("page") / "paper"
-    command = [
-        sys.executable,
-        "-m",
-        "rack.tools.cli",
-        "reproduce",
-        "--out",
-        str(folder),
-        "--only",
-        SECTION,
-        "--share",
-    ]
+    command = [*RACK, "reproduce", "--out", str(folder), "--only", SECTION, "--share"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
     begun = folder / "runs" / "goto" / "events.jsonl"
     wait_until(lambda: begun.exists() or process.poll() is not None, BOUND_S)
@@ -56,11 +45,8 @@ def test_a_killed_command_leaves_no_half_result_and_goes_on(killed: Path) -> Non
     assert [path.name for path in (killed / KEPT).iterdir()] == ["goto.json"]
     assert kept(DEADLINE, killed) is not None
     page, text = ((killed / name).read_text() for name in ("index.html", "README.md"))
-    assert not [
-        target
-        for target in re.findall(r'(?:src|href)="([^"]+)"', page)
-        if target[:1] != "#" and target[:5] != "data:"
-    ]
+    targets = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert not [target for target in targets if not target.startswith(("#", "data:"))]
     assert all((killed / path).is_file() for path in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text))
 
 

@@ -153,10 +153,10 @@ def partitions(slow: int, fast: int, plans: int) -> Partitions:
     return Partitions((tight, loose))
 
 
-def equation(holds: bool, mostly: bool) -> NasremRun:
-    """Return a run with equation 3.1 measured for one level."""
+def equation(name: str, holds: bool, mostly: bool) -> NasremRun:
+    """Return a run with an equation measured for one level."""
     left = 1e6 if holds else 3e6
-    measured = EquationVerdict("3.1", "servo", left, "<=", 2.5e6, "")
+    measured = EquationVerdict(name.removeprefix("equation-"), "servo", left, "<=", 2.5e6, "")
     return replace(RUN, verdicts=(MeasuredVerdict(measured, mostly),))
 
 
@@ -222,9 +222,13 @@ RULINGS = [
     ("figure-5", [partitions(0, 50, 1)], HOLDS),
     ("figure-5", [partitions(50, 50, 1)], FAILS),
     ("figure-5", [partitions(0, 50, 0)], Ruling.UNTESTABLE),
-    ("equation-3.1", [equation(True, True)], HOLDS),
-    ("equation-3.1", [equation(False, True)], BOUNDED),
-    ("equation-3.1", [equation(False, False)], FAILS),
+    ("equation-3.1", [equation("3.1", True, True)], HOLDS),
+    ("equation-3.1", [equation("3.1", False, True)], BOUNDED),
+    *(
+        (name, [equation(name, False, False)], FAILS)
+        for name in EQUATIONS
+        if name != "equation-3.3"
+    ),
     ("equation-3.1", [RUN], Ruling.UNTESTABLE),
     ("equation-3.3", [RUN], HOLDS),
     ("equation-3.3", [response("task missed 1 cycle")], BOUNDED),

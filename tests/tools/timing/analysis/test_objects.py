@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -29,41 +28,30 @@ wait()
 """
 
 
-def run(name: str, *settings: str) -> tuple[int, dict[str, Any]]:
-    """Run the NASREM rack, unrecorded, on its way home; return exit status and report."""
-    given = [word for setting in (f"name={name}", HOME, *settings) for word in ("--set", setting)]
-    done = rack("run", "nasrem", "--lockstep", "--no-record", "--json", *given)
-    return done.returncode, json.loads(done.stdout)
-
-
 @pytest.mark.slow
-def test_an_object_off_its_goal_fails_a_task_that_is_done(rack_name: str) -> None:
-    status, report = run(rack_name, GOAL, PUSH)
-    (end,) = report["objects"]
-    off = f"object 'block1' ended {end['off_mm']:.0f} mm from its goal (tolerance 10 mm)"
-    assert end["off_mm"] > 20.0
-    assert report["outcome"]["cause"] == "task done"
-    assert report["outcome"]["faults"] == [off]
-    assert (status, report["worked"]) == (1, False)
-
-
-@pytest.mark.slow
-def test_an_object_within_the_tolerance_is_listed(rack_name: str) -> None:
-    status, report = run(rack_name, GOAL)
+@pytest.mark.parametrize(
+    ("settings", "words", "cause", "fails"),
+    [
+        ((GOAL, PUSH), (), "task done", True),
+        ((GOAL,), (), "task done", False),
+        # A run that ends before its task is not judged.
+        ((GOAL, PUSH), ("--seconds", "1"), "time over", False),
+    ],
+    ids=["off", "within", "before"],
+)
+def test_an_object_off_its_goal_fails_a_task_that_is_done(
+    rack_name: str, settings: tuple[str, ...], words: tuple[str, ...], cause: str, fails: bool
+) -> None:
+    given = [word for one in (f"name={rack_name}", HOME, *settings) for word in ("--set", one)]
+    done = rack("run", "nasrem", "--lockstep", "--no-record", "--json", *given, *words)
+    report = json.loads(done.stdout)
     (end,) = report["objects"]
     assert (end["object"], end["goal"], end["tolerance_mm"]) == ("block1", [0.5, 0.3, 0.475], 10.0)
-    assert end["off_mm"] < 0.1
-    assert (status, report["worked"]) == (0, True)
-
-
-@pytest.mark.slow
-def test_a_run_that_ends_before_its_task_is_not_judged(rack_name: str) -> None:
-    given = [word for setting in (f"name={rack_name}", GOAL, PUSH) for word in ("--set", setting)]
-    done = rack("run", "nasrem", "--lockstep", "--no-record", "--json", "--seconds", 1.0, *given)
-    report = json.loads(done.stdout)
-    assert report["outcome"]["cause"] == "time over"
-    assert report["objects"][0]["off_mm"] > 20.0
-    assert (done.returncode, report["outcome"]["faults"]) == (0, [])
+    assert end["off_mm"] > 20.0 if PUSH in settings else end["off_mm"] < 0.1
+    assert report["outcome"]["cause"] == cause
+    off = f"object 'block1' ended {end['off_mm']:.0f} mm from its goal (tolerance 10 mm)"
+    assert report["outcome"]["faults"] == [off] * fails
+    assert (done.returncode == 0) is not fails
 
 
 def test_a_task_of_transfers_states_the_last_place_of_each_object(rack_name: str) -> None:
@@ -81,23 +69,6 @@ def test_a_goal_of_what_is_not_in_the_scene_is_a_mistake() -> None:
         match=r"scene.goal\[0\].object = \"block9\": no such object; scene.objects: block1",
     ):
         resolve(load("nasrem", [GOAL.replace("block1", "block9")]))
-
-
-@pytest.mark.slow
-def test_the_objects_of_the_nasrem_task_end_within_tolerance_and_none_falls(
-    rack_name: str, tmp_path: Path
-) -> None:
-    config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep"])
-    assert run_rack(config, None, tmp_path / "run", Display()).worked
-    report, text = write_report(tmp_path / "run")
-    assert [end["object"] for end in report["objects"]] == ["block1", "peg", "block2"]
-    for end in report["objects"]:
-        assert end["off_mm"] < end["tolerance_mm"]
-        assert end["drops"] == []
-        assert (
-            f"Object {end['object']} ended {end['off_mm']:.1f} mm from its goal (tolerance 10 mm)."
-            in text
-        )
 
 
 @pytest.mark.slow

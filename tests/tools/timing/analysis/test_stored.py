@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -32,13 +33,36 @@ def make_newer(path: Path) -> None:
     os.utime(path, ns=(later_ns, later_ns))
 
 
-def test_it_is_the_report_that_was_written(folder: Path) -> None:
+def rename(path: Path) -> None:
+    path.rename(path.with_name("elsewhere"))
+
+
+def cut_off(path: Path) -> None:
+    path.write_text('{"rack": ')
+    path.with_suffix(".md").touch()
+
+
+CHANGES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
+    "newer": (make_newer, tuple(RECORDED)),
+    "missing": (rename, ("report.json", "report.md", *RECORDED)),
+    "there": (Path.touch, (stored.SPOOL,)),
+    "damaged": (cut_off, ("report.json",)),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        pytest.param(change, name, id=f"{name} {what}")
+        for what, (change, names) in CHANGES.items()
+        for name in names
+    ],
+)
+def test_it_is_shown_until_a_file_has_changed(
+    folder: Path, change: Callable[[Path], object], name: str
+) -> None:
     assert stored_report(folder) == write_report(folder)
-
-
-@pytest.mark.parametrize("name", RECORDED)
-def test_it_is_made_anew_once_the_recording_has_changed(folder: Path, name: str) -> None:
-    make_newer(folder / name)
+    change(folder / name)
     assert stored_report(folder) is None
 
 
@@ -52,23 +76,6 @@ def test_it_is_made_anew_once_the_program_has_changed(
     os.utime(changed, ns=(0, 0))
     assert stored_report(folder) is not None
     make_newer(changed)
-    assert stored_report(folder) is None
-
-
-@pytest.mark.parametrize("name", ["report.json", "report.md", *RECORDED])
-def test_it_is_made_anew_if_a_file_is_missing(folder: Path, name: str) -> None:
-    (folder / name).rename(folder / "elsewhere")
-    assert stored_report(folder) is None
-
-
-def test_it_is_made_anew_while_a_spool_is_left(folder: Path) -> None:
-    (folder / stored.SPOOL).touch()
-    assert stored_report(folder) is None
-
-
-def test_it_is_made_anew_if_it_is_damaged(folder: Path) -> None:
-    (folder / "report.json").write_text('{"rack": ')
-    (folder / "report.md").touch()
     assert stored_report(folder) is None
 
 

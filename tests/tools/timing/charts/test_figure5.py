@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import load
-from rack.tools.timing.charts.figure5 import document, placed, region_of
+from rack.tools.timing.charts.figure5 import placed, region_of
 
 
 @pytest.mark.parametrize(
@@ -37,19 +37,3 @@ def test_the_levels_of_nasrem_fall_where_the_paper_has_them() -> None:
     assert "coupled tightly, as in the figure" in found["task"].remark
     assert "a processor of its own; here it is coupled tightly" in found["servo"].remark
     assert "no planner" in found["world"].remark
-
-
-def test_a_rack_that_runs_faster_than_real_time_asks_for_more() -> None:
-    servo = placed(load("nasrem", ["clock.speed=4"]))[0]
-    assert (servo.cycle_s, servo.region) == (
-        0.000625,
-        "fine-grained multiprocessing or dedicated hardware",
-    )
-
-
-def test_the_figure_as_data_has_every_level_and_region() -> None:
-    found = document(load("fig2"))
-    assert [region["to_s"] for region in found["regions"]] == [0.001, 0.25, 60.0, None]
-    assert [(level["level"], level["cycle_s"], level["coupling"]) for level in found["levels"]] == [
-        ("level", pytest.approx(0.008), "tight")
-    ]

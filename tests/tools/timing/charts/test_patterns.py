@@ -60,11 +60,6 @@ def test_a_core_that_another_board_has_is_not_idle() -> None:
     assert dict(counted([EXECUTOR, other], "b", 8000).cycles) == {"X": 10}
 
 
-def test_what_another_board_cuts_in_pieces_is_told_once() -> None:
-    cutting = task("b", "X10", 100, priority=90)
-    assert dict(counted([EXECUTOR, cutting], "a", 8000).cycles) == {"R X W -": 10}
-
-
 LANE = Lane(1, "a", "a", None, 80, 1000, 1000, 0)
 
 
@@ -80,18 +75,6 @@ def test_remnants_and_short_gaps_are_not_told_of_what_was_measured() -> None:
     measured = (("P", 0, 15), ("R", 60, 75), ("X", 75, 400), ("P", 420, 990))
     assert order(*measured, detail=detail) == "R X P"
     assert order(*measured, detail=Detail()) == "P - R X - P -"
-
-
-def test_what_is_always_short_is_told_all_the_same() -> None:
-    detail = Detail.measured(LANE, {Unit.READ: 12, Unit.PROCESS: 500})
-    assert order(("R", 0, 10), ("X", 10, 950), detail=detail) == "R X"
-
-
-def test_a_plan_in_its_executors_own_memory_is_read_without_communication() -> None:
-    times = {Unit.EXCHANGE: 10}
-    tight = replace(LANE, planner="a.planner")
-    assert Detail.measured(LANE, times).short_ns[Unit.EXCHANGE] < 10
-    assert Detail.measured(tight, times).short_ns[Unit.EXCHANGE] > 10
 
 
 @pytest.mark.parametrize("start", [0, 1, 799, 800])

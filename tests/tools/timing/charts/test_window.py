@@ -34,16 +34,6 @@ def test_a_window_shows_two_plans_of_the_slowest_level_whose_neighbours_can_stil
     assert WindowOptions().window(level, None, 40 * MS) == (40 * MS, 120 * MS)
 
 
-def test_a_tight_planner_comes_before_a_slower_one_on_another_core() -> None:
-    tasks = [
-        task("a", 10),
-        task("a.planner", 10, 2),
-        task("b", 10, core=1),
-        task("b.planner", 10, 4, core=0),
-    ]
-    assert shown_task(tasks).name == "a.planner"
-
-
 @pytest.mark.parametrize(
     ("from_ms", "to_ms", "extent_ms", "seen"),
     [
@@ -82,10 +72,6 @@ def test_a_bad_window_is_refused(
     with pytest.raises(Failure, match=message) as failure:
         asked(from_ms, to_ms).window(NASREM[0], extent_ms * MS, 0)
     assert failure.value.status == 2
-
-
-def test_times_of_x_are_read_by_level() -> None:
-    assert times_of(["level=3,2", "servo=0.5"]) == {"level": [3 * MS, 2 * MS], "servo": [500_000]}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,35 @@
+"""A rack that counts, run by a command in lockstep and held before tick 0."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rack.backplane.segment import Segment, racks
+from rack.backplane.words import System
+from tests.boards.table_racks import counting
+from tests.processes import RACK, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack
+
+
+@contextmanager
+def held_rack(
+    folder: Path, name: str, *options: str | Path
+) -> Iterator[tuple[subprocess.Popen[bytes], Segment]]:
+    """Run a rack, without a recording unless `options` say otherwise; yield its launcher and its
+    memory."""
+    path = folder / "counting.toml"
+    path.write_text(counting(folder))
+    words = ("--lockstep", "--step", "--set", f"name={name}", *(options or ("--no-record",)))
+    with subprocess.Popen([*RACK, "run", path, *words], cwd=ROOT) as process:
+        wait_until(lambda: name in racks(), BOUND_S)
+        segment = Segment.attach(name)
+        try:
+            wait_until(lambda: segment.words[System.HELD], BOUND_S)
+            yield process, segment
+        finally:
+            segment.close()
+            process.kill()
+    rack("clean")
