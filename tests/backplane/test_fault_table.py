@@ -37,11 +37,7 @@ def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
     assert read.parameters[:3].tolist() == [0.5, -1.0, 3.25]
     assert (read.stage, read.until, read.struck_tick) == (Stage.WAITING, NEVER, -1)
     assert segment.words[System.INJECTED] == 1
-
-
-def test_a_fault_without_a_condition_waits_for_its_tick_alone(make_bus: MakeBus) -> None:
-    entry = FaultTable(make_bus(mailbox())).add(replace(WHOLE, when=None))
-    assert entry.when_box == -1
+    assert FaultTable(segment).add(replace(WHOLE, when=None)).when_box == -1
 
 
 def test_entries_are_found_by_their_stages(make_bus: MakeBus) -> None:

@@ -70,49 +70,34 @@ def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
 
 
 @WAKES
-def test_a_release_is_given_once(bus: Segment) -> None:
-    cycle, seen = NextCycle(bus, "level"), []
-    for tick in (0, 4, 8):
-        release(bus, tick)
-        seen.append((cycle.wait(), cycle.skipped))
-    assert seen == [(0, 0), (4, 0), (8, 0)]
-
-
-@WAKES
 def test_a_late_task_skips_passed_releases_and_counts_them(bus: Segment) -> None:
     cycle = NextCycle(bus, "level")
-    release(bus, 0)
-    cycle.wait()
-    for tick in (4, 8, 12):
+    # The first one counts from tick 0.
+    release(bus, 4)
+    assert (cycle.wait(), cycle.skipped) == (4, 1)
+    for tick in (8, 12, 16):
         release(bus, tick)
-    assert (cycle.wait(), cycle.skipped) == (12, 2)
-    release(bus, 16)
-    assert (cycle.wait(), cycle.skipped) == (16, 0)
-
-
-def test_the_first_release_counts_from_tick_0(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    release(bus, 8)
-    assert (cycle.wait(), cycle.skipped) == (8, 2)
-
-
-def test_a_planner_at_work_takes_no_release_and_skips_none(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    release(bus, 0)
-    cycle.wait()
-    cycle.hold_until(12)
-    for tick in (4, 8, 12):
-        release(bus, tick)
-    assert (cycle.wait(), cycle.skipped) == (12, 0)
-
-
-def test_a_planner_that_comes_late_counts_from_the_end_of_its_slice(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    release(bus, 0)
-    cycle.wait()
-    cycle.hold_until(12)
+    assert (cycle.wait(), cycle.skipped) == (16, 2)
     release(bus, 20)
-    assert (cycle.wait(), cycle.skipped) == (20, 2)
+    assert (cycle.wait(), cycle.skipped) == (20, 0)
+    # The last release is taken, however late.
+    release(bus, 24)
+    bus.words[System.STATE] = Run.STOPPED
+    assert (cycle.wait(), cycle.skipped) == (24, 0)
+    assert cycle.wait() is None
+
+
+@pytest.mark.parametrize(("releases", "skipped"), [((4, 8, 12), 0), ((20,), 2)])
+def test_a_planner_at_work_takes_no_release_and_skips_none(
+    bus: Segment, releases: tuple[int, ...], skipped: int
+) -> None:
+    cycle = NextCycle(bus, "level")
+    release(bus, 0)
+    cycle.wait()
+    cycle.hold_until(12)
+    for tick in releases:
+        release(bus, tick)
+    assert (cycle.wait(), cycle.skipped) == (releases[-1], skipped)
 
 
 @pytest.mark.parametrize(
@@ -155,16 +140,6 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     wake_semaphore(bus.rack, "level").release()
     thread.join(BOUND_S)
     assert found == [-1, None]
-
-
-@WAKES
-def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    for tick in (0, 4, 8):
-        release(bus, tick)
-    bus.words[System.STATE] = Run.STOPPED
-    assert (cycle.wait(), cycle.skipped) == (8, 2)
-    assert cycle.wait() is None
 
 
 @pytest.mark.slow
@@ -348,19 +323,11 @@ def test_a_task_that_sleeps_before_the_clock_starts_is_woken_to_sleep_by_its_gri
     assert found == [0]
 
 
-@TIMER
-def test_in_lockstep_a_sleeping_task_waits_for_its_signal(bus: Segment) -> None:
-    bus.words[System.LOCKSTEP] = 1
-    # A grid in the far future: it does not count.
-    start_grid(bus, -1_000 * EVERY * PERIOD_NS)
-    cycle = NextCycle(bus, "level")
-    for tick in (0, 4, 8):
-        release(bus, tick)
-        assert (cycle.wait(), cycle.skipped) == (tick, 0)
-
-
+@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: Segment) -> None:
     bus.words[System.LOCKSTEP] = 1
+    # A grid in the far future: it does not count, for a task that sleeps neither.
+    start_grid(bus, -1_000 * EVERY * PERIOD_NS)
     block = bus.block("level")
     cycle = NextCycle(bus, "level")
     release(bus, 0)

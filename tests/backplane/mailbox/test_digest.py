@@ -66,10 +66,7 @@ def test_messages_visible_after_the_last_tick_do_not_count(bus: Segment) -> None
     open_writer(bus, NAME).write(6)
     assert digest(bus, 7) == before[0]
     assert digest(bus, 9) != before[1]
-
-
-def test_the_digest_goes_as_far_as_the_run(bus: Segment) -> None:
-    write(bus, NAME, [1, 2, 3])
+    # It goes as far as the run.
     bus.words[System.STOP_TICK] = 4
     assert digest(bus) == digest(bus, 4) != digest(bus, 7)
 
@@ -80,10 +77,7 @@ def test_the_chain_covers_overwritten_messages(bus: Segment) -> None:
     found = chains(bus, 5000)
     assert found[NAME][0] == found[OTHER][0] == 500
     assert found[NAME][1] != found[OTHER][1]
-
-
-def test_where_no_message_is_left_there_is_no_chain(bus: Segment) -> None:
-    write(bus, NAME, list(range(500)))
+    # Where no message is left there is no chain.
     assert chains(bus, 3)[NAME][1] == 0
 
 

@@ -15,12 +15,6 @@ ARRIVALS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=
 """Pauses before messages, and their services."""
 
 
-def test_messages_are_served_one_at_a_time() -> None:
-    inbox = Inbox(2)
-    assert [inbox.arrive(at, 60) for at in (0, 10, 200)] == [60, 120, 260]
-    assert (inbox.lost, inbox.most_waiting) == (0, 1)
-
-
 def test_one_that_arrives_while_too_many_wait_is_lost_and_costs_nothing() -> None:
     inbox = Inbox(2)
     assert [inbox.arrive(0, 60) for _ in range(4)] == [60, 120, 180, None]

@@ -40,16 +40,12 @@ def obtains(lock: MailboxLock) -> bool:
     return any(lock.acquire() for _ in range(3))
 
 
-def test_a_wait_for_a_living_holder_ends_at_its_bound(bus: Segment) -> None:
-    lock = MailboxLock(bus, NAME)
-    with forked(lambda: hold(bus)):
-        wait_until(lambda: bus.words[REPORT])
-        assert [lock.acquire() for _ in range(5)] == [False] * 5
-    assert obtains(lock)
-
-
 def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
     writer, reader = open_writer(bus, NAME), open_reader(bus, NAME)
+    with forked(lambda: hold(bus)):
+        wait_until(lambda: bus.words[REPORT])
+        assert reader.read(0).verdict is Verdict.NONE
+    bus.words[REPORT] = 0
     writer.message.id = 1
     assert writer.write(0, now=0)
     assert reader.read(0).is_new
@@ -58,9 +54,9 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
         cut_off = reader.read(1)
         assert (cut_off.value.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
         assert not writer.write(1, now=1)
-    assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (1, 1, 1)
+    assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (2, 1, 1)
     # Its holder lives: the reader was held up by no fault.
-    assert (reader.statistics.held_up, reader.statistics.bad_reads) == (0, 1)
+    assert (reader.statistics.held_up, reader.statistics.bad_reads) == (0, 2)
     assert writer.write(2, now=2)
     assert reader.read(2).is_new
 
@@ -74,14 +70,6 @@ def test_a_read_that_a_dead_holder_held_up_is_counted_once(bus: Segment) -> None
         reader.read(0)
     assert (reader.statistics.held_up, reader.statistics.bad_reads) == (1, 1)
     assert reader.statistics.bus_errors == 0
-
-
-def test_a_bus_error_before_the_first_message_gives_none(bus: Segment) -> None:
-    reader = open_reader(bus, NAME)
-    with forked(lambda: hold(bus)):
-        wait_until(lambda: bus.words[REPORT])
-        assert reader.read(0).verdict is Verdict.NONE
-    assert reader.statistics.bus_errors == 1
 
 
 def compete(segment: Segment, word: int) -> None:
@@ -170,18 +158,12 @@ def test_a_holder_overtaken_between_its_two_steps_is_not_the_owner(bus: Segment)
     lock_semaphore(bus.rack, NAME).acquire(0)
     assert quick.acquire()
     assert not slow._owner.take()
+    # Nor does a semaphore posted once too often let a second one in.
+    lock_semaphore(bus.rack, NAME).release()
+    assert not slow.acquire()
     quick.release()
     assert lock_semaphore(bus.rack, NAME).value == 1
     assert slow.acquire()
-
-
-def test_a_semaphore_posted_once_too_often_lets_no_second_one_in(bus: Segment) -> None:
-    first, second = MailboxLock(bus, NAME), MailboxLock(bus, NAME)
-    lock_semaphore(bus.rack, NAME).release()
-    assert first.acquire()
-    assert not second.acquire()
-    first.release()
-    assert lock_semaphore(bus.rack, NAME).value == 1
 
 
 @pytest.mark.slow

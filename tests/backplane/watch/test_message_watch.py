@@ -43,6 +43,7 @@ def test_messages_before_the_first_read_are_not_judged(link: MakeLink) -> None:
 def test_a_reader_that_skips_cycles_reports_nothing_false(
     link: MakeLink, protocol: Protocol
 ) -> None:
+    # The last pause is long enough for everything to be overwritten.
     rack = link(protocol)
     for pause in (1, 2, 18, 100):
         start = rack.reader.seen[-1].tick + 1 if rack.reader.seen else 0
@@ -52,26 +53,6 @@ def test_a_reader_that_skips_cycles_reports_nothing_false(
         rack.run(start + 30 + pause, start + 60 + pause)
     assert rack.alarms() == []
     assert not any(seen.is_lost for seen in rack.reader.seen)
-
-
-def test_a_late_reader_reports_nothing_false(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    # It was released at 20, and preempted while its writer continued.
-    for tick in range(20, 38):
-        rack.writer.cycle(tick)
-    assert rack.reader.cycle(20).value.id == 19
-    assert rack.reader.cycle(38).value.id == 37
-    assert rack.alarms() == []
-
-
-def test_a_reader_that_finds_everything_overwritten_continues(link: MakeLink) -> None:
-    rack = link(depth=8)
-    rack.run(0, 20)
-    for tick in range(20, 100):
-        rack.writer.cycle(tick)
-    rack.run(100, 120)
-    assert rack.alarms() == []
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -181,7 +162,9 @@ def test_a_slot_whose_head_is_damaged_is_damaged_and_not_lost(link: MakeLink) ->
     assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED]
 
 
-@pytest.mark.parametrize(("messages", "alarms"), [(2, []), (3, [Alarm.BABBLE])])
+@pytest.mark.parametrize(
+    ("messages", "alarms"), [(2, []), (3, [Alarm.BABBLE]), (5, [Alarm.BABBLE])]
+)
 def test_one_message_more_than_releases_is_no_babble(
     link: MakeLink, messages: int, alarms: list[Alarm]
 ) -> None:
@@ -190,6 +173,9 @@ def test_one_message_more_than_releases_is_no_babble(
     rack.reader.cycle(20)
     for _ in range(messages):
         publish(rack, 20, 21)
+    if messages == 5:
+        # Serials begin at 1: 21 to 25 are the babble, whose single messages are not judged.
+        rack.segment.bytes[message_address(rack.segment, 23)] ^= 4
     rack.reader.cycle(21)
     assert [code for _, code in rack.alarms()] == alarms
 
@@ -206,18 +192,6 @@ def test_after_a_lost_message_a_babble_is_counted_from_its_tick(link: MakeLink) 
     assert rack.alarms() == [(21, Alarm.GAP), (22, Alarm.BABBLE)]
 
 
-def test_of_a_babble_the_single_messages_are_not_judged(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.reader.cycle(20)
-    for _ in range(5):
-        publish(rack, 20, 21)
-    # Serials begin at 1: 21 to 25 are the babble.
-    rack.segment.bytes[message_address(rack.segment, 23)] ^= 4
-    rack.reader.cycle(21)
-    assert [code for _, code in rack.alarms()] == [Alarm.BABBLE]
-
-
 def test_a_later_message_of_an_earlier_release_is_out_of_order(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
@@ -225,20 +199,6 @@ def test_a_later_message_of_an_earlier_release_is_out_of_order(link: MakeLink) -
     publish(rack, 18, 21)
     rack.reader.cycle(21)
     assert rack.alarms() == [(21, Alarm.DISORDER)]
-
-
-def test_a_bad_read_is_a_trouble_of_its_task(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    task = rack.reader.ports.task
-    assert task.troubles == 0
-    rack.writer.cycle(20)
-    rack.segment.bytes[message_address(rack.segment, 21)] ^= 1
-    rack.reader.cycle(21)
-    assert (task.troubles, rack.alarms()) == (1, [(21, Alarm.DAMAGED)])
-    rack.writer.cycle(21)
-    rack.reader.cycle(22)
-    assert (task.troubles, rack.alarms()) == (1, [])
 
 
 @pytest.mark.parametrize("every", [1, 4])

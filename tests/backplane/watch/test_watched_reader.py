@@ -101,14 +101,3 @@ def test_a_loss_shows_between_its_ticks_too(link: MakeLink) -> None:
     assert [grid.read(tick)[1] for tick in (13, 15)] == [True, True]
     rack.writer.cycle(15)
     assert grid.read(16)[1] is False
-
-
-def test_a_read_without_a_message_is_lost_only_with_its_writer(link: MakeLink) -> None:
-    rack = link()
-    found = Grid(rack, every=1, phase=0).watched
-    assert found.is_writer_lost(5) is False
-    rack.writer.cycle(0)
-    found.read(1)
-    rack.segment.block("writer")[Block.LOST] = 2
-    assert [found.is_writer_lost(tick) for tick in (1, 2)] == [False, True]
-    assert [found.read(tick).is_lost for tick in (1, 2)] == [False, True]

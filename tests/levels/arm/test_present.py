@@ -19,7 +19,7 @@ from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import RobotConfig, SceneConfig
-from tests.levels.arm.test_guard import SEEDS, TICK_S, driven, excess, random_torques
+from tests.levels.arm.test_guard import TICK_S, driven, excess, random_torques
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
 from tests.levels.lockstep import CLOCK_NS
@@ -157,16 +157,12 @@ def test_a_stuck_sensor_shows_in_late_samples_too(tmp_path: Path, arm: type[Late
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("latency", [1, 4])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_late_samples_lead_beyond_no_limit(
-    tmp_path: Path, arm: type[LateArm], latency: int, seed: int
-) -> None:
-    robot, cell = late(tmp_path, latency)
-    arm.late = latency
+def test_late_samples_lead_beyond_no_limit(tmp_path: Path, arm: type[LateArm]) -> None:
+    robot, cell = late(tmp_path, 4)
+    arm.late = 4
     own = arm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(own, cell, robot.joints, TICK_S, PresentLink(own, cell, TICK_S))
-    assert max(excess(cell, driven(guard, own, random_torques(cell, seed, 800)))) <= 0.0
+    assert max(excess(cell, driven(guard, own, random_torques(cell, 0, 800)))) <= 0.0
     assert own.clipped > 50
     assert own.violations == 0
 

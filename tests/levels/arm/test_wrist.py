@@ -12,7 +12,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ARM_STATE
-from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.systems.force.contact_wrench import ContactWrench
 from tests.levels.systems.force.pad import pad
 
@@ -49,13 +49,6 @@ def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
         force,
         torque + np.cross(site - centre, force),
     )
-
-
-def test_before_its_first_step_an_arm_rests(tmp_path: Path) -> None:
-    arm = arm_of(tmp_path)
-    contact = contact_of(arm)
-    contact.take(felt(arm), np.array(arm._state), STILL)
-    assert np.abs(contact.wrench).max() < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -144,9 +137,3 @@ def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     for arm in arms:
         arm.step(1)
     assert felt(arms[0]).tobytes() == felt(arms[1]).tobytes()
-
-
-def test_an_arm_without_a_sensor_senses_nothing(tmp_path: Path) -> None:
-    robot, scene = pad(tmp_path)
-    cell: Cell = build_cell(robot.model_copy(update={"wrist": None}), scene, CLOCK_NS)
-    assert SimulatedArm(cell, scene, CLOCK_NS).feel() is None

@@ -173,14 +173,6 @@ def test_failure_stops_everything_with_its_reason(
     assert bench.command.hold == 1
 
 
-def test_blocked_arm_holds_and_asks_for_another_path_from_where_it_rests() -> None:
-    bench = planned_bench()
-    bench.cycle(2, current=1, blocked=1, resting=1, position=bench.home + 0.05)
-    assert bench.command.hold == 1
-    assert bench.status.replan > 0
-    assert bench.status.start == pytest.approx(bench.home + 0.05)
-
-
 def test_request_is_dropped_when_the_way_is_free_again() -> None:
     bench = planned_bench()
     bench.cycle(2, current=1, blocked=1)
@@ -194,8 +186,10 @@ def test_request_is_dropped_when_the_way_is_free_again() -> None:
 
 
 def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> None:
-    bench = planned_bench()
+    bench = planned_bench(replans=1)
     bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
+    assert (bench.command.hold, bench.status.replan > 0) == (1, True)
+    assert bench.status.start == pytest.approx(bench.home + 0.05)
     bench.plan(1, bench.home + 0.05, replan=bench.status.replan)
     bench.cycle(1)
     assert bench.segments()[0] == (3, 1)
@@ -204,6 +198,9 @@ def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> No
     assert bench.command.hold == 0
     assert bench.segments() == [(3, 1), (4, 2)]
     assert bench.status.replans == 1
+    # The next move may take as many other paths again.
+    bench.cycle(2, done=3, current=4, blocked=1)
+    assert (bench.status.error, bench.status.replan > 0) == (Error.NONE, True)
 
 
 def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_is_there() -> None:
@@ -222,15 +219,6 @@ def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_i
     assert (bench.status.state, bench.status.error) == (State.ERROR, Error.BLOCKED)
     assert bench.status.reason == f"3 other paths tried, still {why}"
     assert bench.segments() == []
-
-
-def test_next_move_may_take_as_many_other_paths_again() -> None:
-    bench = planned_bench(replans=1)
-    bench.cycle(2, current=1, blocked=1)
-    bench.plan(1, bench.home, replan=bench.status.replan)
-    bench.cycle(2, current=3, blocked=0)
-    bench.cycle(2, done=3, current=4, blocked=1)
-    assert (bench.status.error, bench.status.replan > 0) == (Error.NONE, True)
 
 
 def test_who_keeps_the_level_below_from_its_work_is_passed_on() -> None:
@@ -355,18 +343,6 @@ def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() ->
     bench.plan(2)
     bench.cycle(2)
     assert bench.status.planned == 3
-
-
-def test_path_made_again_with_another_end_withdraws_what_was_planned_from_the_old_one() -> None:
-    bench = planned_bench()
-    assert bench.status.planned == 5
-    again = bench.message("elemental_move.plan")
-    again.move, again.kind, again.count = 4, SegmentKind.PATH, 2
-    again.waypoints[:2] = bench.ends[2], bench.ends[2] + 0.3
-    bench.write("elemental_move.plan", again)
-    bench.cycle(2)
-    assert bench.status.planned == 4
-    assert bench.status.end == pytest.approx(bench.ends[2] + 0.3)
 
 
 def test_answer_for_a_place_that_the_arm_has_left_is_requested_again() -> None:

@@ -47,21 +47,6 @@ def test_analytic_bounds_hold_and_are_tight_on_every_piece() -> None:
         assert np.abs(d2q).max(axis=0) == pytest.approx(path.bounds.second[k], rel=1e-3, abs=1e-9)
 
 
-def test_only_a_corner_without_blend_is_a_stop() -> None:
-    path = BlendedPath(CORNERED, [0.0, 0.0, 0.2, 0.0])
-    assert path.stops == pytest.approx([np.linalg.norm(CORNERED[1])])
-    straight = BlendedPath([[0.0, 0.0], [0.5, 0.5], [2.0, 2.0]], [0.0, 0.0, 0.0])
-    assert straight.stops == []
-
-
-def test_rounded_corner_stays_between_the_corner_and_its_chord() -> None:
-    path = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.4, 0.0])
-    q, _, _ = points(path, np.linspace(0.6, 1.4, 101))
-    assert (q[:, 0] <= 1.0).all()
-    assert (q[:, 1] >= 0.0).all()
-    assert (q[:, 0] - q[:, 1] >= 0.6 - 1e-12).all()
-
-
 def test_blends_that_touch_leave_no_line_between_them() -> None:
     path = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [2.0, 1.0]], [0.0, 0.5, 0.5, 0.0])
     assert path.breaks == pytest.approx([0.0, 0.5, 1.5, 2.5, 3.0])
@@ -83,6 +68,11 @@ def test_single_waypoint_is_a_path_of_length_zero() -> None:
 
 
 def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
+    # Only a corner without a blend is a stop.
+    path = BlendedPath(CORNERED, [0.0, 0.0, 0.2, 0.0])
+    assert path.stops == pytest.approx([np.linalg.norm(CORNERED[1])])
+    straight = BlendedPath([[0.0, 0.0], [0.5, 0.5], [2.0, 2.0]], [0.0, 0.0, 0.0])
+    assert straight.stops == []
     path = BlendedPath(
         [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.3, 0.2, 0.4, 0.0]
     )
@@ -91,12 +81,6 @@ def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
     nowhere = BlendedPath([[1.0, 2.0]] * 3, [0.0, 0.5, 0.0])
     assert nowhere.length == 0.0
     assert nowhere.evaluate(0.0).q == pytest.approx([1.0, 2.0])
-
-
-def test_samples_are_no_further_apart_than_asked() -> None:
-    sampled = BlendedPath(CORNERED, BLEND).sample(0.05)
-    assert np.linalg.norm(np.diff(sampled, axis=0), axis=1).max() <= 0.05 + 1e-12
-    assert sampled[[0, -1]] == pytest.approx(CORNERED[[0, -1]])
 
 
 @pytest.mark.parametrize(

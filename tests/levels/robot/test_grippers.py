@@ -70,11 +70,6 @@ def test_a_follower_that_cannot_follow_is_refused(tmp_path: Path, joint: str, wo
         built(grippers.independent(tmp_path, follow=[{"joint": joint}]))
 
 
-def test_a_gripper_whose_open_and_closed_are_equal_is_refused() -> None:
-    with pytest.raises(ValidationError, match=r"both 0\.1: the gripper does not move"):
-        GripperConfig(actuator="grip", joint="elbow", open=0.1, closed=0.1, force=1.0)
-
-
 def test_soft_couplings_are_posed_where_the_simulation_settles(tmp_path: Path) -> None:
     made, data = closing(grippers.soft(tmp_path), 1.0)
     assert made.gripper is not None
@@ -88,11 +83,10 @@ def test_soft_couplings_are_posed_where_the_simulation_settles(tmp_path: Path) -
 def test_fingers_that_settle_elsewhere_than_they_are_posed_are_refused(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match=r"a finger settles .* mm from .*residual permits 0\.0 mm"):
         built(grippers.soft(tmp_path, residual=1e-9))
-
-
-def test_a_force_too_small_for_the_springs_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match=r"robot\.gripper\.force: 1e-06 does not bring"):
         built(grippers.soft(tmp_path, force=1e-6, stiffness=20.0, damping=0.1))
+    with pytest.raises(ValidationError, match=r"both 0\.1: the gripper does not move"):
+        GripperConfig(actuator="grip", joint="elbow", open=0.1, closed=0.1, force=1.0)
 
 
 def test_links_that_overlap_do_not_hold_the_gripper(tmp_path: Path) -> None:
@@ -111,16 +105,12 @@ def test_a_light_drive_gets_the_inertia_that_its_loop_needs(tmp_path: Path) -> N
     assert made.gripper is not None
     assert made.model.dof_armature[made.gripper.dof] > 0.0
     assert abs(data.qvel[made.gripper.dof]) < 0.01
-
-
-def test_nothing_is_added_to_the_gripper_of_the_puma() -> None:
-    made = cell("puma560")
-    assert made.gripper is not None
-    assert made.model.dof_armature[made.gripper.dof] == 0.1
-    table = config("puma560")[0].gripper
+    # Nothing is added to that of the PUMA.
+    puma, table = cell("puma560"), config("puma560")[0].gripper
+    assert puma.gripper is not None
+    assert puma.model.dof_armature[puma.gripper.dof] == 0.1
     assert table is not None
-    assert table.gains == (2000.0, 60.0)
-    assert table.still == 0.002
+    assert (table.gains, table.still) == ((2000.0, 60.0), 0.002)
 
 
 @pytest.mark.parametrize("apart", [2e-5, 2e-4])

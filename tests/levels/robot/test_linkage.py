@@ -11,7 +11,7 @@ import pytest
 
 from rack.levels.errors import RobotError
 from rack.levels.robot.cell import Cell, build_cell
-from tests.levels.arms import CLOCK_NS, cell, four_bar
+from tests.levels.arms import CLOCK_NS, four_bar
 
 
 def built(folder: Path, old: str = "", new: str = "") -> Cell:
@@ -41,15 +41,6 @@ def away(made: Cell, data: mujoco.MjData) -> float:
     posed = np.array(data.qpos)
     made.gripper.linkage.set(posed, float(data.qpos[made.gripper.linkage.driven]))
     return float(np.max(np.abs(posed - data.qpos)[made.gripper.linkage.joints]))
-
-
-def test_geared_finger_follows_over_the_whole_range() -> None:
-    made = cell("puma560")
-    assert made.gripper is not None
-    for opening in (0.0, 0.0123, 0.04):
-        qpos = np.array(made.model.qpos0)
-        made.gripper.linkage.set(qpos, opening)
-        assert qpos[made.model.joint("finger_right").qposadr[0]] == pytest.approx(opening, abs=1e-9)
 
 
 def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> None:
