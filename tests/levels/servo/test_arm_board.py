@@ -51,14 +51,6 @@ def test_six_boards_move_the_arm_as_one_does() -> None:
     assert np.ptp(apart.positions, axis=0).min() > 0.1
 
 
-@pytest.mark.slow
-def test_boards_slower_than_the_arm_drive_it_too() -> None:
-    rig = JointRig(APART, every=2)
-    rig.run(900)
-    assert np.abs(rig.errors()).max() < 3 * NEAR_RAD
-    assert sum(rig.braked) < 10
-
-
 def test_arm_is_braked_until_every_board_sends_torques_and_then_stays_where_it_is() -> None:
     rig = JointRig(APART)
     rig.rack.tasks["swing"].due = -1
@@ -72,8 +64,14 @@ def test_arm_is_braked_until_every_board_sends_torques_and_then_stays_where_it_i
 
 
 @pytest.mark.slow
-def test_lost_board_brakes_all_joints_at_once_and_motion_goes_on_when_it_is_back() -> None:
+def test_silent_or_lost_board_brakes_all_joints_and_motion_goes_on_when_it_is_back() -> None:
     rig = swinging()
+    rig.rack.disturb("servo_j2.command", mute, ticks=100)
+    rig.run(3)
+    assert not any(rig.braked[-3:])
+    rig.run(1)
+    assert rig.braked[-1]
+    rig.run(200)
     rig.rack.lose("servo_j3", ticks=300)
     rig.run(1)
     assert rig.braked[-1]
@@ -82,18 +80,6 @@ def test_lost_board_brakes_all_joints_at_once_and_motion_goes_on_when_it_is_back
     assert all(rig.braked[-298:])
     rig.run(10)
     assert not rig.braked[-1]
-    assert_goes_on(rig)
-
-
-@pytest.mark.slow
-def test_silent_board_brakes_the_arm_after_two_of_its_cycles() -> None:
-    rig = swinging()
-    rig.rack.disturb("servo_j2.command", mute, ticks=100)
-    rig.run(3)
-    assert not any(rig.braked[-3:])
-    rig.run(1)
-    assert rig.braked[-1]
-    rig.run(100)
     assert_goes_on(rig)
 
 
@@ -178,15 +164,9 @@ def test_stop_brings_the_arm_to_rest_by_torques_before_it_is_braked() -> None:
     assert all(rig.braked[WARM_UP + ramp :])
     rig.run(20)
     assert_goes_on(rig)
-
-
-def test_demand_to_brake_is_obeyed_at_once() -> None:
-    rig = swinging()
     rig.rack.stop(Demand.BRAKE, ticks=50)
     rig.run(1)
     assert rig.braked[-1]
-    rig.run(60)
-    assert_goes_on(rig)
 
 
 class Restless(JointServo):

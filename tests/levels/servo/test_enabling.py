@@ -218,36 +218,6 @@ def test_an_arm_is_braked_at_once_when_its_operator_disables_it_however_long_its
         assert servo.servo.arm.state is DriveState.DISABLED
 
 
-def test_a_reset_without_a_fault_leaves_the_arm_enabled(tmp_path: Path) -> None:
-    servo = rig(tmp_path)
-    operator = Operator(servo.rack)
-    for what in (Operation.ENABLE, Operation.RESET, Operation.ENABLE):
-        operator.say("servo", what)
-        servo.run(20)
-        assert (servo.status.answer, servo.status.braked) == (Answer.DONE, 0)
-
-
-def test_an_operators_way_back_ends_where_the_arm_was_enabled_again(tmp_path: Path) -> None:
-    servo = rig(tmp_path, "IdealArm", enable="at-start")
-    operator = Operator(servo.rack)
-    operator.say("servo", Operation.SETPOINT, joints=(0.4, 0.2))
-    servo.run(300)
-    operator.say("servo", Operation.HOLD)
-    servo.run(20)
-    operator.say("servo", Operation.DISABLE)
-    servo.run(20)
-    arm = servo.servo.arm
-    assert isinstance(arm, IdealArm)
-    arm._q += 0.3  # by hand
-    operator.say("servo", Operation.ENABLE)
-    servo.run(20)
-    before = servo.status.position.copy()
-    operator.say("servo", Operation.RESUME)
-    servo.run(300)
-    assert servo.status.answer == Answer.DONE
-    assert np.abs(servo.status.position - before).max() < 1e-3
-
-
 @pytest.mark.parametrize("latency_ticks", [0, 2])
 def test_offsets_make_positions_of_what_the_drives_give(tmp_path: Path, latency_ticks: int) -> None:
     calibration = {"offset": (0.1, -0.2)}
@@ -309,22 +279,6 @@ def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
     assert rack.run_to_end(30.0).state == State.DONE
     status = rack.read("servo.status")
     assert (status.touches, status.violations) == (0, 0)
-
-
-@pytest.mark.thorough
-def test_an_arm_moved_by_hand_in_the_middle_of_a_path_goes_on_to_its_end() -> None:
-    rack, operator, arm = whole()
-    rack.run(20.0, lambda rack: rack.read("primitive.status").progress > 0.5)
-    operator.say("servo", Operation.DISABLE)
-    rack.run(5.0)
-    assert rack.task.state == State.HOLDING
-    arm._data.qpos[arm.cell.qpos[0]] += 0.3
-    arm._refresh()
-    arm._brake.hold_at(arm._state[0])
-    rack.run(0.1)
-    operator.say("servo", Operation.ENABLE)
-    assert rack.run_to_end(30.0).state == State.DONE
-    assert rack.read("servo.status").touches == 0
 
 
 @pytest.mark.slow

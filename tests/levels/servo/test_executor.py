@@ -9,7 +9,6 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.errors import LevelError
 from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
@@ -58,10 +57,8 @@ def test_the_planned_inertia_follows_the_arm_and_a_higher_bandwidth_follows_more
     assert worst[1] < 0.6 * worst[0]
     at_goal = Dynamics(cell("puma560")).terms(move.goal, np.zeros(6)).inertia
     assert rig.rack.read("servo.plan").inertia == pytest.approx(at_goal, abs=1e-9)
-
-
-def test_without_a_planner_the_executor_uses_the_inertia_where_the_arm_is() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
+    # Without a planner it uses the inertia where the arm is.
+    rig = rig_of("puma560")
     rig.stop_planner()
     rig.run(850, move.at)
     assert not rig.rack.read("servo.plan").inertia.any()
@@ -80,20 +77,6 @@ def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_l
     assert (np.abs(steps_of(rig.targets[400:])) <= limits * 1.01).all()
     assert np.abs(rig.status.position - rig.status.target).max() < 1e-3
     assert rig.status.clipped == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("late", [1, 10 * PERIOD])
-def test_a_late_set_point_costs_no_jump(late: int) -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.run(400, move.at)
-    rig.run(late)
-    skipped = -rig.rack.tick % PERIOD
-    rig.run(skipped)
-    rig.run(500, move.at)
-    limits = np.array(config("puma560")[0].acceleration)
-    assert (np.abs(steps_of(rig.targets)) <= 2.2 * limits).all()
-    assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
 
 
 @pytest.mark.slow
@@ -122,33 +105,18 @@ def test_a_restarted_servo_finds_the_arm_where_it_was() -> None:
     assert rig.state.tick == rig.rack.tick - 1
 
 
-def test_a_restart_in_a_long_silence_finds_the_arm_braked() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.run(400, move.at)
-    rig.miss(10_000)
-    for _ in range(400):
-        rig.rack.step()
-    rig.rack.restart("servo")
-    rig.rack.step()
-    assert np.abs(rig.status.velocity).max() < 0.01
-    rig.run(100)
-    assert rig.status.holding == 1
-    assert np.abs(rig.status.position - rig.status.target).max() < 1e-3
-
-
 def garbage(kind: str, home: Array) -> tuple[Array, Array]:
     still = np.zeros_like(home)
     return {
         "nan": (home * np.nan, still),
         "nan velocity": (home, still * np.nan),
-        "infinite": (home + np.inf, still),
         "far": (home + 100.0, still),
         "fast": (home, still + 1e6),
         "jump": (home + 0.4, still),
     }[kind]
 
 
-@pytest.mark.parametrize("kind", ["nan", "nan velocity", "infinite", "far", "fast", "jump"])
+@pytest.mark.parametrize("kind", ["nan", "nan velocity", "far", "fast", "jump"])
 def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> None:
     (robot, _), rig = config("puma560"), rig_of("puma560")
     wrong = garbage(kind, np.array(robot.home))
@@ -158,16 +126,11 @@ def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> Non
         assert np.isfinite(rig.status.position).all()
     assert rig.status.error in (Error.NONE, Error.TOUCHED)  # "far" leads into the table
     assert kind == "jump" or rig.status.clipped > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["nan", "fast"])
-def test_after_broken_set_points_good_ones_are_followed_again(kind: str) -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    wrong = garbage(kind, move.start)
-    rig.run(10 * PERIOD, lambda _: wrong)
-    rig.run(1600, lambda _: (move.goal, np.zeros(6)))
-    assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
+    if kind in ("nan", "fast"):
+        # Good ones are followed again.
+        goal = course("puma560").goal
+        rig.run(1600, lambda _: (goal, np.zeros(6)))
+        assert rig.status.position == pytest.approx(goal, abs=1e-3)
 
 
 def test_a_set_point_due_in_the_far_future_is_refused() -> None:
@@ -190,11 +153,6 @@ def test_a_scene_is_filled_in_the_cycle_before_those_of_its_readers() -> None:
             filled.append(rig.rack.tick)  # the tick at which it is visible
     assert len(filled) == 4
     assert all(tick % PERIOD == 0 for tick in filled)
-
-
-def test_an_unknown_parameter_is_refused_with_the_valid_ones() -> None:
-    with pytest.raises(LevelError, match=r"params.bandwith = 3: .*; keys: bandwidth, damping"):
-        rig_of("puma560", bandwith=3)
 
 
 @pytest.mark.slow
@@ -262,11 +220,7 @@ def test_the_held_object_is_in_the_plan_and_does_not_pull_the_arm_down(grasping:
     load = Dynamics(cell("puma560"))
     bare = load.terms(home, np.zeros(6)).bias.copy()
     assert grasping.status.torque[1] - bare[1] == pytest.approx(1.5 * 9.81 * 0.5, rel=0.05)
-
-
-def test_a_restart_does_not_drop_the_held_object(grasping: ServoRig) -> None:
-    home = np.array(config("puma560")[0].home)
-    grasping.run(100, lambda _: (home, np.zeros(6)))
+    # A restart does not drop it.
     grasping.miss(10_000)
     for _ in range(100):
         grasping.rack.step()
@@ -275,18 +229,3 @@ def test_a_restart_does_not_drop_the_held_object(grasping: ServoRig) -> None:
     scene = grasping.rack.read("servo.scene")
     assert scene.position[0] == pytest.approx(scene.tool_position, abs=0.01)
     assert grasping.status.touches == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("early", [3, PERIOD - 1])
-def test_set_points_that_come_early_wait_for_their_turn(early: int) -> None:
-    move, targets = course("puma560"), []
-    for ahead in (0, early):
-        rig = rig_of("puma560")
-        for _ in range(700):
-            if (rig.rack.tick + ahead) % PERIOD == 0:
-                due = rig.rack.tick + ahead + PERIOD
-                rig.set_point(*move.at(due * TICK_S - 0.1), due)
-            rig.run(1)
-        targets.append(np.array(rig.targets))
-    assert np.abs(targets[0] - targets[1]).max() < 1e-12

@@ -42,16 +42,7 @@ def run(rack: WholeRack, most_s: float, seed: int | None = None) -> list[tuple[i
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "k1607",
-        *(
-            pytest.param(name, marks=pytest.mark.thorough)
-            for name in ("nasrem", "nasrem-1khz", "crossing")
-        ),
-    ],
-)
+@pytest.mark.parametrize("name", ["k1607", pytest.param("crossing", marks=pytest.mark.thorough)])
 def test_a_whole_task_finds_nothing_and_breaks_no_limit(name: str) -> None:
     rack = WholeRack(name, motion=load(name).scene.motion)
     assert run(rack, 60.0) == []
@@ -60,10 +51,7 @@ def test_a_whole_task_finds_nothing_and_breaks_no_limit(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "seed"), [("nasrem", 1), pytest.param("k1607", 2, marks=pytest.mark.thorough)]
-)
-def test_missed_cycles_and_restarted_boards_are_not_faults_of_the_arm(name: str, seed: int) -> None:
-    rack = WholeRack(name, motion=load(name).scene.motion)
-    assert run(rack, 15.0, seed) == []
+def test_missed_cycles_and_restarted_boards_are_not_faults_of_the_arm() -> None:
+    rack = WholeRack("nasrem", motion=load("nasrem").scene.motion)
+    assert run(rack, 15.0, seed=1) == []
     assert rack.read("servo.status").violations == 0

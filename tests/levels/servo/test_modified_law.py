@@ -210,19 +210,19 @@ def test_one_put_in_again_starts_anew_and_each_acts_once_a_sample() -> None:
 
 
 def test_one_in_place_of_the_law_replaces_another() -> None:
-    bench = Bench(nine="Nine", pd={"class": COMMON + "JointPd"})
+    bench = Bench(nine="Nine", pd={"class": COMMON + "JointPd"}, huge="Huge")
     bench.switch("nine", True)
     bench.run(60)
     bench.switch("pd", True)
     assert bench.law.reason == "modified by pd"
     assert bench.run(60)[-1] == LOAD[2]
-
-
-def test_limits_stay_in_force() -> None:
-    bench = Bench(huge="Huge")
-    bench.run(1)
+    assert bench.switch("third", True) == "no modification 'third'; permitted: nine, pd, huge"
+    # The limits stay in force.
     bench.switch("huge", True)
     assert np.max(bench.run(100)) == LIMITS[2]
+    tables = {name: {"class": HERE + "Nine", "on": True} for name in ("one", "two")}
+    with pytest.raises(ValueError, match="one, two are on in place of the law; permitted: one"):
+        ModifiableParams.model_validate({"modifications": tables})
 
 
 def test_after_braking_the_torque_is_at_once_the_laws() -> None:
@@ -263,13 +263,6 @@ def test_one_whose_result_is_not_finite_is_taken_out_and_the_law_goes_on(name: s
     assert len(bench.findings) == 2
 
 
-def test_an_unknown_name_is_refused() -> None:
-    assert (
-        Bench(half="Half", nine="Nine").switch("third", True)
-        == "no modification 'third'; permitted: half, nine"
-    )
-
-
 def law_of(**params: Any) -> LawContext:
     return LawContext([f"j{k}" for k in range(JOINTS)], 0.001, LIMITS, params)
 
@@ -307,23 +300,19 @@ def test_a_notch_removes_its_frequency_and_passes_others(
     frequency: float, least: float, most: float
 ) -> None:
     notch, sample, passed = Notch(law_of(frequency=60.0)), sample_of(torque=5.0), []
+    with pytest.raises(
+        LevelError, match="frequency = 500 Hz: permitted: below half the law's rate, 500 Hz"
+    ):
+        Notch(law_of(frequency=500.0))
+    # It begins without a transient.
     notch.begin(sample)
+    notch.modify(sample)
+    assert sample.torque == pytest.approx(5.0)
     for tick in range(1000):
         sample.torque = 5.0 + np.sin(2.0 * np.pi * frequency * 0.001 * tick)
         notch.modify(sample)
         passed.append(sample.torque[0])
     assert least <= np.abs(np.array(passed[500:]) - 5.0).max() <= most
-
-
-def test_a_notch_begins_without_a_transient_and_lies_below_half_the_rate() -> None:
-    notch, sample = Notch(law_of(frequency=60.0)), sample_of(torque=5.0)
-    notch.begin(sample)
-    notch.modify(sample)
-    assert sample.torque == pytest.approx(5.0)
-    with pytest.raises(
-        LevelError, match="frequency = 500 Hz: permitted: below half the law's rate, 500 Hz"
-    ):
-        Notch(law_of(frequency=500.0))
 
 
 def test_a_modification_that_assigns_a_vector_fills_it() -> None:
@@ -382,9 +371,3 @@ def test_a_table_of_a_modification_is_checked_with_its_class(
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(expected)):
         ModifiableParams.model_validate({"modifications": {"it": table}})
-
-
-def test_two_in_place_of_the_law_cannot_both_be_on_at_the_start() -> None:
-    tables = {name: {"class": HERE + "Nine", "on": True} for name in ("one", "two")}
-    with pytest.raises(ValueError, match="one, two are on in place of the law; permitted: one"):
-        ModifiableParams.model_validate({"modifications": tables})

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.operator import Answer, Operation
-from rack.levels.servo.modification import Hook, LawSample, Modification
 from tests.levels.arms import cell, config
 from tests.levels.lockstep import Operator
 from tests.levels.servo.rig import Course, ServoRig
@@ -19,14 +17,6 @@ from tests.levels.servo.rig import Course, ServoRig
 HOME = cell("puma560").home
 COURSE = Course(HOME, HOME + 0.5 * np.array([1.0, -0.4, 0.4, 0.5, 0.5, 1.0]), 2.0)
 PD = {"class": "rack.levels.servo.common_modifications:JointPd"}
-BREAKS = {"class": f"{__name__}:Breaks"}
-
-
-class Breaks(Modification):
-    hook = Hook.AFTER
-
-    def modify(self, sample: LawSample) -> None:
-        sample.torque[0] = np.inf
 
 
 def rig_of(**modifications: dict[str, Any]) -> ServoRig:
@@ -53,21 +43,6 @@ def test_a_law_is_replaced_under_motion_without_a_step_and_the_arm_follows_its_c
     assert again[0] == pytest.approx(replaced[-1], abs=1e-12)
     assert rig.status.position == pytest.approx(COURSE.goal, abs=1e-3)
     assert (rig.status.reason, rig.found) == ("", [])
-
-
-def test_modifications_that_are_not_put_in_change_no_torque() -> None:
-    assert (rig_of(pd=PD).torques(200, COURSE.at) == rig_of().torques(200, COURSE.at)).all()
-
-
-@pytest.mark.slow
-def test_one_that_fails_leaves_the_law_to_itself() -> None:
-    rig = rig_of(breaks=BREAKS)
-    rig.torques(200, COURSE.at)
-    Operator(rig.rack).modify("servo", "breaks", True)
-    rest = rig.torques(200, COURSE.at)
-    assert rig.alarms() == [Alarm.MODIFICATION]
-    assert rig.status.reason == "modification 'breaks' taken out: its result is not finite"
-    assert rest == pytest.approx(rig_of().torques(400, COURSE.at)[200:], abs=0.05)
 
 
 def test_a_restarted_board_puts_its_modifications_in_again() -> None:

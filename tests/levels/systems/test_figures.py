@@ -49,9 +49,7 @@ def test_an_executor_computes_for_its_time_in_every_cycle() -> None:
     times = [computing_ns(executor, tick) for tick in (0, 4, 8)]
     assert all(time >= 3 * MS for time in times)
     assert min(times) < 4 * MS
-
-
-def test_several_times_are_taken_in_turn_cycle_by_cycle() -> None:
+    # Several times are taken by turns.
     executor = FigureExecutor(context(process_ms=[6.0, 1.0]))
     # A cycle that is skipped takes its turn with it.
     assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [

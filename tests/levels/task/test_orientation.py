@@ -158,14 +158,7 @@ def moved(
     return rehearse(program, scene, rehearsal(robot, scene))
 
 
-@pytest.mark.slow
-def test_a_block_is_taken_otherwise_where_its_goal_cannot_be_reached_so() -> None:
-    done = moved((0.793, -0.149, 0.475))
-    assert np.degrees(leaning_of(done)) > 9.0
-    assert done.situation.object_pose(0).position[:2] == pytest.approx((0.793, -0.149), abs=1e-6)
-
-
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
     with pytest.raises(
         Refused,

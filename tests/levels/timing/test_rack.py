@@ -68,14 +68,6 @@ def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
     assert all(verdict.holds for verdict in verdicts(longer))
 
 
-def test_a_planner_has_the_ceiling_of_its_executor_only_in_a_critical_section() -> None:
-    planners = [
-        rack(replace(FIGURE_3, is_critical=critical)).tasks[1] for critical in (True, False)
-    ]
-    found = [(planner.ceiling, planner.parts[-1].preemptible) for planner in planners]
-    assert found == [(80, False), (0, True)]
-
-
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
     timing = rack(
         board("top", 40, below="a"), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7)
@@ -150,22 +142,10 @@ def test_chains_of_equal_cycles_are_one_only_if_they_are_every_combination() -> 
     assert set(crossed.changed("c", every=80).longest_cycles.values()) == {80}
 
 
-def test_a_response_through_a_queue_is_said_to_be_that_of_an_empty_one() -> None:
-    notes = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
-    assert notes[0] == "the system's response is that of empty queues: plan.requests"
-    assert not any("queue" in note for note in Forecast.of(arm_of(*JOINTS)).notes)
-
-
 def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
     found = rack(*boards, board("alone", 7), goal_ns=60 * 2.0 * MS).longest_cycles
     assert found == {"top": 20, "middle": 20, "low": 20, "alone": 7}
-
-
-def test_boards_without_a_budget_are_named_and_not_judged() -> None:
-    forecast = Forecast.of(rack(board("top", 40, below="a"), board("a", 4, "top")))
-    assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
-    assert {"top", "a"} <= forecast.uncounted.keys()
 
 
 def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
@@ -178,6 +158,10 @@ def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
     assert found.keys() - {CLOCK.name} == {"silent.planner", "unknown", "unknown.planner"}
     assert {why for name, why in found.items() if name != CLOCK.name} == {NO_BUDGET}
     assert not Forecast.of(rack(FIGURE_3, plain)).uncounted.keys() - {CLOCK.name}
+    # Without any budget only the system is judged.
+    forecast = Forecast.of(rack(board("top", 40, below="a"), board("a", 4, "top")))
+    assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
+    assert {"top", "a"} <= forecast.uncounted.keys()
 
 
 def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
@@ -193,6 +177,10 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
+    queued = rack(board("queued", 4)).changed("queued", queues=("plan.requests",))
+    assert Forecast.of(queued).notes[0] == (
+        "the system's response is that of empty queues: plan.requests"
+    )
     # Without a budget there is nothing to say about times.
     bare = Forecast.of(
         replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False

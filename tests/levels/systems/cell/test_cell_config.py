@@ -119,14 +119,3 @@ def test_each_mistake_in_a_coordinators_config_is_one_line(
 ) -> None:
     (found,) = mistakes(tmp_path, (old, new)).splitlines()
     assert line in found
-
-
-def test_arm_needs_the_rack_that_orders_it_about() -> None:
-    settings = (
-        "board.task.executor=rack.levels.systems.cell:OrderedTaskExecutor",
-        "board.task.planner=rack.levels.systems.cell:OrderedTaskPlanner",
-        "board.task.params.coordinator=cell",
-    )
-    with pytest.raises(ConfigError) as caught:
-        resolve(load("nasrem", settings))
-    assert all(mailbox in str(caught.value) for mailbox in ("lan.orders", "lan.peer_cell"))

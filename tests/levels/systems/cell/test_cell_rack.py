@@ -9,7 +9,6 @@ import pytest
 from rack.backplane.message import State
 from rack.levels.messages import Error
 from rack.levels.operator import Operation
-from rack.levels.systems.cell.messages import Phase, Response
 from tests.levels.lockstep import Lockstep, Operator
 from tests.levels.systems.cell.rack import CellRack
 
@@ -83,16 +82,6 @@ def assert_rests(rack: CellRack) -> None:
     assert 0.0 < rack.read("elemental_move.status").progress < 1.0
 
 
-def test_coordinator_that_remembers_nothing_goes_on_with_the_step_under_way() -> None:
-    rack = CellRack([SLOWLY], [HOME])
-    assert rack.run(8.0, is_moving)
-    rack.forget("cell")
-    rack.run(1.0)
-    assert (rack.read("cell.progress").phase, rack.report.response) == (Phase.DOING, Response.DOING)
-    assert rack.run(20.0, is_over)
-    assert (rack.cell.state, rack.task.action, rack.report.echo) == (State.DONE, 2, 3000)
-
-
 @pytest.mark.parametrize(
     ("action", "error", "words"),
     [
@@ -102,11 +91,6 @@ def test_coordinator_that_remembers_nothing_goes_on_with_the_step_under_way() ->
             "goto [1.5, 0.0, 0.6]: out of reach: [1.5",
         ),
         ({**HOME, "by": 0.2}, Error.TOO_LATE, "home, by 0.45 s: it is 0.50 s already"),
-        (
-            {**TRANSFER, "object": "cup"},
-            Error.UNREACHABLE,
-            "object = 'cup': not in the scene; objects: block1, b",
-        ),
     ],
 )
 def test_order_that_cannot_be_done_ends_both_runs_with_the_reason(

@@ -197,15 +197,6 @@ def test_of_two_arms_that_take_the_part_at_once_the_name_decides(pair: Pair) -> 
     assert pair.alpha.claim == pair.beta.claim == Claim(1, b"beta")
 
 
-def test_a_copy_stays_in_the_air_when_the_other_rack_is_lost(pair: Pair) -> None:
-    pair.lift(pair.alpha)
-    pair.apart = True
-    before = pair.beta.part
-    pair.run(0.5)
-    np.testing.assert_array_equal(pair.beta.part, before)
-    assert pair.beta.claim == Claim(1, b"alpha")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"]
@@ -217,6 +208,8 @@ def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
     hoist = restarted(pair)
     before = hoist.part
     pair.apart = hoist is pair.beta  # without the other's word it has to remember by itself
+    pair.run(0.1)
+    np.testing.assert_allclose(hoist.part, before, atol=1e-3 if hoist is pair.alpha else 1e-12)
     hoist.rack.lose("servo", 12)
     pair.run(0.3)
     assert hoist.claim == Claim(1, b"alpha")
@@ -239,18 +232,6 @@ def test_a_rack_launched_anew_gets_its_part_back_where_the_other_saw_it(pair: Pa
     pair.run(0.2)
     assert pair.alpha.claim == pair.beta.claim == Claim(1, b"alpha")
     np.testing.assert_allclose(pair.alpha.part, moved, atol=1e-4)
-
-
-@pytest.mark.thorough
-@pytest.mark.slow
-def test_two_runs_say_the_same_bit_for_bit(tmp_path: Path) -> None:
-    runs = [Pair(tmp_path), Pair(tmp_path)]
-    for pair in runs:
-        pair.lift(pair.alpha)
-        pair.put_down(pair.alpha)
-        pair.lift(pair.beta)
-    one, other = ((bytes(pair.alpha.said.raw), bytes(pair.beta.said.raw)) for pair in runs)
-    assert one == other
 
 
 def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
@@ -292,17 +273,3 @@ def test_an_arm_that_still_touches_a_body_does_not_claim_it_back() -> None:
     body.touch(False)
     body.touch(True)
     assert body.claim == Claim(3, b"alpha")
-
-
-def test_a_claim_after_the_greatest_number_is_that_number_again() -> None:
-    message, body = Message(SHARED_BODIES.dtype({})), SharedBody(b"part", b"one")
-    greatest = (1 << 32) - 1
-    message.bodies[0]["name"], message.bodies[0]["owner"], message.bodies[0]["claim"] = (
-        b"part",
-        b"two",
-        greatest,
-    )
-    body.hear(message)
-    body.touch(True)
-    body.show(message.bodies[0], np.zeros(7))
-    assert (message.bodies[0]["claim"], message.bodies[0]["owner"]) == (greatest, b"one")

@@ -9,7 +9,7 @@ from rack.backplane.message import State
 from rack.levels.messages import Error
 from rack.levels.systems.force.messages import Mode
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
-from tests.levels.systems.force.server_rig import DOWN, EDGE, HEIGHT, PERIOD_S, ServerRig
+from tests.levels.systems.force.server_rig import EDGE, HEIGHT, PERIOD_S, ServerRig
 
 X, Y = 0.499, -0.15
 
@@ -25,20 +25,6 @@ def pressing(**params: float) -> ServerRig:
     return rig
 
 
-def test_a_guard_ends_its_segment_where_the_arm_is_and_ends_with_it() -> None:
-    rig = ServerRig()
-    rig.guard(4.0)
-    down = rig.line((X, Y, HEIGHT - 0.02), 1.5)
-    rig.run(3.0)
-    assert rig.ends()[down] == RequestEnd.GUARDED
-    assert (rig.status.guarded, rig.status.axis) == (down, 2)
-    assert 4.0 < max(rig.pressed) < 8.0
-    up = rig.line((X, Y, HEIGHT + 0.03), 1.0)
-    rig.run(2.5)
-    assert rig.ends()[up] == RequestEnd.DONE
-    assert np.allclose(rig.places[-1], (X, Y, HEIGHT + 0.03), atol=1e-4)
-
-
 def test_compliance_is_done_when_the_force_is_as_wanted_and_keeps_it_over_an_edge() -> None:
     rig = pressing()
     assert rig.mode is Mode.FORCE
@@ -49,19 +35,14 @@ def test_compliance_is_done_when_the_force_is_as_wanted_and_keeps_it_over_an_edg
     assert abs(rig.places[-1][1] - EDGE - 0.05) < 1e-3
     assert rig.places[-1][2] < HEIGHT - 0.012
     assert abs(rig.pressed[-1] - 15.0) < 0.5
-
-
-def test_motion_after_compliance_begins_where_the_arm_is_without_a_step() -> None:
-    rig = pressing()
-    rig.line((X, EDGE + 0.05, HEIGHT), 1.0)
+    # Motion after it begins where the arm is, without a step.
     rig.free()
     up = rig.line((X, EDGE + 0.05, HEIGHT + 0.05), 1.0)
-    rig.run(5.0)
+    rig.run(3.0)
     assert rig.ends()[up] == RequestEnd.DONE
     assert rig.mode is Mode.MOTION
     assert np.allclose(rig.places[-1], (X, EDGE + 0.05, HEIGHT + 0.05), atol=1e-4)
-    steps = np.abs(np.diff(rig.places, axis=0)).max()
-    assert steps < 0.15 * PERIOD_S
+    assert np.abs(np.diff(rig.places, axis=0)).max() < 0.15 * PERIOD_S
 
 
 def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_released() -> None:
@@ -78,7 +59,11 @@ def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_release
     assert rig.status.reason == (
         "no sign of life from the client for 0.5 s: forces are held for 1 s; cancel, then go on"
     )
-    rig.run(2.5)
+    # A restarted server goes on with that.
+    rig.restart()
+    rig.run(0.3)
+    assert rig.mode is Mode.HELD
+    rig.run(3.5)
     assert rig.mode is Mode.RELEASED
     assert rig.pressed[-1] < 2.0
     assert "the position is held" in rig.status.reason
@@ -93,19 +78,6 @@ def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_release
     rig.run(3.0)
     assert rig.ends()[up] == RequestEnd.DONE
     assert (rig.mode, rig.status.reason) == (Mode.MOTION, "")
-
-
-def test_a_client_that_is_back_in_time_goes_on_with_the_force_as_it_is() -> None:
-    rig = pressing(silence=0.5, hold=3.0)
-    rig.alive = False
-    rig.run(1.0)
-    assert rig.mode is Mode.HELD
-    rig.alive = True
-    rig.request(MotionKind.CANCEL)
-    along = rig.line((X, -0.12, HEIGHT), 1.0)
-    rig.run(2.0)
-    assert (rig.mode, rig.ends()[along]) == (Mode.FORCE, RequestEnd.DONE)
-    assert abs(rig.pressed[-1] - 15.0) < 1.0
 
 
 def test_a_silent_client_that_wants_nothing_is_not_missed() -> None:
@@ -179,26 +151,3 @@ def test_a_restarted_server_goes_on_with_the_same_contact() -> None:
     assert (rig.write.compliance.id, rig.mode) == (before, Mode.FORCE)
     assert abs(rig.pressed[-1] - 15.0) < 1.0
     assert rig.places[-1][1] == pytest.approx(EDGE + 0.05, abs=1e-3)
-
-
-def test_a_restarted_server_outlives_a_client_that_was_lost_before() -> None:
-    rig = pressing(silence=0.5, hold=1.0)
-    rig.alive = False
-    rig.run(1.0)
-    rig.restart()
-    rig.run(0.3)
-    assert rig.mode is Mode.HELD
-    rig.run(3.5)
-    assert rig.mode is Mode.RELEASED
-    assert rig.pressed[-1] < 2.0
-
-
-def test_a_joint_motion_is_a_request_of_a_server_too() -> None:
-    rig = ServerRig()
-    rig.joints([0.1, 0, 0, 0, 0, 0])
-    rig.line((X, Y, HEIGHT + 0.03))
-    rig.run(3.0)
-    assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE}
-    assert np.allclose(rig.status.quaternion, DOWN, atol=1e-3) or np.allclose(
-        -rig.status.quaternion, DOWN, atol=1e-3
-    )

@@ -13,7 +13,6 @@ from rack.levels.messages import ARM_STATE
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.systems.hand.simulated import SimulatedHand
-from rack.levels.tables import SensorConfig
 from tests.levels.arms import config
 from tests.levels.systems.hand.hand_rig import CLOCK_NS, EVERY
 
@@ -62,16 +61,15 @@ def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_t
     assert risen == pytest.approx(np.maximum(0.0, 1.0 - np.exp(-times / 0.008)), abs=0.08)
     assert risen[0] == 0.0
     assert risen[-1] > 0.88
-
-
-def test_torque_is_the_arm_times_the_difference_of_the_tensions() -> None:
-    hand = hand_of()
-    hand.pull(flexed(hand, INDEX1, 40.0))
-    hand.step(60)
     sample = hand.sense()
     assert sample.torque == pytest.approx(
         hand.hand.arms * (sample.tension[FLEXOR] - sample.tension[EXTENSOR])
     )
+    # The valves close by themselves when no command comes.
+    hand.step(2 * EVERY - 1)
+    assert not hand.braked
+    hand.step(1)
+    assert hand.braked
 
 
 @pytest.mark.slow
@@ -101,15 +99,6 @@ def test_closed_valves_bring_a_moving_finger_to_rest_and_a_stiffer_one_sooner() 
         ways.append(float(hand.sense().position[INDEX1]) - begun)
         assert abs(hand.sense().velocity[INDEX1]) < 0.05
     assert 0.0 < ways[1] < 0.7 * ways[0]
-
-
-def test_valves_close_by_themselves_when_no_command_comes() -> None:
-    hand = hand_of()
-    hand.pull(flexed(hand, INDEX1, 20.0))
-    hand.step(2 * EVERY)
-    assert not hand.braked
-    hand.step(1)
-    assert hand.braked
 
 
 def test_contact_pushes_a_fingertip_away_from_what_it_touches() -> None:
@@ -159,12 +148,3 @@ def test_a_restored_hand_continues_bit_for_bit(closes: bool) -> None:
     run(again, range(60, 90))
     assert saved(again).raw == saved(first).raw
     assert all(np.array_equal(a, b) for a, b in zip(again.sense(), first.sense(), strict=True))
-
-
-def test_encoders_of_a_hand_may_be_coarse() -> None:
-    robot, scene = config("utah_mit")
-    robot = robot.model_copy(update={"sensors": SensorConfig(resolution=0.01)})
-    hand = SimulatedHand(build_cell(robot, scene, CLOCK_NS), scene, CLOCK_NS, EVERY)
-    position = hand.sense().position
-    assert position == pytest.approx(np.round(position / 0.01) * 0.01)
-    assert position == pytest.approx(hand.cell.home, abs=0.0051)

@@ -114,6 +114,10 @@ def test_it_plans_once_and_anew_when_the_object_moves_before_it_is_held() -> Non
 
 
 def test_it_waits_until_it_knows_object_and_coordinator() -> None:
+    with pytest.raises(LevelError, match="object = cup: not in the scene; objects: can"):
+        workstation(object="cup")
+    with pytest.raises(LevelError, match="opposing = little: the hand has no such finger"):
+        workstation(opposing="little")
     crate, host = Crate(), workstation()
     crate.read = lambda port: Reading(crate.messages[port], Verdict.NONE)  # type: ignore[method-assign]
     host.run(crate)  # type: ignore[arg-type]
@@ -124,8 +128,3 @@ def test_a_prompt_reads_the_counts_of_the_boards() -> None:
     crate = Crate()
     names = workstation().names(crate)  # type: ignore[arg-type]
     assert names["boards"]() == {"coordinator": {"cycles": CYCLES, "missed": 0, "skipped": 0}}
-
-
-def test_an_object_that_is_not_in_the_scene_is_refused() -> None:
-    with pytest.raises(LevelError, match="object = cup: not in the scene; objects: can"):
-        workstation(object="cup")

@@ -87,36 +87,18 @@ def test_it_goes_on_with_the_command_that_it_sent_down_last(bench: Bench) -> Non
 
 
 def test_without_a_command_of_its_own_it_starts_where_the_arm_is(bench: Bench) -> None:
-    bench.write("status", **LAST)
     level, command = bench.restarted()
     home = level._cell.home
+    # One that starts for the first time recalls nothing.
+    assert (level.state, level.words, command.id, command.words) == ("idle", [], 0, "")
+    np.testing.assert_array_equal(command.joints, home)
+    bench.write("status", **LAST)
+    level, command = bench.restarted()
     # It knows its own state, and nothing of a command: no joints are taken from a mailbox that is
     # still empty.
     assert (level.state, level._reached) == ("reaching", True)
     assert (command.id, command.words, command.speed, command.object) == (0, "", 1.0, -1)
     np.testing.assert_array_equal(command.joints, home)
-
-
-def test_a_board_that_starts_for_the_first_time_recalls_nothing(bench: Bench) -> None:
-    level, command = bench.restarted()
-    assert (level.state, level.words, command.id, command.words) == ("idle", [], 0, "")
-    np.testing.assert_array_equal(command.joints, level._cell.home)
-
-
-def test_it_recalls_its_last_messages_in_its_first_cycle_only(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench.write("status", **LAST)
-    wiring = next(wiring for wiring in bench.plan.tasks if wiring.task == LEVEL)
-    task = VirtualControlLoop(
-        bench.segment, wiring, find_class(wiring.target, Executor)(wiring.context)
-    )
-    recalled: list[int] = []
-    monkeypatch.setattr(task.executor, "recall", lambda read, write: recalled.append(1))
-    for tick in (50, 62):
-        task.inputs.read(tick)
-        task.process(tick)
-    assert recalled == [1]
 
 
 class Arm:
@@ -237,12 +219,9 @@ def test_a_pose_over_nothing_is_not_reached_and_ends_no_board(arm: Arm, words: s
     arm.level.do_move(pose)
     assert not arm.level._reached
     assert arm.level._command.id == sent
-
-
-def test_a_pose_out_of_reach_sends_nothing(arm: Arm) -> None:
+    # Nor is one out of reach.
     arm.world.position[0] = (9.0, 0.0, 0.0)
     arm.look()
-    name = arm.level.context.scene.objects[0]
-    arm.level._taken = WordCommand(False, 1, f"pick {name}")
-    arm.level.do_move(next(iter(arm.level.table.plan.pose)))
-    assert (arm.level._command.id, arm.look()["reach"]) == (0, "no")
+    arm.level._taken = WordCommand(False, 1, f"pick {arm.level.context.scene.objects[0]}")
+    arm.level.do_move(pose)
+    assert (arm.level._command.id, arm.look()["reach"]) == (sent, "no")

@@ -160,6 +160,9 @@ def test_a_command_that_no_row_takes_is_not_in_force(bench: Bench) -> None:
     status = bench.cycle()
     assert brief(status) == ("shut", 2, "locked", "", State.HOLDING)
     assert (status.reason, status.echo) == ("locked", 0)
+    # A reason from below is added to that of a row.
+    bench.door.detail = "no key"
+    assert bench.cycle().reason == "locked: no key"
     bench.door.lock = "free"
     bench.command(2, "paint blue")
     # The table has no row for words that the level does not know.
@@ -181,25 +184,6 @@ def test_a_state_is_late_after_more_than_its_patience(bench: Bench, place: str) 
         assert status.done == 0
 
 
-def test_a_reason_from_below_is_added_to_that_of_the_row(bench: Bench) -> None:
-    bench.door.lock = "locked"
-    bench.door.detail = "no key"
-    bench.command(1, "open")
-    assert bench.cycle().reason == "locked: no key"
-    bench.door.lock = "free"
-    # A row without a reason has none from below either.
-    assert bench.cycle().reason == ""
-
-
-def test_a_case_that_no_row_takes_is_an_error_with_the_case(bench: Bench) -> None:
-    bench.command(1, "open")
-    bench.cycle()
-    bench.door.place = "nowhere"
-    status = bench.cycle()
-    assert (status.row, status.fired, status.error) == (0, "", Error.TABLE)
-    assert status.reason.startswith("no row of 'moving' takes lock = free, place = nowhere")
-
-
 def test_the_level_above_holds_this_one_while_it_executes(bench: Bench) -> None:
     bench.command(1, "open", hold=True, operator=9)
     status = bench.cycle()
@@ -211,12 +195,8 @@ def test_the_level_above_holds_this_one_while_it_executes(bench: Bench) -> None:
     assert bench.above is not None
     bench.above = bench.above._replace(is_lost=True)
     assert (bench.cycle().state, bench.door.holds) == (State.HOLDING, True)
-
-
-def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
-    bench.command(1, "open")
-    bench.cycle()
-    bench.door.place = "between"
+    bench.above = bench.above._replace(is_lost=False)
+    # An operator's hold is done when all is at rest.
     bench.door.resting = False
     status = bench.order(1, Operation.HOLD)
     assert (status.state, status.answer, status.order) == (State.HOLDING, Answer.TAKEN, 1)
@@ -224,6 +204,11 @@ def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
     assert bench.cycle().answer == Answer.DONE
     bench.order(2, Operation.RESUME)
     assert (bench.cycle().state, bench.door.holds) == (State.EXECUTING, False)
+    # A case that no row takes is an error with the case.
+    bench.door.place = "nowhere"
+    status = bench.cycle()
+    assert (status.row, status.fired, status.error) == (0, "", Error.TABLE)
+    assert status.reason.startswith("no row of 'moving' takes lock = free, place = nowhere")
 
 
 def test_an_operators_command_goes_before_that_of_the_level_above(bench: Bench) -> None:
@@ -294,15 +279,13 @@ def test_a_restarted_board_goes_on_where_its_last_status_was(bench: Bench) -> No
     assert bench.cycle().done == 6
     bench.restart()
     assert (bench.cycle().fired, bench.status.done) == ("stay shut", 6)
-
-
-def test_a_restarted_board_goes_on_with_an_operators_command(bench: Bench) -> None:
+    # So it does with an operator's command.
+    bench.door.place = "shut"
     bench.order(3, Operation.DO, "open")
     bench.restart()
     bench.door.place = "between"
     status = bench.cycle()
-    assert (status.fired, status.ordered, status.echo) == ("moves", 3, 0)
-    assert status.words == "open"
+    assert (status.fired, status.ordered, status.words) == ("moves", 3, "open")
 
 
 @pytest.mark.parametrize(

@@ -113,16 +113,11 @@ def test_what_was_not_picked_is_tried_once_more_and_then_given_up(bench: Bench) 
     )
 
 
-def test_a_lost_level_below_is_waited_for(bench: Bench) -> None:
+def test_a_restarted_board_goes_on_with_the_step_under_way(bench: Bench) -> None:
     bench.cycle()
     bench.is_lost = True
     assert bench.answer(State.DONE) == ("picking", STEPS[0])
     bench.is_lost = False
-    assert bench.answer(State.DONE) == ("placing", STEPS[1])
-
-
-def test_a_restarted_board_goes_on_with_the_step_under_way(bench: Bench) -> None:
-    bench.cycle()
     for _ in range(3):
         bench.answer(State.DONE)
     assert bench.cycle() == ("picking", STEPS[2])
@@ -133,14 +128,6 @@ def test_a_restarted_board_goes_on_with_the_step_under_way(bench: Bench) -> None
     assert bench.write.command.id == 3
     assert bench.answer(State.DONE) == ("placing", STEPS[3])
     assert bench.progress[0] == 4
-
-
-def test_past_the_last_step_a_command_is_about_that_one(bench: Bench) -> None:
-    bench.cycle()
-    for _ in range(5):
-        bench.level.do_next()
-    bench.level.do_send("place")
-    assert (bench.cycle()[1], bench.progress[1:]) == ("place corner", (3, 3, 6, 6))
 
 
 def test_a_hold_and_rest_of_the_level_below_are_passed_on(bench: Bench) -> None:

@@ -75,19 +75,8 @@ def test_blended_requests_do_not_stop_at_their_goals() -> None:
     assert np.allclose(rig.positions[-1][0] - rig.cell.home[0], 0.6, atol=1e-9)
 
 
-def test_a_corner_is_rounded_and_the_next_goal_reached() -> None:
-    rig = TrajectoryRig()
-    rig.joints([0.5, 0, 0, 0, 0, 0], acceleration=0.3)
-    rig.joints([0.5, 0, 0.5, 0, 0, 0], acceleration=0.3)
-    rig.run(6.0)
-    q = np.array(rig.positions) - rig.cell.home
-    off = np.min(np.hypot(q[:, 0] - 0.5, q[:, 2]))
-    assert 1e-3 < off < 0.1
-    assert np.allclose(q[-1], [0.5, 0, 0.5, 0, 0, 0], atol=1e-9)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("cycles", range(10, 110, 20))
+@pytest.mark.parametrize("cycles", [10, 50, 90])
 def test_a_cancel_at_any_time_ramps_to_rest_and_drops_the_rest(cycles: int) -> None:
     rig = TrajectoryRig()
     first = [

@@ -33,13 +33,6 @@ def test_a_leg_is_smooth_and_passes_its_goal_in_the_middle_of_its_blend() -> Non
     assert abs(law.part(at) + (law.nominal_s - at) / law.segment_s - 1.0) < 1e-12
 
 
-def test_two_legs_begun_half_a_blend_apart_are_one_straight_motion() -> None:
-    law = TimeLaw(segment_s=1.0, half_blend_s=0.2)
-    second = law.nominal_s - law.half_blend_s
-    way = [law.part(t) + law.part(t - second) for t in np.arange(0.4, second + 0.9, 0.01)]
-    assert np.abs(np.diff(way, 2)).max() < 1e-12
-
-
 @pytest.mark.slow
 @given(parts, times, st.floats(0.0, 2.0))
 @settings(max_examples=25, deadline=None)
