@@ -14,15 +14,6 @@ pytestmark = pytest.mark.filterwarnings(FORKS)
 ADDRESS = 400
 
 
-def test_two_holders_in_one_process_exclude_each_other(make_bus: MakeBus) -> None:
-    segment = make_bus()
-    first, second = ByteLock(segment.fd, ADDRESS), ByteLock(segment.fd, ADDRESS)
-    assert first.take()
-    assert not second.take()
-    first.release()
-    assert second.take()
-
-
 def test_a_closed_lock_is_free_and_leaves_no_file_open(make_bus: MakeBus) -> None:
     segment = make_bus()
     before = descriptors()

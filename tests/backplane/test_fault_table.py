@@ -40,16 +40,6 @@ def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
     assert FaultTable(segment).add(replace(WHOLE, when=None)).when_box == -1
 
 
-def test_entries_are_found_by_their_stages(make_bus: MakeBus) -> None:
-    table = FaultTable(make_bus())
-    entries = [table.add(Injection(0, task)) for task in (0, 1, 1, -1)]
-    assert table.staged((Stage.ACTIVE,)) == []
-    for entry in entries[1:]:
-        entry.stage = Stage.ACTIVE
-    assert [entry.task for entry in table.staged((Stage.ACTIVE,))] == [1, 1, -1]
-    assert [entry.index for entry in table.staged((Stage.WAITING,))] == [0]
-
-
 def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(
     make_bus: MakeBus,
 ) -> None:

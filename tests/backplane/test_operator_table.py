@@ -95,16 +95,15 @@ def test_a_request_in_a_reused_entry_is_not_withdrawn_by_an_earlier_client(
 
 def test_a_claimed_request_waits_as_long_as_its_client_holds_it(segment: Segment) -> None:
     table, before = OperatorTable(segment), descriptors()
-    with table.claim(Request(0, b"", 9)) as entry:
-        assert OperatorTable(segment).waiting()[0].index == entry.index
-    assert table.waiting() == []
-    claim = table.enter(Request(0, b"", 9))
-    assert [entry.index for entry in table.waiting()] == [claim.entry.index]
-    claim.leave()
+    with table.claim(Request(0, b"", 9)) as first:
+        assert OperatorTable(segment).waiting()[0].index == first.index
     assert table.waiting() == []
     # One without a client waits in an entry that a client had.
-    assert table.add(Request(0, b"", 9)).index == claim.entry.index
-    assert [entry.index for entry in table.waiting()] == [claim.entry.index]
+    assert table.add(Request(0, b"", 9)).index == first.index
+    claim = table.enter(Request(0, b"", 9))
+    assert [entry.index for entry in table.waiting()] == [first.index, claim.entry.index]
+    claim.leave()
+    assert [entry.index for entry in table.waiting()] == [first.index]
     assert descriptors() == before
 
 
@@ -133,21 +132,6 @@ def test_a_full_table_makes_room_with_the_command_given_longest_ago(segment: Seg
     for serial, entry in enumerate(reversed(entries), 1):
         give(entry, serial)
     assert table.add(Request(0, b"", 9)).index == entries[-1].index
-
-
-@pytest.mark.filterwarnings(FORKS)
-def test_two_operators_at_once_fill_entries_of_their_own(segment: Segment) -> None:
-    half = OPERATOR_ENTRIES // 2
-
-    def add_half() -> None:
-        for _ in range(half):
-            OperatorTable(segment).add(Request(0, b"", 9))
-
-    pids = [fork(add_half) for _ in range(2)]
-    assert [exit_status(pid) for pid in pids] == [0, 0]
-    waiting = OperatorTable(segment).waiting()
-    assert len(waiting) == 2 * half
-    assert len({entry.ticket for entry in waiting}) == 2 * half
 
 
 @pytest.mark.parametrize(("tick", "was_withdrawn"), [(-1, True), (0, False), (1, False)])

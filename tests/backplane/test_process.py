@@ -27,7 +27,6 @@ from rack.backplane.process import (
     is_alive,
     mapped_and_locked,
     name_process,
-    pin,
     processor_ns,
     readable,
     refusal,
@@ -63,16 +62,6 @@ def test_a_name_with_parentheses_and_spaces_does_not_confuse() -> None:
         before = start_time(pid)
         wait_until(lambda: ") S 1" in Path(f"/proc/{pid}/comm").read_text())
         assert start_time(pid) == before > 0
-
-
-def test_a_process_is_pinned_to_one_core() -> None:
-    core = max(os.sched_getaffinity(0))
-
-    def pinned() -> bool:
-        pin(core)
-        return os.sched_getaffinity(0) == {core}
-
-    assert exit_status(fork(pinned)) == 0
 
 
 def test_cores_are_kept_awake_by_a_request_that_is_held(
@@ -147,20 +136,6 @@ def test_a_status_says_how_a_process_ended() -> None:
         "exit status 3",
         "signal SIGKILL",
     ]
-
-
-@needs_fifo
-def test_a_priority_is_that_of_the_process_itself() -> None:
-    def take() -> bool:
-        assert set_priority(7)
-        assert os.sched_getscheduler(0) == os.SCHED_FIFO
-        assert os.sched_getparam(0).sched_priority == 7
-        assert set_priority(0)
-        return os.sched_getscheduler(0) == os.SCHED_OTHER
-
-    before = os.sched_getscheduler(1)
-    assert exit_status(fork(take)) == 0
-    assert os.sched_getscheduler(1) == before
 
 
 @needs_fifo

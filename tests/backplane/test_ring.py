@@ -13,10 +13,9 @@ from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.slots import claim
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
-from rack.boards.faults.messages import forge
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, exit_status, fork, kill, wait_until
+from tests.processes import FORKS, fork, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 DEPTH = 16
@@ -82,17 +81,6 @@ def test_only_messages_that_a_reader_takes_are_rows(bus: Segment) -> None:
     writer.lose()
     write(writer, 1)
     assert serials(ring) == ([1, 2, 5], 0)
-
-
-@pytest.mark.filterwarnings(FORKS)
-def test_a_forged_message_is_no_row_and_the_true_one_in_its_place_is(bus: Segment) -> None:
-    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
-    write(writer, 2)
-    assert serials(ring) == ([1, 2], 0)
-    assert exit_status(fork(lambda: forge(bus, NAME, 20))) == 0
-    assert serials(ring) == serials(ring) == ([], 0)
-    write(writer, 2)
-    assert serials(ring) == ([3, 4], 0)
 
 
 def hammer(segment: Segment) -> None:

@@ -225,16 +225,3 @@ def test_a_clock_without_a_launcher_ends(make_bus: MakeBus, driver: str) -> None
     with in_thread(clock.run):
         pass
     assert segment.words[System.STATE] == Run.STOPPED
-
-
-def test_a_stop_requested_from_outside_ends_at_the_next_tick(make_bus: MakeBus) -> None:
-    segment = make_bus()
-    start(segment)
-
-    def request(tick: int) -> None:
-        segment.words[System.STOP_REQUEST] |= tick >= 5
-
-    ticks = given_out(segment, 10_000, request)
-    stopped = segment.words[System.STOP_TICK]
-    assert stopped > segment.words[System.TICK] >= 5
-    assert stopped > ticks[-1][0]

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
 
@@ -15,14 +12,12 @@ import pytest
 from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
-from rack.backplane.process import processor_ns, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
+from tests.processes import BOUND_S, in_thread, wait_until
 
 WAKES = pytest.mark.parametrize("wake", get_args(Wake), indirect=True)
 EVERY = 4
@@ -154,63 +149,6 @@ def busy() -> None:
         pass
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings(FORKS)
-@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
-@pytest.mark.parametrize(("clock", "rung"), [(busy, []), (signal.pause, [Alarm.CLOCK_STOPPED])])
-def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch, clock: Callable[[], None], rung: list[Alarm]
-) -> None:
-    monkeypatch.setattr("rack.backplane.clock.wake.CLOCK_SILENT_S", 0.05)
-    looks: list[int] = []
-    monkeypatch.setattr(
-        "rack.backplane.clock.wake.state_of", lambda pid: looks.append(pid) or state_of(pid)
-    )
-    start_grid(bus)
-    cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))
-    release(bus, 0)
-    cycle.wait()
-    with forked(clock) as pid:
-        # A process that has just been forked may wait for its memory.
-        wait_until(lambda: clock is not busy or processor_ns(pid) > 20_000_000)
-        bus.words[System.CLOCK_PID] = pid
-        with in_thread(cycle.wait):
-            # The checks a tenth of a second apart or more.
-            wait_until(lambda: len(looks) > 60)
-            bus.words[System.STATE] = Run.STOPPED
-            wake_semaphore(bus.rack, "level").release()
-    assert [Alarm(code) for code in alarm_ring(bus, "level").drain().rows["code"]] == rung
-
-
-@pytest.mark.filterwarnings(FORKS)
-@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
-def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
-    start_grid(bus)
-    cycle, ring = (
-        NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")),
-        alarm_ring(bus, "level"),
-    )
-    release(bus, 0)
-    cycle.wait()
-    with forked(signal.pause) as pid:
-        os.kill(pid, signal.SIGSTOP)
-        bus.words[System.CLOCK_PID] = pid
-        for tick in (4, 8):
-            with in_thread(cycle.wait):
-                wait_until(lambda: ring.waiting > 0)
-                assert Alarm(ring.drain().rows["code"][0]) is Alarm.CLOCK_STOPPED
-                release(bus, tick)
-
-
-def test_posts_that_a_task_does_not_wait_for_do_not_add_up(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    for tick in range(0, 100 * EVERY, EVERY):
-        release(bus, tick)
-        if tick % 3:
-            assert cycle.wait() == tick
-    assert wake_semaphore(bus.rack, "level").value < 100 // 3 + 2
-
-
 def publish(segment: Segment, tick: int) -> None:
     """Release the task as a clock does that is in time: without a post."""
     segment.block("level")[Block.RELEASED] = tick
@@ -306,21 +244,6 @@ def test_a_late_clock_wakes_a_sleeping_task_with_a_post(
     release(bus, EVERY)
     thread.join(BOUND_S / 2)
     assert found == [EVERY]
-
-
-@TIMER
-def test_a_task_that_sleeps_before_the_clock_starts_is_woken_to_sleep_by_its_grid(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
-    cycle, found = NextCycle(bus, "level"), []
-    thread = threading.Thread(target=lambda: found.append(cycle.wait()), daemon=True)
-    thread.start()
-    start_grid(bus, -4 * PERIOD_NS)
-    wake_semaphore(bus.rack, "level").release()
-    publish(bus, 0)
-    thread.join(BOUND_S / 2)
-    assert found == [0]
 
 
 @pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)

@@ -41,20 +41,6 @@ def test_no_two_services_overlap_and_no_more_wait_than_permitted(
     assert inbox.most_waiting <= depth
 
 
-@given(ARRIVALS, ARRIVALS, st.integers(1, 5))
-def test_after_an_idle_instant_nothing_before_it_counts(
-    first: list[tuple[int, int]], then: list[tuple[int, int]], depth: int
-) -> None:
-    used, at, ends = Inbox(depth), 0, [0]
-    for pause, service in first:
-        at += pause
-        ends.append(used.arrive(at, service) or 0)
-    at, fresh = max(at, *ends), Inbox(depth)
-    for pause, service in then:
-        at += pause
-        assert used.arrive(at, service) == fresh.arrive(at, service)
-
-
 def test_a_burst_of_all_senders_waits_for_each_other() -> None:
     burst = burst_of([InterruptSource(2_500, 60)] * 5)
     assert (burst.waiting, burst.longest_ns) == (4, 300)

@@ -16,10 +16,9 @@ from rack.backplane.mailbox.interrupt import (
 from rack.backplane.mailbox.mailbox import Reader, Verdict
 from rack.backplane.mailbox.protocols import open_reader
 from rack.backplane.segment import Segment
-from rack.boards.faults.messages import forge
 from tests.backplane.bus import CLOCK_NS, mailbox, task
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, exit_status, fork
+from tests.processes import FORKS
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 SENDERS = ("first", "second", "third")
@@ -137,15 +136,6 @@ def test_a_full_inbox_loses_what_comes_last_at_this_board_only(make_bus: MakeBus
     assert Reader(board.segment, "first.point").read(5).value.id == 4
 
 
-def test_a_late_message_is_sent_in_the_tick_that_writes_it(make_bus: MakeBus) -> None:
-    board = Board(make_bus(*boxes(every=8), *tasks()))
-    assert board.send(0, "first", now=0)
-    assert not board.send(8, "first", now=11)
-    assert board.read(8) == {"first": 0}
-    assert board.read(11) == {}
-    assert board.read(12) == {"first": 8}
-
-
 @pytest.mark.parametrize("idle", [0, 3, 40])
 def test_a_restarted_reader_continues_as_the_one_before_it(make_bus: MakeBus, idle: int) -> None:
     # Two thirds of the time the handler works; a burst of three is not done before the next tick.
@@ -188,20 +178,6 @@ def test_a_lost_message_raises_no_interrupt_and_a_damaged_one_does(make_bus: Mak
     assert board.read(4) == {"first": 3}
 
 
-def test_a_forged_message_is_rejected_and_the_true_one_comes_in_its_place(
-    make_bus: MakeBus,
-) -> None:
-    board = Board(make_bus(*boxes(), *tasks()))
-    board.send(0, "first")
-    assert board.read(1) == {"first": 0}
-    assert exit_status(fork(lambda: forge(board.segment, "first.point", 1))) == 0
-    assert board.read(2) == {}
-    assert board.readers["first"].statistics.forged == 1
-    board.send(2, "first")
-    assert board.read(3) == {"first": 2}
-    assert board.inbox.count == 2
-
-
 def test_between_tasks_of_one_slot_nothing_is_interrupted(make_bus: MakeBus) -> None:
     how = replace(box("first"), interrupt=InterruptSpec(500_000, 60_000, 16, 1, 1))
     segment = make_bus(how, task("first", slot=4), task("reader", slot=4))
@@ -209,22 +185,3 @@ def test_between_tasks_of_one_slot_nothing_is_interrupted(make_bus: MakeBus) -> 
     writer, reader = InterruptWriter(segment, "first.point"), open_reader(segment, "first.point")
     writer.write(0)
     assert [reader.read(tick).verdict for tick in (0, 1)] == [Verdict.NONE, Verdict.NEW]
-
-
-def test_a_message_that_is_overwritten_while_it_is_judged_raises_no_interrupt_yet(
-    make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    board = Board(make_bus(*boxes(), *tasks()))
-    slots = board.inbox.lines["first.point"]._slots
-    copy = slots.copy
-    board.send(0, "first")
-    assert board.read(1) == {"first": 0}
-    board.writers["first"].close()
-    board.writers["first"] = InterruptWriter(board.segment, "first.point")
-    board.send(1, "first")
-    monkeypatch.setattr(slots, "copy", lambda serial: False)
-    board.read(2)
-    assert (board.inbox.count, board.readers["first"].found) == (1, 2)
-    monkeypatch.setattr(slots, "copy", copy)
-    board.read(3)
-    assert board.inbox.count == 2

@@ -77,14 +77,6 @@ def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(
         assert seen(reader, at)[0] == sum(due <= at for due in visible)
 
 
-def test_a_slow_reader_takes_the_newest_visible(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox()))
-    for tick in range(6):
-        write(writer, tick)
-    assert seen(reader, 4) == (4, NEW)
-    assert seen(reader, 4) == (4, OLD)
-
-
 def test_the_host_peeks_at_the_newest_at_once(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox(every=8, delay=8))
     writer, host, board = *ends(segment), open_reader(segment, NAME)
@@ -164,69 +156,6 @@ def test_a_second_writer_is_refused_with_the_first_ones_process(make_bus: MakeBu
     # A claim ends with its process.
     assert exit_status(fork(lambda: write(open_writer(segment, NAME), 0))) == 0
     open_writer(segment, NAME)
-
-
-def test_a_new_writer_continues_after_the_last_message_in_a_new_epoch(make_bus: MakeBus) -> None:
-    segment = make_bus(mailbox())
-    slots = Slots(segment, segment.layout.mailbox(NAME))
-    first, reader = ends(segment)
-    write(first, 0)
-    first.close()
-    second = open_writer(segment, NAME)
-    assert second.serial == 1
-    write(second, 1)
-    assert [seen(reader, tick) for tick in (1, 2)] == [(1, NEW), (2, NEW)]
-    epochs = [epoch_of(slots.signature) for serial in (1, 2) if slots.fetch(serial)]
-    assert epochs == [1, 2]
-
-
-def test_the_chain_does_not_show_where_a_writer_was_replaced(make_bus: MakeBus) -> None:
-    segment = make_bus(mailbox(), mailbox(name="writer.other"))
-    whole, part = open_writer(segment, NAME), open_writer(segment, "writer.other")
-    for tick in range(6):
-        if tick == 3:
-            part.close()
-            part = open_writer(segment, "writer.other")
-        write(whole, tick)
-        write(part, tick)
-    chains = {name: open_reader(segment, name) for name in (NAME, "writer.other")}
-    for reader in chains.values():
-        reader.peek()
-    assert len({reader.slots.chain for reader in chains.values()}) == 1
-
-
-@pytest.mark.parametrize(
-    ("every", "delay", "phase", "visible"),
-    [
-        # Ticks 8 to 15 of a message released at 8, and the end of its slice or the next boundary.
-        (4, 4, 0, [12, 12, 12, 12, 16, 16, 16, 16]),
-        (4, 4, 1, [12, 12, 12, 12, 13, 17, 17, 17]),
-        (2, 6, 0, [14, 14, 14, 14, 14, 14, 16, 16]),
-        (8, 3, 0, [11, 11, 11, 12, 15, 15, 15, 18]),
-    ],
-)
-def test_a_message_is_in_time_before_the_end_of_its_slice(
-    make_bus: MakeBus, every: int, delay: int, phase: int, visible: list[int]
-) -> None:
-    spec = replace(mailbox(every=every, delay=delay), phase=phase)
-    writer = open_writer(make_bus(spec), NAME)
-    assert [writer.visible_at(8, now) for now in range(8, 16)] == visible
-    assert [writer.is_in_time(8, now) for now in range(8, 16)] == [
-        now < 8 + delay for now in range(8, 16)
-    ]
-    # Without a clock, as in a test, a writer is never late.
-    assert writer.is_in_time(8, None)
-    assert writer.visible_at(8, None) == 8 + delay
-
-
-def test_a_reader_counts_its_reads_and_the_messages_that_it_copied(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox()))
-    write(writer, 0)
-    writer.write(1, basis=0)
-    for tick in (0, 1, 1, 2):
-        reader.read(tick)
-    assert (reader.accesses, reader.transfers, reader.serial, reader.found) == (4, 2, 2, 2)
-    assert (reader.newest, reader.visible, reader.basis) == (1, 2, 0)
 
 
 def test_a_forged_message_is_counted_with_the_process_that_it_names(make_bus: MakeBus) -> None:

@@ -98,13 +98,3 @@ def test_an_episode_ends_after_both_enough_clean_accesses_and_cycles_of_the_writ
     rung(ring)
     found.find(Alarm.STALE, 7 + accesses, 30 + ticks)
     assert len(rung(ring)) == (0 if is_open else 1)
-
-
-def test_a_caller_that_knows_of_an_episode_raises_its_alarm_at_once(
-    episodes: tuple[Episodes, Ring],
-) -> None:
-    found, ring = episodes
-    found.ring(Alarm.STALE, 10)
-    found.ring(Alarm.STALE, 11, 2.0, since=4)
-    assert rung(ring) == [(Alarm.STALE, 10, 0.0, 10), (Alarm.STALE, 11, 2.0, 4)]
-    assert not found.is_open(Alarm.STALE, 1, 12)

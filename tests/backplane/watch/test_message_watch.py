@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.layout import BY_TICKS, PROTOCOLS, Protocol
-from rack.backplane.watch.alarms import CLEAN_READS, Alarm
+from rack.backplane.watch.alarms import Alarm
 from tests.backplane.bus import NAME, message_address
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
 
@@ -24,19 +24,6 @@ def publish(rack: Link, tick: int, visible_at: int) -> None:
     writer.message.id = tick
     writer.message.row = tick
     writer.publish(tick, visible_at, tick)
-
-
-def test_messages_before_the_first_read_are_not_judged(link: MakeLink) -> None:
-    rack = link()
-    rack.fault("drop", 0.5)
-    rack.fault("corrupt", 0.5)
-    rack.fault("reorder", 0.5)
-    for tick in range(40):
-        rack.writer.cycle(tick)
-    rack.heal()
-    rack.writer.cycle(40)
-    rack.reader.cycle(41)
-    assert rack.alarms() == []
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -71,31 +58,6 @@ def test_a_writer_that_is_late_or_skips_cycles_is_no_fault(
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_writer_that_loses_its_core_between_the_clock_and_its_slot_is_no_fault(
-    link: MakeLink, protocol: Protocol
-) -> None:
-    rack = link(protocol)
-    rack.run(0, 20)
-    for tick in range(20, 38):
-        rack.reader.cycle(tick)
-    # It read the clock in time, then stood still: the message carries a tick long past.
-    publish(rack, 20, 21)
-    rack.reader.cycle(38)
-    rack.writer.end(20)
-    rack.run(39, 80)
-    assert rack.alarms() == []
-
-
-def test_a_message_after_the_end_of_its_cycle_was_held_back(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.writer.end(20)
-    publish(rack, 20, 25)
-    rack.run(25, 30)
-    assert rack.alarms() == [(25, Alarm.HELD_BACK)]
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_restarted_reader_reports_nothing_false(link: MakeLink, protocol: Protocol) -> None:
     rack = link(protocol)
     rack.run(0, 50)
@@ -126,17 +88,6 @@ def test_a_restarted_writer_is_not_taken_for_a_fault(
     assert rack.alarms() == []
     assert rack.alarms("writer") == []
     assert rack.reader.seen[-1].released == 299 - (protocol in BY_TICKS)
-
-
-def test_an_episode_rings_once_and_a_later_one_again(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    for first in (20, 200):
-        rack.fault("corrupt", 0.7)
-        rack.run(first, first + 100)
-        rack.heal()
-        rack.run(first + 100, first + 102 + CLEAN_READS)
-    assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED] * 2
 
 
 @pytest.mark.parametrize("rates", [(1, 8), (1, 24)])
@@ -178,27 +129,6 @@ def test_one_message_more_than_releases_is_no_babble(
         rack.segment.bytes[message_address(rack.segment, 23)] ^= 4
     rack.reader.cycle(21)
     assert [code for _, code in rack.alarms()] == alarms
-
-
-def test_after_a_lost_message_a_babble_is_counted_from_its_tick(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.reader.cycle(20)
-    rack.writer.ports.writers["point"].lose()
-    rack.reader.cycle(21)
-    for _ in range(3):
-        publish(rack, 21, 22)
-    rack.reader.cycle(22)
-    assert rack.alarms() == [(21, Alarm.GAP), (22, Alarm.BABBLE)]
-
-
-def test_a_later_message_of_an_earlier_release_is_out_of_order(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.reader.cycle(20)
-    publish(rack, 18, 21)
-    rack.reader.cycle(21)
-    assert rack.alarms() == [(21, Alarm.DISORDER)]
 
 
 @pytest.mark.parametrize("every", [1, 4])

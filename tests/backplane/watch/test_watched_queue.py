@@ -97,18 +97,6 @@ def test_a_damaged_message_is_reported_and_the_order_goes_on(site: Site) -> None
     assert site.task.troubles == 1
 
 
-def test_a_message_of_an_earlier_release_is_out_of_order_and_one_of_the_same_is_not(
-    site: Site,
-) -> None:
-    site.send(8, 1)
-    site.send(8, 2)
-    assert site.read(9) == [1, 2]
-    assert site.alarms() == []
-    site.send(6, 3)
-    assert site.read(10) == [3]
-    assert site.alarms() == [(Alarm.DISORDER, 10, 2.0)]
-
-
 @pytest.mark.parametrize(("lost", "at", "is_lost"), [(0, 9, False), (9, 8, False), (9, 9, True)])
 def test_a_writer_is_lost_from_the_tick_after_its_loss(
     site: Site, lost: int, at: int, is_lost: bool

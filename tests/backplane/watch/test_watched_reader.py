@@ -8,17 +8,13 @@ import pytest
 
 from rack.backplane.layout import TickGrid
 from rack.backplane.watch.alarms import AlarmWriter
-from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import (
     GridReader,
-    SporadicReader,
-    WatchedQueue,
     WatchedReader,
     watched,
 )
 from rack.backplane.words import Block
-from tests.backplane.bus import NAME, mailbox, queue, task
-from tests.backplane.conftest import MakeBus
+from tests.backplane.bus import NAME
 from tests.link import Link, MakeLink, links
 
 
@@ -26,26 +22,6 @@ from tests.link import Link, MakeLink, links
 def link(rack_name: str) -> Iterator[MakeLink]:
     with links(rack_name) as make:
         yield make
-
-
-def test_each_mailbox_has_the_checks_that_suit_its_writer(make_bus: MakeBus) -> None:
-    segment = make_bus(
-        *queue(4),
-        mailbox(name="writer.other"),
-        mailbox(name="reader.operator", writer="clock"),
-        task("writer"),
-        task("reader", slot=3),
-    )
-    alarms = AlarmWriter(segment, "reader")
-    kinds = {
-        name: type(watched(segment, name, alarms, ReadingTask()))
-        for name in (NAME, "writer.other", "reader.operator")
-    }
-    assert kinds == {
-        NAME: WatchedQueue,
-        "writer.other": WatchedReader,
-        "reader.operator": SporadicReader,
-    }
 
 
 class Grid:

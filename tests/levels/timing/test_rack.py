@@ -177,10 +177,8 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
-    queued = rack(board("queued", 4)).changed("queued", queues=("plan.requests",))
-    assert Forecast.of(queued).notes[0] == (
-        "the system's response is that of empty queues: plan.requests"
-    )
+    queued = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
+    assert queued[0] == "the system's response is that of empty queues: plan.requests"
     # Without a budget there is nothing to say about times.
     bare = Forecast.of(
         replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False

@@ -195,8 +195,12 @@ def test_the_level_above_holds_this_one_while_it_executes(bench: Bench) -> None:
     assert bench.above is not None
     bench.above = bench.above._replace(is_lost=True)
     assert (bench.cycle().state, bench.door.holds) == (State.HOLDING, True)
-    bench.above = bench.above._replace(is_lost=False)
-    # An operator's hold is done when all is at rest.
+
+
+def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
+    bench.command(1, "open")
+    bench.cycle()
+    bench.door.place = "between"
     bench.door.resting = False
     status = bench.order(1, Operation.HOLD)
     assert (status.state, status.answer, status.order) == (State.HOLDING, Answer.TAKEN, 1)

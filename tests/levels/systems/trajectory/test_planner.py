@@ -138,7 +138,8 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
             {"do": "home"},
             {"do": "line", "position": [0.0, 0.0, 0.1], "body": "post", "live": True},
             {"do": "move", "position": [3.0, 0.0, 0.5]},
-        ]
+        ],
+        ahead=5,
     )
     rig.run(3)
     ik = InverseKinematics(CELL, 1)

@@ -180,6 +180,13 @@ def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -
     rig = TrajectoryRig()
     rig.joints([0.5, 0, 0, 0, 0, 0])
     rig.run(1.0)
+    rig.lost.add("joints1")
+    status = rig.run(0.2)
+    assert (rig.write.command.due, status.state) == (0, State.HOLDING)
+    assert status.reason.startswith("waiting for joints1: no status for")
+    rig.lost.clear()
+    rig.brake()
+    rig.run(1.0)
     name, stopped = next(iter(rig.statuses.items()))
     stopped.stopped, stopped.reason = 1, "brakes engaged"
     status = rig.run(0.3)
@@ -188,11 +195,7 @@ def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -
     assert status.reason == f"waiting for {name}: brakes engaged"
     stopped.target[0] += 0.02  # it sagged meanwhile
     stopped.stopped, stopped.reason = 0, ""
-    rig.lost.add("joints1")
-    status = rig.cycle()
-    assert (rig.write.command.due, status.state) == (0, State.HOLDING)
-    assert status.reason.startswith("waiting for joints1: no status for")
-    rig.lost.clear()
+
     rig.cycle()
     rig.cycle()
     assert abs(rig.write.command.position[0] - stopped.target[0]) < 1e-3
