@@ -13,38 +13,12 @@ from rack.levels import algebra
 
 LEVELS = Path(algebra.__file__).parent
 RNG = np.random.default_rng(3)
-ELSEWHERE = (
-    {
-        "dot",
-        "vdot",
-        "inner",
-        "vecdot",
-        "matmul",
-        "matvec",
-        "tensordot",
-        "power",
-        "float_power",
-        "argsort",
-    }
-    | {
-        name
-        for stem in ("sin", "cos", "tan", "sinh", "cosh", "tanh")
-        for name in (stem, f"a{stem}", f"arc{stem}")
-    }
-    | {
-        "exp",
-        "exp2",
-        "expm1",
-        "log",
-        "log2",
-        "log10",
-        "log1p",
-        "cbrt",
-        "atan2",
-        "arctan2",
-        "logaddexp",
-    }
-)
+STEMS = ("sin", "cos", "tan", "sinh", "cosh", "tanh")
+PRODUCTS = "dot vdot inner vecdot matmul matvec tensordot power float_power argsort"
+POWERS = "exp exp2 expm1 log log2 log10 log1p cbrt atan2 arctan2 logaddexp"
+ELSEWHERE = {*PRODUCTS.split(), *POWERS.split()} | {
+    name for stem in STEMS for name in (stem, f"a{stem}", f"arc{stem}")
+}
 """Functions of numpy whose results depend on the processor: BLAS, vector code of its own, ties
 sorted in any order."""
 

@@ -84,14 +84,6 @@ def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(
     assert report(orders).objection.startswith("99 is not a command of this level")
 
 
-def test_a_status_rests_on_the_newest_of_here_and_above() -> None:
-    orders = Orders(TAKES)
-    assert orders.rests_on(3) == 3
-    orders.take(said(5, Operation.HOLD))
-    assert (orders.rests_on(3), orders.rests_on(8)) == (5, 8)
-    assert report(orders, above=8).operator == 8
-
-
 def test_a_command_given_up_holds() -> None:
     orders = Orders(TAKES)
     orders.take(said(5, Operation.GOTO, Goal.HOME))
@@ -105,16 +97,6 @@ def test_a_command_given_up_holds() -> None:
     assert shown.operator == 5
     orders.done()
     assert report(orders, message=shown).answer == Answer.REFUSED
-
-
-def test_only_a_command_under_way_becomes_done() -> None:
-    orders = Orders(TAKES)
-    orders.done()
-    assert report(orders).answer == Answer.NONE
-    orders.take(said(5, Operation.HOLD))
-    assert report(orders).answer == Answer.TAKEN
-    orders.done()
-    assert report(orders).answer == Answer.DONE
 
 
 SETTING = {**TAKES, Operation.SET: (), Operation.ENABLE: ()}
@@ -163,13 +145,6 @@ def test_drives_that_arrive_answer_their_own_command() -> None:
     orders.done()
     assert told(orders) == (5, Answer.DONE, "")
     orders.drives_done(6)
-    assert told(orders) == (6, Answer.DONE, "")
-
-
-def test_a_command_that_another_replaces_in_the_same_cycle_gets_no_answer() -> None:
-    orders = Orders(SETTING)
-    earlier, newest = said(5, Operation.HOLD), said(6, Operation.RESUME)
-    orders.take(Reading(newest.value, Verdict.NEW, earlier=(earlier.value,)))
     assert told(orders) == (6, Answer.DONE, "")
 
 

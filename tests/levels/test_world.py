@@ -96,16 +96,6 @@ def test_the_revision_rises_when_a_body_starts_and_when_it_rests_again() -> None
     assert len(WorldRig().run(3.0, sliding(0.5, 10.0, 0.004))) > 2
 
 
-def test_a_body_that_turns_on_the_spot_moves() -> None:
-    def turning(time_s: float) -> tuple[Array, Array]:
-        quaternions = np.tile(UPRIGHT, (3, 1))
-        half = 0.5 * min(max(time_s - 1.0, 0.0), 0.5)
-        quaternions[1] = [np.cos(half), 0.0, 0.0, np.sin(half)]
-        return START, quaternions
-
-    assert len(WorldRig().run(3.0, turning)) == 4
-
-
 def test_a_restarted_board_shows_its_last_model_and_age_until_it_sees_again() -> None:
     rig = WorldRig()
     rig.run(1.0, resting)

@@ -7,7 +7,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.faulty import FaultyLink
@@ -47,20 +46,6 @@ def test_a_fault_of_a_sensor_is_on_its_joint_alone() -> None:
     assert np.isfinite(sample.velocity).all()
 
 
-def test_noise_is_the_same_again_with_the_same_seed_and_tick_and_has_its_size() -> None:
-    draws = []
-    for seed in (7, 7, 8):
-        link, arm, _ = linked(fault("sensor-noise", seed=seed, size=0.01, joint=-1))
-        noise = []
-        for _ in range(100):
-            noise.append(link.sense().position - arm.sense().position)
-            arm.step(1)
-        draws.append(np.array(noise))
-    assert np.array_equal(draws[0], draws[1])
-    assert not np.array_equal(draws[0], draws[2])
-    assert np.std(draws[0]) == pytest.approx(0.01, rel=0.1)
-
-
 def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_by_enough() -> None:
     link, arm, acted = linked(fault("sensor-stuck", joint=0))
     first = link.sense().position.copy()
@@ -77,14 +62,6 @@ def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_by_en
     assert sample.position[1] == arm.sense().position[1]
     assert shows == sorted(shows)
     assert 0 < sum(shows) < len(shows) == 20
-
-
-def test_a_dropout_leaves_the_tick_of_the_last_sample() -> None:
-    link, arm, acted = linked(fault("sensor-dropout"))
-    for _ in range(3):
-        assert link.sense().tick == -1
-        arm.step(1)
-        assert acted.pop(0)
 
 
 def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -> None:
@@ -110,25 +87,6 @@ def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_
     acted.clear()
     link.drive(0.05 * limits, 0.0)
     assert acted == {}
-
-
-@pytest.mark.parametrize(
-    ("kind", "parameters", "alarm"),
-    [
-        ("command-nan", {}, Alarm.COMMAND_INVALID),
-        ("command-limit", {"factor": 1.1}, Alarm.COMMAND_LIMIT),
-    ],
-)
-def test_a_corrupted_command_never_reaches_the_motors(
-    kind: str, parameters: dict[str, float], alarm: Alarm
-) -> None:
-    link, arm, acted = linked(fault(kind, joint=4, **parameters))
-    found = link.drive(HOLDING, 0.0)
-    assert found is not None
-    assert (found.alarm, found.subject) == (alarm, 4)
-    assert arm.braked
-    assert acted == {0: True}
-    assert np.isfinite(HOLDING).all()  # the level's own torques stay as they are
 
 
 def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:

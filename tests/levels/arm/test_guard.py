@@ -18,7 +18,6 @@ from rack.boards.errors import ConfigError
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, Sensed
 from rack.levels.arm.guard import GuardedArm
-from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import SceneConfig, SensorConfig
@@ -130,24 +129,6 @@ def test_as_coarse_as_its_encoders_may_be_it_keeps_them_too(tmp_path: Path) -> N
     assert arm.violations == 0
 
 
-def test_a_torque_that_no_drive_may_have_engages_the_brakes(tmp_path: Path) -> None:
-    robot = pendulum(tmp_path)
-    cell = build_cell(robot, SceneConfig(), CLOCK_NS)
-    most = cell.bounds.torque
-    for torque, alarm in (
-        (np.array([np.nan, 0.0]), Alarm.COMMAND_INVALID),
-        (np.array([0.0, 2.0 * most[1]]), Alarm.COMMAND_LIMIT),
-    ):
-        arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
-        guard = GuardedArm(arm, cell, robot.joints, TICK_S)
-        guard.sense()
-        assert guard.drive(np.zeros(2), 0.0) is None
-        assert not arm.braked
-        refused = guard.drive(torque, 0.0)
-        assert refused is not None
-        assert (refused.alarm, arm.braked, arm.clipped) == (alarm, True, 1)
-
-
 @pytest.mark.slow
 def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
@@ -196,19 +177,6 @@ def test_nothing_is_driven_on_a_sample_that_is_not_finite(
     guard.sense()
     assert guard.drive(np.zeros(2), 0.0) is None
     assert not arm.braked
-
-
-def test_encoders_too_coarse_to_tell_a_limit_are_refused(tmp_path: Path) -> None:
-    robot = pendulum(tmp_path)
-    sensors = SensorConfig(resolution=0.25)
-    cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
-    arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
-    with pytest.raises(RobotError) as error:
-        GuardedArm(arm, cell, robot.joints, TICK_S)
-    assert str(error.value) == (
-        "robot.sensors: 'shoulder' may be off by 0.125 rad, 1.25 rad/s: too coarse to keep it below"
-        " 2 rad/s; permitted: less than half of that"
-    )
 
 
 class LyingArm(IdealArm):

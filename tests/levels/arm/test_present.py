@@ -145,17 +145,6 @@ def test_samples_older_than_the_config_permits_are_a_finding_with_their_age(
     )
 
 
-def test_a_stuck_sensor_shows_in_late_samples_too(tmp_path: Path, arm: type[LateArm]) -> None:
-    arm.late, arm.stuck_from = 2, 150
-    servo = rig(tmp_path, 2)
-    servo.run(150, COURSE.at)
-    assert not servo.alarms()
-    servo.run(60, COURSE.at)
-    first = next(found for found in servo.found if found.finding.alarm is not Alarm.BRAKES_OPENED)
-    assert first.finding.alarm in (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL)
-    assert (first.finding.subject, first.tick <= 150 + 2 + 10) == (0, True)
-
-
 @pytest.mark.slow
 def test_late_samples_lead_beyond_no_limit(tmp_path: Path, arm: type[LateArm]) -> None:
     robot, cell = late(tmp_path, 4)

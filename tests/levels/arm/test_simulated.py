@@ -138,39 +138,6 @@ def test_limits_hold_at_every_step_whatever_is_commanded(watched: Watch) -> None
     assert arm.violations == 0
 
 
-@pytest.mark.slow
-def test_drives_keep_the_last_torque_for_a_while_then_brake_to_standstill() -> None:
-    arm, made = arm_of("puma560")
-    torque = wobble(made)
-    for tick in range(100):
-        arm.drive(torque(tick), 0.0)
-        arm.step(1)
-    given = arm.torque.copy()
-    for _ in range(arm.patience - 1):
-        arm.step(1)
-        assert np.array_equal(arm.torque, given)
-    assert np.abs(arm.sense().velocity).max() > 0.2
-    arm.step(800)
-    rest = arm.sense().position.copy()
-    assert np.abs(arm.sense().velocity).max() < 1e-3
-    arm.step(400)
-    assert arm.sense().position == pytest.approx(rest, abs=1e-3)
-
-
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_a_command_that_is_no_number_never_reaches_the_arm(wrong: float) -> None:
-    arm, made = arm_of("puma560")
-    command = wobble(made)(0)
-    command[2] = wrong
-    for _ in range(50):
-        arm.drive(command, wrong)
-        arm.step(1)
-    assert arm.clipped == 50
-    assert arm.fault == ""
-    assert arm.grip_force == 0.0
-    assert arm.sense().position == pytest.approx(made.home, abs=1e-3)
-
-
 def test_a_broken_simulation_is_a_fault_that_leaves_the_last_sound_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -74,32 +74,6 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
     assert np.allclose(contact.torque, expected, atol=0.02)
 
 
-def test_inertia_of_the_tool_is_no_contact(tmp_path: Path) -> None:
-    arm = arm_of(tmp_path)
-    contact, before = contact_of(arm), np.zeros(6)
-    wrenches = []
-    for tick in range(300):
-        velocity = 0.4 * np.sin(4.0 * np.pi * tick * 1e-3) * np.ones(6)
-        acceleration = 4.0 * (velocity - arm._state[1]) / 0.02
-        terms = arm.dynamics.terms(*arm._state)
-        arm.drive(
-            (terms.inertia * acceleration).sum(axis=1)
-            + terms.bias
-            + arm.dynamics.friction(velocity),
-            0.0,
-        )
-        arm.step(1)
-        state = np.array(arm._state)
-        contact.take(felt(arm), state, np.zeros(6))
-        ignored = contact.wrench.copy()
-        contact.take(felt(arm), state, (state[1] - before) / 1e-3)
-        wrenches.append((ignored, contact.wrench.copy()))
-        before = state[1]
-    off = np.abs(wrenches[50:])[:, :, :3].max(axis=(0, 2))
-    assert off[0] > 2.0
-    assert off[1] < 0.3
-
-
 def test_noise_is_that_of_the_tick_and_has_its_standard_deviation(tmp_path: Path) -> None:
     arm, exact = arm_of(tmp_path, noise=0.5), arm_of(tmp_path)
     samples = []

@@ -104,19 +104,6 @@ def planned_bench(**params: Any) -> Bench:
     return bench
 
 
-def test_nothing_is_handed_down_before_its_path_is_there() -> None:
-    bench = Bench()
-    bench.order()
-    bench.cycle(3)
-    assert bench.segments() == []
-    assert bench.status.state == State.EXECUTING
-    bench.plan(1)
-    bench.cycle(2)
-    assert bench.segments() == [(1, 1)]
-    assert bench.status.planned == 1
-    assert bench.status.end == pytest.approx(bench.home + 0.1)
-
-
 def test_window_stays_full_until_the_program_is_done() -> None:
     bench = planned_bench()
     assert bench.segments() == [(1, 1), (2, 2)]
@@ -299,21 +286,6 @@ def test_restarted_executor_continues_from_its_own_last_messages() -> None:
     assert bench.segments() == [(3, 3), (4, 4)]
 
 
-def test_after_a_restart_the_next_path_continues_from_the_one_that_replaced_the_blocked_one() -> (
-    None
-):
-    bench = planned_bench()
-    bench.restart("elemental_move")
-    bench.cycle(2, blocked=1, current=1)
-    bench.plan(1, bench.home, replan=bench.status.replan)
-    bench.cycle(1, blocked=0, current=3, resting=0)
-    assert [move for _, move in bench.segments()] == [1]
-    assert (bench.status.planned, bench.status.end) == (1, pytest.approx(bench.home + 0.1))
-    bench.plan(2, bench.home + 0.2)  # where move 2 was to end before it was withdrawn
-    bench.cycle(2)
-    assert [move for _, move in bench.segments()] == [1]
-
-
 @pytest.mark.parametrize(
     ("mailbox", "reason", "hold"),
     [("task.command", ABOVE_LOST, 1), ("primitive.status", BELOW_LOST, 0)],
@@ -329,31 +301,3 @@ def test_loss_of_a_neighbour_is_said_and_ends(mailbox: str, reason: str, hold: i
     bench.cycle(2)
     assert bench.command.hold == 0
     assert (bench.status.state, bench.status.reason) == (State.EXECUTING, "")
-
-
-def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() -> None:
-    # The path of move 1 was lost, that of move 2 was not; another path for move 1 may end
-    # elsewhere.
-    bench = Bench()
-    bench.order()
-    bench.plan(2, bench.home + 0.3)
-    bench.plan(1)
-    bench.cycle(2)
-    assert bench.status.planned == 1
-    bench.plan(2)
-    bench.cycle(2)
-    assert bench.status.planned == 3
-
-
-def test_answer_for_a_place_that_the_arm_has_left_is_requested_again() -> None:
-    bench = planned_bench()
-    bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
-    asked = bench.status.replan
-    bench.cycle(position=bench.home + 0.09)
-    bench.plan(1, bench.home + 0.05, replan=asked)
-    bench.cycle(1)
-    assert bench.segments() == [(1, 1), (2, 2)]
-    assert bench.status.replan > asked
-    bench.plan(1, bench.home + 0.09, replan=bench.status.replan)
-    bench.cycle(1)
-    assert bench.segments()[0] == (3, 1)

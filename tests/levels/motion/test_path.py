@@ -28,13 +28,6 @@ def test_derivatives_agree_with_finite_differences() -> None:
     )  # q'' has kinks where a blend ends
 
 
-def test_second_derivative_is_continuous_and_zero_where_a_blend_ends() -> None:
-    path = BlendedPath(CORNERED, BLEND)
-    for s in path.breaks[1:-1]:
-        _, _, d2q = points(path, np.array([s - 1e-9, s, s + 1e-9]))
-        assert np.abs(d2q).max() < 1e-6
-
-
 def test_analytic_bounds_hold_and_are_tight_on_every_piece() -> None:
     path = BlendedPath(CORNERED, BLEND)
     for k, (start, end) in enumerate(zip(path.breaks[:-1], path.breaks[1:], strict=True)):

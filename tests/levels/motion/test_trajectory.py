@@ -112,15 +112,6 @@ def test_nothing_to_drive_takes_no_time() -> None:
     assert (stop.begin, stop.end, stop.duration) == (0.25, 0.25, 0.0)
 
 
-def test_motion_resumes_from_rest_in_the_middle_of_a_corner() -> None:
-    path = random_path(7, 3)
-    begin = float(path.breaks[1:3].mean())
-    trajectory = make_trajectory(path, ARM, begin)
-    assert trajectory.begin == begin
-    assert trajectory.end == pytest.approx(path.length, abs=1e-8)
-    assert max(used(path, trajectory)) <= 1.0 + EXACT
-
-
 def test_stretched_trajectory_takes_exactly_the_time_asked_for_on_the_same_path() -> None:
     path = random_path(8, 2)
     quick = make_trajectory(path, ARM)

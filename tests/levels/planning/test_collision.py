@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -14,9 +13,8 @@ from rack.levels.planning import collision
 from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, first_blocked
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pointing, pose
-from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.tables import RobotConfig, SceneConfig
-from tests.levels.arms import CLOCK_NS, cell, config
+from rack.levels.robot.cell import Cell
+from tests.levels.arms import cell, config
 
 DOWN = (0.0, 0.0, -1.0)
 BLOCK1, BLOCK2, PEG = 0, 1, 2
@@ -122,33 +120,6 @@ def test_objects_are_where_they_are_placed(
     positions[PEG] = [0.7, 0.246, 0.5]
     checker.place(positions, quaternions)
     assert "'peg'" in checker.why(q)
-
-
-STAND = '<geom name="stand" type="cylinder" size=".05 .1" pos="0 0 .5"/>'
-
-
-@pytest.mark.parametrize("carrier", [f'{STAND}<body name="none">', f'<body name="stand">{STAND}'])
-def test_arm_may_be_near_what_carries_it(tmp_path: Path, carrier: str) -> None:
-    model = tmp_path / "carried.xml"
-    model.write_text(
-        f'<mujoco><worldbody><geom name="floor" type="plane" size="2 2 .1"/>{carrier}<body'
-        ' name="arm" pos="0 0 .66"><joint name="j" axis="0 1 0"/><geom name="arm" type="capsule"'
-        ' fromto="0 0 0 0 0 .3" size=".05"/><site name="tip" pos="0 0 .3"/></body></body>'
-        '</worldbody><actuator><motor joint="j" ctrlrange="-9 9"/></actuator></mujoco>'
-    )
-    robot = RobotConfig(
-        model=model,
-        joints=("j",),
-        tool="tip",
-        home=(0.0,),
-        velocity=(1.0,),
-        acceleration=(1.0,),
-        jerk=(1.0,),
-    )
-    scene = SceneConfig(clearance=0.05)
-    checker = CollisionChecker(build_cell(robot, scene, CLOCK_NS), scene)
-    assert checker.free(np.zeros(1))
-    assert not checker.free(np.array([3.0]))
 
 
 @pytest.mark.parametrize("held", [None, BLOCK1])

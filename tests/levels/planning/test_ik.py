@@ -8,7 +8,6 @@ import pytest
 from rack.levels.motion.path import BlendedPath
 from rack.levels.planning.ik import LIMIT_MARGIN_RAD, InverseKinematics, sampling_range
 from rack.levels.planning.motion_planner import MAX_STRAY_M, straight_line
-from rack.levels.planning.path_planner import lever_arms
 from rack.levels.planning.pose import Pose, pointing, pose
 from tests.levels.arms import cell
 
@@ -86,14 +85,3 @@ def test_tool_follows_a_straight_line(name: str, way: tuple[float, float, float]
         along = off @ np.array(way) / length
         assert np.linalg.norm(off - along * np.array(way) / length) < 1.5 * MAX_STRAY_M
         assert tool.angle_to(begin) < 0.02
-
-
-@pytest.mark.parametrize("name", CELLS)
-def test_lever_arms_bound_how_far_a_step_moves_the_tool(name: str) -> None:
-    c, ik = CELLS[name], SOLVERS[name]
-    levers, rng = lever_arms(c, SEED), np.random.default_rng(SEED)
-    low, high = sampling_range(c)
-    for _ in range(50):
-        q, step = rng.uniform(low, high), rng.normal(size=len(low)) * 0.02
-        moved = np.linalg.norm(ik.tool_at(q + step).position - ik.tool_at(q).position)
-        assert moved <= 1.05 * levers @ np.abs(step)

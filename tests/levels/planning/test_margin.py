@@ -45,13 +45,6 @@ def test_links_keep_the_margin_in_planning_alone(tmp_path: Path) -> None:
     assert planned.free(lifted, planned.room(lifted))
 
 
-def test_links_that_are_close_at_home_keep_half_of_that(tmp_path: Path) -> None:
-    made, scene = hinged(tmp_path, 0.0004)
-    planned = CollisionChecker(made, scene, MAX_STRAY_M)
-    assert planned.free(made.home)
-    assert not planned.free(np.array([-0.0003 / 0.2, 0.5]))
-
-
 @pytest.mark.parametrize(
     ("arm", "farther"),
     [(four_bar, True), (grippers.rotary, True), (lambda _: config("puma560"), False)],

@@ -54,15 +54,6 @@ def around(
     return path
 
 
-def test_free_straight_line_is_the_path(
-    planner: PathPlanner, checker: CollisionChecker, puma: Cell
-) -> None:
-    goal = puma.home + np.array([0.2, 0.0, 0.1, 0.0, 0.1, 0.5])
-    path = planner.plan(puma.home, goal, checker.first_blocked)
-    assert path is not None
-    assert np.array_equal(path.waypoints, [puma.home, goal])
-
-
 @pytest.mark.slow
 def test_path_around_the_wall_is_free_between_its_checks_too(
     planner: PathPlanner,
@@ -107,23 +98,6 @@ def test_no_path_where_goal_or_start_is_blocked(
     )[0]
     assert planner.plan(puma.home, in_the_wall, checker.first_blocked) is None
     assert planner.plan(in_the_wall, puma.home, checker.first_blocked) is None
-
-
-def test_search_without_a_way_ends_after_a_bounded_number_of_checks(
-    planner: PathPlanner, puma: Cell
-) -> None:
-    checks = 0
-
-    def walled_in(configurations: np.ndarray) -> int:
-        nonlocal checks
-        for k, q in enumerate(configurations):
-            checks += 1
-            if 0.3 < q[0] < 0.4:
-                return k
-        return len(configurations)
-
-    assert planner.plan(puma.home, puma.home + np.array([1.0, 0, 0, 0, 0, 0]), walled_in) is None
-    assert checks < 30_000
 
 
 def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(

@@ -81,14 +81,6 @@ def test_blocked_arm_says_when_the_way_is_free_again_and_continues() -> None:
     assert rack.servo.touches == 0
 
 
-@pytest.mark.slow
-def test_arm_that_looks_ahead_too_little_touches_the_obstacle() -> None:
-    rack = PrimitiveRack(CROSSING, motion=crossing(1.0), params={"lookahead": 0.001})
-    sweep(rack)
-    rack.run(4.0)
-    assert rack.servo.touches > 0
-
-
 class Watched:
     """A guard over a path of the crossing cell, and the world model that it is shown."""
 
@@ -151,19 +143,6 @@ def test_obstacle_on_its_way_into_the_path_is_seen_before_it_is_there() -> None:
     watched.world.position[-1] = meets - velocity * arrival_s
     assert watched.clear()
     watched.world.velocity[-1] = velocity
-    assert not watched.clear()
-
-
-def test_what_is_held_moves_with_the_tool() -> None:
-    lower = np.array([-0.9, 0.95, -2.95, 0.0, -1.1416, 0.0])
-    watched = Watched(np.array([lower, lower + SWEEP]), held=0)
-    watched.watch()
-    hand = watched.tool_at(lower)
-    free_of_wall = watched.clear()
-    watched.world.position[0] = hand - np.array([0.0, 0.0, 0.12])
-    watched.guard.carry(0, lower, watched.world)
-    watched.watch()
-    assert free_of_wall
     assert not watched.clear()
 
 

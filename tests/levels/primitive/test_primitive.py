@@ -152,25 +152,6 @@ def test_segment_that_cannot_be_is_an_error_and_the_next_command_is_done(
     assert rack.status.error == 0
 
 
-def test_waypoint_beyond_a_joint_range_names_joint_value_and_range() -> None:
-    rack = PrimitiveRack()
-    far = rack.home.copy()
-    far[0] = 3.0
-    rack.command(path(1, [rack.home, far]))
-    assert "waypoint 1, joint 'j1' at 3.0000 rad; valid: -2.78" in rack.run_until_error().reason
-
-
-def test_path_that_begins_slightly_off_the_arm_is_joined_smoothly() -> None:
-    rack = PrimitiveRack()
-    rack.command(path(1, [rack.home + 0.015, rack.home + TURN]))
-    assert rack.run_until_done(1)
-    assert np.abs(rack.servo.position - rack.home - TURN).max() < 1e-3
-    limits = cell("puma560").limits
-    assert (
-        np.abs(np.diff(positions(rack), n=2, axis=0)) / 0.02**2 < 1.3 * limits.acceleration
-    ).all()
-
-
 def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() -> None:
     rack = PrimitiveRack("k1607")
     corner = rack.home + 0.2

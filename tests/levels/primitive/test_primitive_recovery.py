@@ -12,7 +12,7 @@ from rack.levels.messages import Error
 from rack.levels.motion.path import BlendedPath
 from rack.levels.primitive.path_motion import PathMotion
 from rack.levels.robot.limits import Limits
-from tests.levels.box import Shown, mute
+from tests.levels.box import Shown
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive.rack import TURN, PrimitiveRack, gripper, path, two_paths
 
@@ -71,20 +71,6 @@ def test_path_whose_planner_is_lost_waits_with_a_reason() -> None:
     assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
 
 
-def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
-    rack = PrimitiveRack(params={"silent": 0.5})
-    rack.command(*two_paths(rack))
-    rack.run(0.3)
-    servo = rack.tasks["servo"]
-    servo.due = -1
-    rack.run(0.8)
-    assert rack.status.error == Error.BELOW
-    assert rack.set_points[-1]["due"] == 0
-    servo.due = rack.tick
-    assert rack.run_until_done(2)
-    assert rack.status.error == 0
-
-
 def show_servo(rack: PrimitiveRack, ticks: int, **fields: object) -> None:
     """Change fields of the servo's status for some time."""
 
@@ -133,17 +119,6 @@ def test_arm_rests_on_its_path_while_the_board_above_is_lost_and_continues_when_
     assert np.abs(rack.servo.position - rack.home).max() < 1e-3
 
 
-def test_gripper_does_not_begin_while_the_board_above_is_lost() -> None:
-    rack = PrimitiveRack()
-    rack.run(0.1)
-    rack.command(gripper(1, opening=0.0, held=0))
-    rack.boxes["em.command"].lost = True
-    rack.run(1.0)
-    assert (rack.status.done, rack.servo.opening) == (0, pytest.approx(0.04, abs=1e-3))
-    rack.boxes["em.command"].lost = False
-    assert rack.run_until_done(1)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) -> None:
@@ -163,17 +138,6 @@ def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) ->
 
 
 @pytest.mark.slow
-def test_path_that_returns_to_itself_continues_on_the_way_back() -> None:
-    rack = PrimitiveRack()
-    rack.command(path(1, [rack.home, rack.home + TURN, rack.home]))
-    rack.run(6.0, until=lambda rack: rack.read("primitive.status").progress > 0.8)
-    rack.lose("primitive", seconds(0.3))
-    rack.run(0.5)
-    assert rack.status.progress > 0.75
-    assert rack.run_until_done(1)
-
-
-@pytest.mark.slow
 def test_arm_moved_while_nobody_drove_it_does_not_fail_the_next_segment() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN]))
@@ -183,18 +147,6 @@ def test_arm_moved_while_nobody_drove_it_does_not_fail_the_next_segment() -> Non
     rack.command(path(2, [rack.home + TURN + 0.03, rack.home]))
     rack.run(1.0)
     assert (rack.status.error, rack.status.current, rack.status.blocked) == (0, 2, 1)
-
-
-@pytest.mark.slow
-def test_arm_is_held_when_the_world_model_receives_no_scene() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run(0.4)
-    rack.disturb("servo.scene", mute, seconds(1.0))
-    rack.run(0.9)
-    assert rack.status.resting
-    assert not rack.status.blocked
-    assert rack.run_until_done(2)
 
 
 @pytest.mark.slow

@@ -219,15 +219,3 @@ def test_a_model_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, case
         build(pendulum(tmp_path, **changed, joints=joints))
     assert (message or "'shoulder2' is a ball joint; valid: hinge, slide") in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def test_the_arm_of_the_cell_for_force_control_is_the_puma() -> None:
-    puma, own = cell("puma560").model, cell("penn_cell").model
-    for name in (f"link{k}" for k in range(1, 7)):
-        one, other = puma.body(name), own.body(name)
-        for field in ("mass", "inertia", "ipos", "iquat", "pos", "quat"):
-            assert np.array_equal(getattr(one, field), getattr(other, field)), (name, field)
-    for name in (f"j{k}" for k in range(1, 7)):
-        one, other = puma.joint(name), own.joint(name)
-        for field in ("axis", "range", "armature", "damping", "frictionloss"):
-            assert np.array_equal(getattr(one, field), getattr(other, field)), (name, field)

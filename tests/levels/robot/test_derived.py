@@ -63,11 +63,3 @@ def test_a_tool_may_be_a_body_and_an_offset(tmp_path: Path) -> None:
         built_cell(config(tmp_path, 'tool = "tcp"'))
     with pytest.raises(ConfigError, match=r"'velocities' is no key of \[robot\]"):
         config(tmp_path, 'guessed = ["home", "velocities"]')
-
-
-def test_excluded_bodies_touch_without_a_contact(tmp_path: Path) -> None:
-    home = "home = [0.0, 1.5, 1.2, 0.0, 0.0, 0.0]"
-    with pytest.raises(Exception, match=r"touches .desk.; move home"):
-        built_cell(config(tmp_path, home))
-    pairs = [[name, "world"] for name in ("upper_arm", "forearm", "wrist", "hand", "flange")]
-    assert built_cell(config(tmp_path, f"{home}\nexclude = {pairs}".replace("'", '"')))

@@ -89,17 +89,6 @@ def test_fingers_that_settle_elsewhere_than_they_are_posed_are_refused(tmp_path:
         GripperConfig(actuator="grip", joint="elbow", open=0.1, closed=0.1, force=1.0)
 
 
-def test_links_that_overlap_do_not_hold_the_gripper(tmp_path: Path) -> None:
-    arm = grippers.rotary(tmp_path)
-    model = tmp_path / "puma560.xml"
-    knuckle = '<geom name="knuckle" type="box" size=".01 .02 .02" pos="0 0 .01"/>{}'
-    pad = '<geom class="pad" name="pad_left"'
-    model.write_text(model.read_text().replace(pad, knuckle.format(pad)))
-    made, data = closing(arm, 1.0)
-    assert made.gripper is not None
-    assert data.qpos[made.gripper.linkage.driven] < 0.0
-
-
 def test_a_light_drive_gets_the_inertia_that_its_loop_needs(tmp_path: Path) -> None:
     made, data = closing(grippers.rotary(tmp_path, armature=""), 1.0)
     assert made.gripper is not None

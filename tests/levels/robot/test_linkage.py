@@ -57,22 +57,6 @@ def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> Non
     assert away(made, settled(made, -1.0)) < 1e-3
 
 
-def test_joint_on_a_spring_is_posed_at_its_stop(tmp_path: Path) -> None:
-    # Without its loop the left tip has a spring that presses it outwards against a stop, as
-    # underactuated fingers have.
-    robot, scene = four_bar(tmp_path)
-    arm = tmp_path / "puma560.xml"
-    text = arm.read_text().replace('name="loop_left"', 'name="loop_left" active="false"')
-    spring = '<joint name="tip_left" range="-10 20" stiffness=".5" springref="40" '
-    text = text.replace('<joint name="rod_left" ', '<joint name="rod_left" stiffness=".1" ')
-    arm.write_text(text.replace('<joint name="tip_left" ', spring))
-    made = build_cell(robot, scene, CLOCK_NS)
-    assert made.gripper is not None
-    qpos = np.array(made.model.qpos0)
-    made.gripper.linkage.set(qpos, 0.3)
-    assert qpos[made.model.joint("tip_left").qposadr[0]] == pytest.approx(np.deg2rad(20), abs=1e-3)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -125,39 +125,6 @@ def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(
     assert rig.status.violations == 0
 
 
-def test_an_arm_that_falls_while_it_is_to_ramp_to_rest_is_braked() -> None:
-    rig, dash = dashing("k1607", 0, 1.0, on_actuator_fault="stop")
-    rig.inject("actuator-saturated", joint=3, part=0.05)
-    rig.run(6, dash.at)
-    assert (rig.status.stopped, rig.status.braked) == (1, 0)
-    rig.run(150, dash.at)
-    assert (rig.status.violations, rig.status.stopped, rig.status.braked) == (0, 1, 1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "cycles"), [("command-nan", 120), ("command-limit", 1)])
-def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torques_are_valid(
-    kind: str, cycles: int
-) -> None:
-    rig, dash = dashing("puma560", 0, 1.0)
-    parameters = {"factor": 5.0} if kind == "command-limit" else {}
-    begun = rig.inject(kind, joint=0, **parameters)
-    rig.run(cycles, dash.at)
-    alarm = Alarm.COMMAND_INVALID if kind == "command-nan" else Alarm.COMMAND_LIMIT
-    assert [(f.tick, f.finding.alarm) for f in rig.found if f.finding.alarm is alarm] == [
-        (begun, alarm)
-    ]
-    assert (rig.status.stopped, rig.status.braked) == (1, 1)
-    assert not rig.status.torque.any()
-    rig.heal()
-    rig.run(1, dash.at)
-    assert (rig.status.stopped, rig.status.braked) == (0, 0)
-    goal = dash.at(60.0)
-    rig.run(1600, lambda _: goal)
-    assert rig.status.position == pytest.approx(goal[0], abs=1e-3)
-    assert rig.status.violations == 0
-
-
 def test_a_dead_motor_is_found_where_dry_friction_changes_sign_and_hides_it() -> None:
     rig = ServoRig(*config("puma560"))
     home = np.array(config("puma560")[0].home)

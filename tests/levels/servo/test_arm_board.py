@@ -169,26 +169,6 @@ def test_stop_brings_the_arm_to_rest_by_torques_before_it_is_braked() -> None:
     assert rig.braked[-1]
 
 
-class Restless(JointServo):
-    """Never sees that the arm is stopped, only that it is braked."""
-
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Servo on."""
-        read.status.value.stopped = read.status.value.braked
-        super().process(read, write, tick)
-
-
-def test_arm_that_its_boards_do_not_bring_to_rest_is_braked() -> None:
-    rig = JointRig(TOGETHER, servo=Restless)
-    rig.run(WARM_UP)
-    operator = Operator(rig.rack)
-    operator.say("arm", Operation.HOLD)
-    rig.run(50)
-    assert not rig.braked[-1]
-    rig.run(700)
-    assert rig.braked[-1]
-
-
 @pytest.mark.slow
 def test_operator_of_the_arm_holds_it_and_lets_it_go() -> None:
     rig = swinging()

@@ -10,7 +10,6 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
-from rack.backplane.words import Demand
 from rack.boards.config import load
 from rack.levels.arm import DriveState, Sensed, SimulatedArm
 from rack.levels.messages import Error
@@ -20,7 +19,7 @@ from rack.levels.servo import ServoExecutor
 from rack.levels.tables import SceneConfig
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
-from tests.levels.lockstep import Lockstep, Operator
+from tests.levels.lockstep import Operator
 from tests.levels.servo.rig import Course, ServoRig
 from tests.levels.whole_rack import WholeRack
 
@@ -51,20 +50,6 @@ class StatefulArm(IdealArm):
         super().step(ticks)
         if self.state is DriveState.ENABLING and self.tick >= self._ready_at:
             self.state = DriveState.ENABLED
-
-
-class SlowArm(StatefulArm):
-    """Its drives take some ticks to be disabled, too."""
-
-    left_at = -1
-
-    def disable(self) -> None:
-        self.left_at = self.tick + self.ticks
-
-    def step(self, ticks: int) -> None:
-        super().step(ticks)
-        if self.tick == self.left_at:
-            self.state = DriveState.DISABLED
 
 
 class OffArm(IdealArm):
@@ -189,35 +174,6 @@ def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_rest
     assert (0.1 * limits < fastest).any()
 
 
-def test_an_arm_enabled_under_a_demand_is_enabled_and_waits_for_its_end(tmp_path: Path) -> None:
-    servo = rig(tmp_path)
-    servo.rack.demand = Demand.BRAKE
-    Operator(servo.rack).say("servo", Operation.ENABLE)
-    servo.run(50)
-    assert servo.status.reason.startswith("demand 'brake' on the arm")
-    assert (servo.status.error, servo.state.error, servo.status.braked) == (0, 0, 1)
-    servo.rack.demand = Demand.NONE
-    servo.run(5)
-    assert not servo.status.braked
-
-
-def test_an_arm_is_braked_at_once_when_its_operator_disables_it_however_long_its_drives_take(
-    tmp_path: Path,
-) -> None:
-    servo = rig(tmp_path, "SlowArm")
-    operator = Operator(servo.rack)
-    for _ in range(2):
-        operator.say("servo", Operation.ENABLE)
-        servo.run(50)
-        assert (servo.status.braked, servo.status.answer) == (0, Answer.DONE)
-        operator.say("servo", Operation.DISABLE)
-        servo.run(3)
-        assert servo.servo.arm.state is DriveState.ENABLED
-        assert (servo.status.braked, servo.status.error) == (1, Error.DISABLED)
-        servo.run(10)
-        assert servo.servo.arm.state is DriveState.DISABLED
-
-
 @pytest.mark.parametrize("latency_ticks", [0, 2])
 def test_offsets_make_positions_of_what_the_drives_give(tmp_path: Path, latency_ticks: int) -> None:
     calibration = {"offset": (0.1, -0.2)}
@@ -289,23 +245,3 @@ def test_a_fault_of_the_drives_that_nobody_resets_is_the_tasks() -> None:
     task = rack.run_to_end(20.0)
     assert (task.state, task.error) == (State.ERROR, Error.STALLED)
     assert "waiting for servo: drives: j2: encoder lost" in task.reason
-
-
-@pytest.mark.slow
-def test_planned_motion_is_slow_until_the_release() -> None:
-    rack, operator, arm = whole(bring_up=0.2)
-    limits = arm.cell.limits.velocity
-    fastest = np.zeros(len(limits))
-
-    def look(rack: Lockstep) -> bool:
-        np.maximum(fastest, np.abs(arm._state[1]), out=fastest)
-        return bool(rack.read("task.status").action)
-
-    assert rack.run(60.0, look)
-    assert rack.read("servo.status").slowed
-    assert 0.1 < (fastest / limits).max() <= 0.2
-    operator.say("servo", Operation.RELEASE)
-    fastest[:] = 0.0
-    rack.run(30.0, lambda rack: look(rack) and rack.read("task.status").state == State.DONE)
-    assert rack.task.state == State.DONE
-    assert (fastest / limits).max() > 0.25

@@ -12,7 +12,7 @@ from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
-from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config, pendulum
+from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
 from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
 
 GOALS = {
@@ -140,50 +140,6 @@ def test_a_set_point_due_in_the_far_future_is_refused() -> None:
     rig.run(20)
     assert rig.status.holding == 1
     assert rig.status.clipped == 20
-
-
-def test_a_scene_is_filled_in_the_cycle_before_those_of_its_readers() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.run(100, move.at)
-    seen, filled = rig.rack.tasks["servo"].write.scene.tool_position.copy(), []
-    for _ in range(4 * PERIOD):
-        rig.run(1, move.at)
-        if not np.array_equal(seen, scene := rig.rack.tasks["servo"].write.scene.tool_position):
-            seen = scene.copy()
-            filled.append(rig.rack.tick)  # the tick at which it is visible
-    assert len(filled) == 4
-    assert all(tick % PERIOD == 0 for tick in filled)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "drives",
-    [
-        (
-            '<motor joint="shoulder" gear="20" ctrlrange="-2 2"/><motor joint="elbow"'
-            ' ctrlrange="-20 20"/>'
-        ),
-        (
-            '<position joint="shoulder" kp="900" kv="9" forcerange="-40 40"/>'
-            '<position joint="elbow" kp="90" forcerange="-20 20"/>'
-        ),
-        (
-            '<general joint="shoulder" dyntype="filter" dynprm=".1" gainprm="9" forcerange="-40'
-            ' 40"/><velocity joint="elbow" kv="4" forcerange="-20 20"/>'
-        ),
-    ],
-)
-def test_a_foreign_arm_follows_by_its_config_alone(tmp_path: Path, drives: str) -> None:
-    robot = pendulum(tmp_path, drives)
-    rig, move = (
-        ServoRig(robot, SceneConfig()),
-        Course(np.array(robot.home), np.array([-0.5, 1.2]), 1.5),
-    )
-    rig.run(200)
-    assert rig.status.position == pytest.approx(robot.home, abs=1e-4)
-    rig = ServoRig(robot, SceneConfig())
-    rig.run(700, move.at)
-    assert np.abs(rig.errors(move.at)).max() < 0.33e-3
 
 
 WEIGHT = """

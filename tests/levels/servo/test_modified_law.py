@@ -147,10 +147,6 @@ class Bench:
         return 3.0 + 10.0 * motion.position + 0.0 * state[1]
 
 
-def swing(tick: int) -> float:
-    return 0.5 * np.sin(0.01 * tick)
-
-
 @pytest.mark.parametrize(
     ("name", "after"),
     [("Half", 1.5), ("Further", 13.0), ("Nine", 9.0)],
@@ -171,26 +167,6 @@ def test_a_switch_begins_at_the_last_torque_and_goes_over_to_the_modified_law_in
     back = bench.run(TRANSFER_TICKS + 1)
     assert back[0] == pytest.approx(after, abs=1e-12)
     assert back[-1] == 3.0
-
-
-@pytest.mark.parametrize("name", ["Half", "Further", "Nine"])
-def test_no_step_at_any_switch_under_motion(name: str) -> None:
-    bench, torque = Bench(it=name), [Bench(it=name).run(1, swing)]
-    # Also while the transfer before it lasts.
-    for samples, is_on in (
-        (40, True),
-        (120, False),
-        (20, True),
-        (10, False),
-        (80, True),
-        (200, False),
-    ):
-        torque.append(bench.run(samples, swing))
-        bench.switch("it", is_on)
-    steps = np.abs(np.diff(np.concatenate(torque)))
-    in_motion, decay = 10.0 * 0.5 * 0.01, 1.5 / TRANSFER_TICKS
-    assert steps.max() <= in_motion + decay * 10.5
-    assert steps[40] < 1e-12 > steps[160]
 
 
 def test_modifications_act_at_their_hooks_in_the_order_of_the_config() -> None:
@@ -313,16 +289,6 @@ def test_a_notch_removes_its_frequency_and_passes_others(
         notch.modify(sample)
         passed.append(sample.torque[0])
     assert least <= np.abs(np.array(passed[500:]) - 5.0).max() <= most
-
-
-def test_a_modification_that_assigns_a_vector_fills_it() -> None:
-    sample = sample_of(wanted_position=1.0)
-    torque, seen = sample.torque, sample.seen
-    sample.torque = 2.0 * np.ones(JOINTS)
-    sample.torque -= 0.5
-    sample.wanted_velocity = sample.wanted_position + 1.0
-    assert torque.tolist() == [1.5] * JOINTS
-    assert seen[1].tolist() == sample.motion.velocity.tolist() == [2.0] * JOINTS
 
 
 MISTAKES = {

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.backplane.words import Demand
 from rack.levels.operator import Answer, Operation
 from tests.levels.arms import cell, config
 from tests.levels.lockstep import Operator
@@ -53,17 +52,6 @@ def test_a_restarted_board_puts_its_modifications_in_again() -> None:
     rig.restart()
     rig.torques(3, COURSE.at)
     assert rig.status.reason == "modified by pd"
-
-
-def test_a_switch_while_the_arm_is_braked_acts_at_once_when_it_is_released() -> None:
-    rig, operator = rig_of(pd=PD), None
-    rig.torques(100, COURSE.at)
-    rig.rack.stop(Demand.BRAKE, 40)
-    rig.torques(20, COURSE.at)
-    operator = Operator(rig.rack)
-    operator.modify("servo", "pd", True)
-    rig.torques(40, COURSE.at)
-    assert (rig.status.braked, rig.status.reason) == (0, "modified by pd")
 
 
 def test_a_hold_stays_in_force_over_a_modification_and_an_unknown_one_is_refused() -> None:

@@ -123,16 +123,6 @@ def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
 
 
-@pytest.mark.slow
-def test_a_restarted_board_continues_with_the_command_in_force(rig: ServoRig) -> None:
-    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
-    rig.run(2 * SECOND, COURSE.at)
-    rig.restart()
-    rig.run(SECOND, COURSE.at)
-    assert (rig.status.standing, rig.status.answer) == (Operation.SETPOINT, Answer.DONE)
-    assert np.abs(rig.status.position - AWAY).max() < 1e-3
-
-
 def assert_within_limits(targets: Array) -> None:
     """Hold the reference, (ticks, joints), rad, against the limits of planned motion, by
     differences."""

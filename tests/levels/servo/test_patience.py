@@ -105,19 +105,6 @@ def test_a_fault_of_any_joint_that_outlasts_the_patience_is_latched_with_its_cau
     assert (rig.status.state, rig.status.braked) == (State.ERROR, 1)
 
 
-def test_a_wait_names_its_cause_and_the_tick_at_which_it_ends() -> None:
-    rig = swinging()
-    begun = rig.inject("sensor-bias", joint=2, size=0.31)
-    rig.run(10, swing)
-    assert rig.status.state == State.HOLDING
-    assert rig.status.reason.startswith("sensor of 'j3' reads -")
-    assert rig.status.reason.endswith(f"off by 0.31; latched at tick {begun + PATIENCE_TICKS - 1}")
-    rig.run(PATIENCE_TICKS, swing)
-    assert [f.tick for f in rig.found if f.finding.alarm is Alarm.LATCHED] == [
-        begun + PATIENCE_TICKS - 1
-    ]
-
-
 def test_a_latched_fault_outlasts_a_restart_of_the_board() -> None:
     rig = swinging()
     rig.inject("sensor-nan", joint=1)

@@ -64,17 +64,6 @@ def test_a_fault_is_found_in_time_the_arm_braked_and_motion_resumed_and_the_stat
     assert rig.alarms().count(alarm) == 1
 
 
-def test_a_bias_that_begins_while_the_servo_is_dead_is_found_when_it_is_back() -> None:
-    rig = rig_under_way()
-    rig.miss(10_000)
-    for _ in range(20):
-        rig.step()
-    rig.inject("sensor-bias", size=0.05, joint=1)
-    rig.restart()
-    rig.run(1, move().at)
-    assert Alarm.SENSOR_MODEL in rig.alarms()
-
-
 @pytest.mark.parametrize("speed", [2e-4, 2e-3, 2e-2])
 def test_a_stuck_sensor_is_found_before_its_joint_runs_away_however_slow_the_set_points_are(
     speed: float,
@@ -100,24 +89,6 @@ def test_a_joint_that_crept_while_its_sensor_was_stuck_is_trusted_again_where_it
     assert rig.alarms(*BRAKES) == [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED]
     assert rig.status.reason == ""
     assert rig.status.position == pytest.approx(rig.servo.arm.sense().position, abs=1e-6)
-
-
-def test_noise_on_a_joint_that_was_in_doubt_is_not_taken_for_where_it_is() -> None:
-    rig, home = ServoRig(*config("puma560")), move().start
-    rig.run(200, lambda _: (home, np.zeros(6)))
-    rig.inject("sensor-nan", joint=0)
-    rig.run(40, lambda _: (home, np.zeros(6)))
-    rig.heal()
-    rig.run(40, lambda _: (home, np.zeros(6)))
-    assert rig.status.stopped == 0
-    rig.inject("sensor-noise", size=0.01, joint=5)
-    for _ in range(100):
-        rig.run(1, lambda _: (home, np.zeros(6)))
-        assert rig.status.position == pytest.approx(home, abs=1e-3)
-    assert rig.alarms(*BRAKES)[-1] is Alarm.SENSOR_MODEL
-    rig.heal()
-    rig.run(40, lambda _: (home, np.zeros(6)))
-    assert rig.status.stopped == 0
 
 
 def test_an_offset_too_small_to_matter_is_accepted_at_rest() -> None:

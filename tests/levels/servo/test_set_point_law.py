@@ -19,7 +19,7 @@ from rack.levels.operator import Answer, Operation
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.servo.control import LoopGains, SetPointLaw
 from rack.levels.servo.curves import Motion
-from rack.levels.tables import CalibrationConfig, Interface, SceneConfig
+from rack.levels.tables import Interface, SceneConfig
 from tests.levels.arm.test_own_arm import GOAL, START
 from tests.levels.arm.test_set_points import SET_POINTS, ServoArm
 from tests.levels.arms import CLOCK_NS, pendulum
@@ -69,18 +69,6 @@ def test_it_follows_a_course(tmp_path: Path, interface: Interface, arm: str) -> 
     # It says what torque was predicted for the motion: at rest that of gravity.
     holding = servo.servo.terms().bias
     assert servo.status.torque == pytest.approx(holding, abs=0.3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_drives_that_count_from_elsewhere_get_set_points_as_they_count(
-    tmp_path: Path, interface: Interface
-) -> None:
-    servo = rig(tmp_path, interface, calibration=CalibrationConfig(offset=(0.3, -0.2)))
-    servo.run(500, COURSE.at)
-    truth = servo.servo.arm.sense().position + np.array([0.3, -0.2])
-    assert np.abs(truth - GOAL).max() < 5e-4
-    assert not servo.alarms()
 
 
 @pytest.mark.slow
@@ -153,22 +141,6 @@ def test_a_drive_that_does_not_follow_is_a_motor_fault(
     assert abs(found.value) == pytest.approx(servo.servo.given.following, rel=0.3)
     assert servo.status.error == Error.NONE
     assert "motor of 'elbow'" in servo.status.reason
-
-
-@pytest.mark.parametrize("interface", SET_POINTS)
-@pytest.mark.parametrize(
-    ("kind", "alarm"), [("command-nan", Alarm.COMMAND_INVALID), ("sensor-nan", Alarm.SENSOR_RANGE)]
-)
-def test_what_is_not_finite_is_not_followed(
-    tmp_path: Path, interface: Interface, kind: str, alarm: Alarm
-) -> None:
-    servo = rig(tmp_path, interface)
-    servo.run(100, COURSE.at)
-    servo.inject(kind, joint=1)
-    servo.run(3, COURSE.at)
-    assert servo.servo.arm.braked
-    assert alarm in servo.alarms()
-    assert servo.status.violations == 0
 
 
 @pytest.mark.parametrize("interface", SET_POINTS)

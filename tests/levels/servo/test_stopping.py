@@ -180,17 +180,3 @@ def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_the
     found = [(begun + missed, closed), (begun + missed, opened)]
     assert rig.found == (found if missed > 1 else [])
     assert rig.status.stopped == 0
-
-
-def test_a_servo_that_dies_while_the_arm_is_braked_finds_it_braked() -> None:
-    rig, move = rig_under_way()
-    rig.rack.demand = Demand.BRAKE
-    rig.run(200, move.at)
-    rest = rig.status.position.copy()
-    rig.miss(10_000)
-    for _ in range(3):
-        rig.step()
-    rig.restart()
-    rig.run(100, move.at)
-    assert rig.status.braked == 1
-    assert rig.servo.arm.sense().position == pytest.approx(rest, abs=1e-4)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -123,16 +122,6 @@ def test_what_cannot_be_done_is_refused_with_what_can(
         assert rehearsed(start, {"do": "goto", "position": [float(x) for x in place]}).moves
 
 
-@pytest.mark.slow
-def test_refused_transfer_says_that_to_pick_is_blocked(start: Rehearsal) -> None:
-    on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
-    buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))
-    refused = refusal(buried, TRANSFER)
-    assert refused.code == Error.NO_PATH
-    assert "pick block1: " in str(refused)
-    assert "'block2' are" in str(refused)
-
-
 def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> None:
     moves = rehearsed(start, TRANSFER, HOME).moves
     times = finish_times(moves, 4.0, CONTEXT, TaskParams())
@@ -167,14 +156,6 @@ def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(
     assert refused_run.primitive.done == 0
     assert not refused_run.primitive.current
     assert refused_run.read("servo.status").position == pytest.approx(ROBOT.home, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_earliest_time_that_was_reported_can_be_met(refused_run: WholeRack) -> None:
-    earliest = refused_run.read("task.plan").earliest
-    rack = WholeRack(actions=[REACH, {**HOME, "by": earliest + 1e-6}])
-    assert rack.run_to_end(earliest + 2.0).state == State.DONE
-    assert rack.seconds <= earliest + 1.0
 
 
 def test_time_of_another_rack_is_not_refused_for_the_rounding_of_its_offset() -> None:

@@ -150,16 +150,6 @@ def test_task_that_an_operator_holds_stands_still_as_long_as_that_lasts() -> Non
     assert bench.status.error == Error.STALLED
 
 
-def test_restarted_executor_remembers_what_was_done() -> None:
-    bench = Bench(HOME)
-    bench.plan([0] * (WINDOW + 2))
-    bench.cycle(done=2)
-    bench.restart("task")
-    bench.cycle()
-    assert bench.status.moves_done == 2
-    assert bench.window() == list(range(3, WINDOW + 3))
-
-
 class Obedient(Executor):
     """A level below that does every move as soon as it is shown."""
 

@@ -132,16 +132,6 @@ def test_a_joint_that_is_slower_than_the_others_is_judged_by_itself() -> None:
     assert subjects == [f"system, {chains.text}" for chains in timing.parallel]
 
 
-def test_chains_of_equal_cycles_are_one_only_if_they_are_every_combination() -> None:
-    pairs = [board("a", 40), board("b", 4, "a"), board("c", 40), board("d", 4, "c")]
-    assert [chains.text for chains in rack(*pairs).parallel] == ["a > b", "c > d"]
-    slower = rack(*pairs).changed("c", every=80).longest_cycles
-    assert slower == {"a": 40, "b": 40, "c": 80, "d": 80}
-    crossed = rack(*pairs[:3], board("d", 4, "a c"))
-    assert [chains.text for chains in crossed.parallel] == ["a > b", "a > d", "c > d"]
-    assert set(crossed.changed("c", every=80).longest_cycles.values()) == {80}
-
-
 def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
     found = rack(*boards, board("alone", 7), goal_ns=60 * 2.0 * MS).longest_cycles

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import pytest
 
 from rack.levels.timing.response_time import (
-    TURN_NS,
     Load,
     blocking_ns,
     load_of,
@@ -171,16 +170,6 @@ def test_two_tasks_respond(
     ]
     found = response_times(tasks)
     assert [found.get("one"), found.get("other")] == expected
-
-
-def test_ordinary_tasks_share_time_by_turns() -> None:
-    tasks = [timed("brief", 0, 0, 100, computing(3)), timed("long", 0, 0, 1000, computing(200))]
-    long, seldom = 50 * TURN_NS, 1000 * TURN_NS
-    assert response(3, [], sharing=[(long, seldom)], horizon=seldom) == 3 + 3 + TURN_NS
-    often = 25 * TURN_NS
-    assert response(long, [], sharing=[(3, often)], horizon=seldom) == long + 3 * 3
-    # A turn of the kernel's, 4 ms, is longer than all of it.
-    assert response_times(tasks) == {"brief": 203, "long": 209}
 
 
 def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:

@@ -126,18 +126,3 @@ def test_a_disturbance_is_taken_off_the_part_that_is_longer_than_usual() -> None
     times = trace_times.unit_times(records(*usual, disturbed, own), NOBODY)
     assert times[:-1].tolist() == [list(USUAL)] * 5
     assert times[-1].tolist() == [10, 20, 45, 30]
-
-
-def test_what_is_disturbed_in_every_cycle_is_the_longest_part() -> None:
-    # A host that takes the machine away for 50, 80 or 110 ns of each cycle.
-    often = [(10, 20, 40 + stolen, 30) for stolen in (50, 80, 110) * 10]
-    rare = (10, 70, 90, 30)
-    rows = records(*(cycle(1000 * n, parts, 100) for n, parts in enumerate([*often, rare])))
-    times = trace_times.unit_times(rows, NOBODY)
-    assert times.tolist() == [list(USUAL)] * 31
-
-
-def test_without_a_longer_part_a_disturbance_is_taken_off_all_in_proportion() -> None:
-    assert trace_times.unit_times(records(cycle(0, USUAL, 50)), NOBODY).tolist() == [
-        [5, 10, 20, 15]
-    ]

@@ -59,18 +59,6 @@ def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
     return str(caught.value)
 
 
-def test_rack_of_a_coordinator_has_a_mailbox_for_each_arm(tmp_path: Path) -> None:
-    (tmp_path / "cell.toml").write_text(RACK)
-    names = {box.name for box in resolve(load(tmp_path / "cell.toml")).layout.mailboxes}
-    assert {
-        "task.order_puma",
-        "task.order_k1607",
-        "task.progress",
-        "lan.puma",
-        "lan.k1607",
-    } <= names
-
-
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [

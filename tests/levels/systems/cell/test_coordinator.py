@@ -183,16 +183,6 @@ def test_arm_that_is_lost_holds_the_others_and_the_program() -> None:
     assert bench.order("puma").hold == 0
 
 
-def test_arms_that_never_report_are_waited_for_so_long() -> None:
-    bench = CellBench([TRANSFER, REACH], stalled_s=3.0, farewell_s=1.0)
-    bench.say("puma")
-    bench.cycles(3)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "no report from k1607 yet")
-    bench.cycles(20)
-    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
-    assert bench.status.reason == "nothing has happened for 3 s: no report from k1607 yet"
-
-
 def test_restarted_board_goes_on_where_it_was() -> None:
     bench = CellBench([TRANSFER, REACH], [BENT])
     bench.both(Response.NONE)

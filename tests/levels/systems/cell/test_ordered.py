@@ -160,20 +160,6 @@ def test_times_are_those_of_the_rack_that_gives_the_orders() -> None:
     assert report.error == Error.TOO_LATE
 
 
-def test_time_of_a_rack_whose_clock_is_not_compared_is_waited_for() -> None:
-    bench = OrderBench(uncertainty=-1.0)
-    bench.order(OrderVerb.ASK, Home(by=30.0))
-    bench.run(2.0)
-    why = "the clock of rack 'cell' has not been compared yet"
-    assert (bench.status.state, bench.status.reason, bench.report.reason) == (
-        State.HOLDING,
-        why,
-        why,
-    )
-    bench.compare(50.0, 0.001)
-    assert bench.until(Response.REFUSED).reason.startswith("home, by 30 s: it is 5")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "stray_rad", "plans"),
@@ -257,16 +243,6 @@ def test_arm_whose_coordinator_stays_away_ends_its_run_and_says_so() -> None:
     bench.run(1.0)
     assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
     assert bench.status.reason == "nothing has moved for 3 s: no orders from rack 'cell' yet"
-
-
-def test_order_that_stands_still_fails_with_the_reason() -> None:
-    bench = OrderBench(stalled_s=3.0)
-    bench.ask_and_do(TRANSFER)
-    bench.lose("elemental_move", 100_000)
-    report = bench.until(Response.FAILED)
-    assert report.error == Error.STALLED
-    assert report.reason.startswith("nothing has moved for 3 s: no status from the level below")
-    assert bench.status.state != State.ERROR
 
 
 @pytest.mark.slow

@@ -220,20 +220,6 @@ def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
     assert pair.alpha.claim == pair.beta.claim == Claim(2, b"beta")
 
 
-@pytest.mark.slow
-def test_a_rack_launched_anew_gets_its_part_back_where_the_other_saw_it(pair: Pair) -> None:
-    pair.lift(pair.alpha)
-    pair.put_down(pair.alpha)
-    moved = pair.alpha.part
-    moved[0] += 0.05
-    cast(SharingArm, pair.alpha.servo.arm).place(0, moved)
-    pair.run(0.1)
-    pair.alpha = Hoist(pair.folder, "alpha")
-    pair.run(0.2)
-    assert pair.alpha.claim == pair.beta.claim == Claim(1, b"alpha")
-    np.testing.assert_allclose(pair.alpha.part, moved, atol=1e-4)
-
-
 def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
     """Return a message of a rack: the claim that it knows, and where its copy is."""
     message = Message(SHARED_BODIES.dtype({}))

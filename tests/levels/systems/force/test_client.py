@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -16,7 +15,6 @@ from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.force.client import ForceMotions, ForceProgram
 from rack.levels.systems.force.messages import SERVER_STATUS, Mode
-from rack.levels.systems.force.server import ForceServer
 from rack.levels.systems.trajectory.messages import MotionKind
 from tests.levels.arms import config
 
@@ -181,11 +179,3 @@ def test_a_program_that_is_impossible_is_found_before_the_launch(
 ) -> None:
     found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))
     assert [(place, why) for place, _, why in found] == [(key, reason)]
-
-
-def test_an_arm_without_a_sensor_has_no_contacts_and_no_server() -> None:
-    bare = ROBOT.model_copy(update={"wrist": None})
-    reasons = [reason for _, _, reason in ForceProgram.model_validate(TASK).misfits(bare, SCENE)]
-    assert reasons == ["the arm has no wrist sensor"] * 2
-    ((key, server, _),) = ForceServer.misfits(replace(CONTEXT, robot=bare), (), ())
-    assert (key, server) == ("executor", "ForceServer")

@@ -101,18 +101,6 @@ def test_a_surface_that_is_not_there_ends_compliance_with_a_reason() -> None:
     assert rig.places[0][2] - rig.places[-1][2] < 0.03
 
 
-def test_a_force_that_swings_about_the_wanted_one_has_not_settled() -> None:
-    rig = ServerRig(reach=1.0)
-    rig.floor = HEIGHT + 0.0355  # at home the pad presses there
-    press = rig.comply(20.0)
-    for cycle in range(100):
-        rig.floor += 0.003 if cycle % 12 == 0 else -0.003 if cycle % 12 == 6 else 0.0
-        rig.cycle()
-    assert sum(abs(force - 20.0) < 5.0 for force in rig.pressed) > 10
-    assert rig.ends() == {press: RequestEnd.FAILED}
-    assert rig.mode is Mode.MOTION
-
-
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
@@ -130,14 +118,6 @@ def test_an_impossible_contact_is_refused(fields: dict[str, object], why: str) -
     assert rig.ends() == {press: RequestEnd.REFUSED}
     assert rig.status.reason == f"request {press}: {why}"
     assert rig.mode is Mode.MOTION
-
-
-def test_a_guard_in_another_frame_is_refused_while_axes_are_of_force() -> None:
-    rig = pressing()
-    other = rig.request(MotionKind.GUARD, frame=(1, 0, 0, 0), guard=(5, 0, 0, 0, 0, 0))
-    rig.run(0.3)
-    assert rig.ends()[other] == RequestEnd.REFUSED
-    assert rig.mode is Mode.FORCE
 
 
 def test_a_restarted_server_goes_on_with_the_same_contact() -> None:

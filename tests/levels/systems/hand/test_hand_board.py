@@ -87,21 +87,6 @@ def test_silent_or_lost_board_closes_the_valves_until_it_is_back() -> None:
     assert_follows(rig)
 
 
-def test_board_that_sees_nothing_new_closes_the_valves() -> None:
-    rig = swinging()
-    rig.swing("index").is_blind = True
-    rig.cycles(8)
-    status = rig.status
-    assert (status.state, status.stopped) == (State.HOLDING, 1)
-    assert (
-        status.reason
-        == "stale tensions from board 'index': based on a status more than 20 ticks old"
-    )
-    rig.swing("index").is_blind = False
-    rig.cycles(10)
-    assert_follows(rig)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("demand", [Demand.STOP, Demand.BRAKE])
 def test_emergency_stop_closes_the_valves_and_keeps_the_tensions(demand: Demand) -> None:
@@ -144,18 +129,6 @@ def test_tension_beyond_its_limits_is_cut(asked: float, given: float) -> None:
     assert [(found.alarm, found.value) for found in rig.executor.findings] == [
         (Alarm.TENSION_LIMIT, asked)
     ]
-
-
-def test_restarted_board_finds_the_hand_where_the_valves_have_kept_it() -> None:
-    rig = swinging()
-    before = rig.status.position
-    rig.lose("hand", ticks=50 * EVERY)
-    rig.cycles(52)
-    status = rig.status
-    assert (status.stopped, status.violations) == (1, 0)
-    assert np.abs(status.position - before).max() < 0.3
-    rig.cycles(10)
-    assert_follows(rig)
 
 
 def tear(rig: HandRig, joint: int, side: int) -> None:

@@ -41,13 +41,6 @@ def flexed(hand: SimulatedHand, joint: int, flexor: float) -> Array:
     return tension
 
 
-def test_open_hand_carries_its_weight_before_the_first_command() -> None:
-    hand = hand_of()
-    hand.step(1000)
-    assert hand.sense().position == pytest.approx(hand.cell.home, abs=1e-6)
-    assert (hand.braked, hand.touches, hand.violations, hand.fault) == (True, 0, 0, "")
-
-
 def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_the_valve() -> None:
     hand = hand_of()
     before = hand.sense().tension[FLEXOR, INDEX1]
@@ -82,23 +75,6 @@ def test_no_pull_breaks_a_limit_at_any_step() -> None:
             hand.pull(tension)
             hand.step(EVERY)
     assert (hand.violations, hand.pushed, hand.first_violation, hand.fault) == (0, 0, "", "")
-
-
-@pytest.mark.slow
-def test_closed_valves_bring_a_moving_finger_to_rest_and_a_stiffer_one_sooner() -> None:
-    ways = []
-    for stiff in (1000.0, 4000.0):
-        hand = hand_of(stiff)
-        for _ in range(20):
-            hand.pull(flexed(hand, INDEX1, 30.0))
-            hand.step(EVERY)
-        begun = float(hand.sense().position[INDEX1])
-        assert hand.sense().velocity[INDEX1] > 1.0
-        hand.close()
-        hand.step(2000)
-        ways.append(float(hand.sense().position[INDEX1]) - begun)
-        assert abs(hand.sense().velocity[INDEX1]) < 0.05
-    assert 0.0 < ways[1] < 0.7 * ways[0]
 
 
 def test_contact_pushes_a_fingertip_away_from_what_it_touches() -> None:

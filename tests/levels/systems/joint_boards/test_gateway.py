@@ -110,15 +110,6 @@ def test_missing_references_are_extrapolated_without_a_gap(count: int) -> None:
     assert [position for _, _, position in rig.given] == pytest.approx(wanted)
 
 
-@pytest.mark.slow
-def test_references_that_are_always_late_are_extrapolated_from_the_newest() -> None:
-    rig = GatewayRig()
-    rig.run(100)
-    rig.run(300, late=3 * PERIOD)
-    assert rig.write.command.due > rig.tick
-    assert rig.given[-1][2] == pytest.approx(SPEED * TICK_S * (rig.given[-1][1] - LATENCY))
-
-
 def test_after_too_many_missing_the_arm_is_left_to_the_boards_and_then_joined_again() -> None:
     rig = GatewayRig()
     # A level above that wants no motion is obeyed without extrapolation.

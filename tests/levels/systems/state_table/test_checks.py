@@ -136,19 +136,6 @@ def test_every_mistake_is_found_with_its_row(tmp_path: Path, mistake: str) -> No
     ), expected
 
 
-def test_all_mistakes_of_a_table_are_reported_together(tmp_path: Path) -> None:
-    text = DOOR
-    for mistake in ("unknown condition", "unknown parameter", "unknown status", "missing reason"):
-        before, after, _ = MISTAKES[mistake]
-        text = text.replace(before, after)
-    assert [line.split(":")[0] for line in found(tmp_path, text)] == [
-        "row 1 'open it'",
-        "row 4 'moves'",
-        "row 5 'arrived'",
-        "row 6 'jams'",
-    ]
-
-
 @pytest.mark.parametrize(
     "text", ["start = ", "start = 3", 'start = "shut"', "\x00", 'start = "shut"\nrow = 5']
 )

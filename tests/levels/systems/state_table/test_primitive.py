@@ -13,8 +13,6 @@ from rack.boards.config import load
 from rack.boards.config.resolved import resolve
 from rack.levels.level import LevelContext, Ports
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
-from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS
-from rack.levels.systems.state_table.level import TABLE_STATUS, WORD_COMMAND
 from rack.levels.systems.state_table.primitive import (
     GRIP_CYCLES,
     JOINT_MOVE,
@@ -169,19 +167,6 @@ def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: s
     assert bench.level._curve is None
 
 
-@pytest.mark.parametrize(
-    ("off", "arm"), [(0.009, "arrived"), (-0.009, "arrived"), (0.011, "moving")]
-)
-def test_a_joint_that_is_not_where_it_is_commanded_moves(
-    bench: Bench, off: float, arm: str
-) -> None:
-    bench.follow()
-    position = bench.home.copy()
-    position[2] += off
-    bench.below[0].position = position
-    assert bench.look()["arm"] == arm
-
-
 def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) -> None:
     bench.follow()
     bench.below[1].stopped = 1
@@ -287,19 +272,6 @@ def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -
     np.testing.assert_allclose(level._point[0], bench.home + 0.1)
     np.testing.assert_allclose(level._end, bench.home + 0.2)
     assert fresh.command.id == 77
-
-
-def test_whoever_changes_the_bytes_of_a_message_changes_its_version(context: LevelContext) -> None:
-    kinds = (WORD_COMMAND, TABLE_STATUS, JOINT_MOVE, JOINT_MOVE_STATUS, MOVE_TABLE_STATUS)
-    sizes = dict(context.sizes)
-    bytes_of = {kind.name: (kind.version, kind.dtype(sizes).itemsize) for kind in kinds}
-    assert bytes_of == {
-        "word_command": (1, 76),
-        "table_status": (1, 436),
-        "joint_move": (1, 176),
-        "joint_move_status": (1, 544),
-        "move_table_status": (1, 448),
-    }
 
 
 def test_a_set_point_is_due_two_cycles_after_its_release_and_carries_the_load_there(

@@ -130,19 +130,6 @@ def test_a_restarted_board_goes_on_with_the_step_under_way(bench: Bench) -> None
     assert bench.progress[0] == 4
 
 
-def test_a_hold_and_rest_of_the_level_below_are_passed_on(bench: Bench) -> None:
-    bench.cycle()
-    bench.below.resting = 1
-    bench.below.reason = "waits"
-    bench.answer(State.EXECUTING)
-    assert (bench.level.resting, bench.level.detail) == (True, "waits")
-    assert bench.write.command.hold == 0
-    bench.level._kept = "held"
-    assert bench.level.holds
-    bench.level.give(bench.write, 9)  # type: ignore[arg-type]
-    assert bench.write.command.hold == 1
-
-
 def test_objects_that_the_scene_lacks_are_named() -> None:
     plan = TaskPlanConfig.model_validate(
         {"step": [{"object": "a", "place": "x"}, {"object": "b", "place": "x"}]}

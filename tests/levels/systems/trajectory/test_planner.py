@@ -118,17 +118,6 @@ def test_a_request_that_is_not_taken_is_sent_again() -> None:
     assert rig.run(5) == [2, 3]
 
 
-def test_a_cancel_waits_for_its_time() -> None:
-    rig = PlanningRig([*MOVES[:2], {"do": "cancel", "after": 1.0}, MOVES[0]])
-    rig.run(1)
-    rig.below.taken, rig.below.current = 2, 1
-    assert rig.run(20) == []
-    rig.below.current = 2
-    assert rig.run(10) == []
-    assert rig.run(4) == [3, 4]
-    assert [record["kind"] for record in rig.sent[2:]] == [MotionKind.CANCEL, MotionKind.JOINTS]
-
-
 def test_tool_goals_become_joint_positions_near_those_before() -> None:
     place = [0.45, 0.30, 0.75]
     rig = PlanningRig(

@@ -7,7 +7,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.operator import Answer, Operation
-from rack.levels.systems.trajectory.messages import HELD, MotionKind, RequestEnd
+from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from tests.levels.systems.trajectory.rig import EVERY, PERIOD_S, TrajectoryRig
 
 DOWN = (0.0, 0.0, 1.0, 0.0)
@@ -160,20 +160,6 @@ def test_a_request_that_was_lost_is_missed_until_it_is_sent_again() -> None:
     rig.queue += [lost, lost, later]
     status = rig.run(4.0)
     assert (status.taken, status.done, status.state) == (3, 3, State.DONE)
-
-
-def test_more_than_the_level_holds_waits_in_the_queue() -> None:
-    rig = TrajectoryRig()
-    for k in range(HELD + 4):
-        rig.joints([0.01 * k, 0, 0, 0, 0, 0])
-    rig.cycle()  # it takes none before it has recalled what it holds
-    assert rig.write.status.taken == 0
-    rig.cycle()
-    assert len(rig.queue) == 4
-    assert rig.write.status.taken == HELD
-    rig.run(20.0)
-    assert not rig.queue
-    assert rig.write.status.done == HELD + 4
 
 
 def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -> None:
