@@ -177,17 +177,6 @@ def test_without_a_home_or_permission_to_read_it_code_is_compiled_in_memory(
 
 
 @pytest.mark.slow
-def test_code_is_compiled_though_numba_is_told_not_to(
-    heard: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from numba import config
-
-    monkeypatch.setattr(config, "DISABLE_JIT", 1)
-    assert called() == 3.0
-    assert len(heard) == 1
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("place", ["cache", "cache/nasrem-rack"])
 def test_a_cache_that_cannot_be_written_is_said_once_with_its_cure(
     place: str, heard: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

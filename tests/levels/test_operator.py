@@ -10,7 +10,6 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State, status
-from rack.levels.messages import Verb
 from rack.levels.operator import (
     ANSWER,
     OPERATOR_COMMAND,
@@ -172,7 +171,6 @@ def test_joints_that_cannot_be_name_the_joint_and_its_range(
 
 LEVELS = ("task", "elemental_move", "primitive", "servo")
 REACH = {"do": "goto", "position": [0.45, 0.10, 0.95]}
-TRANSFER = {"do": "transfer", "object": "block1", "to": [0.50, -0.20, 0.475]}
 HOME = {"do": "home"}
 TOUR = [REACH, HOME] * 4
 """Long enough for an operator to reach the task level in the middle of it."""
@@ -259,19 +257,3 @@ def test_gotos_leave_a_free_motion_and_the_program_continues_afterwards() -> Non
     operator.say("task", Operation.RESUME)
     assert rack.run_to_end(40.0).state == State.DONE
     assert (rack.task.detour, rack.task.moves_done) == (0, rack.task.moves)
-
-
-@pytest.mark.slow
-def test_what_is_done_with_an_object_is_done_before_a_goto() -> None:
-    rack = WholeRack(actions=[TRANSFER, HOME])
-    operator = Operator(rack)
-    assert rack.run(20.0, lambda r: r.read("elemental_move.status").verb == Verb.APPROACH)
-    serial = operator.goto("task", ASIDE, DOWN)
-    assert rack.run(30.0, answers("task", Answer.DONE, serial))
-    assert rack.task.moves_done < rack.task.moves
-    # The block is taken and not put down, or put down and left alone.
-    next_move = rack.read("task.plan").moves["verb"][rack.task.moves_done]
-    assert next_move in (Verb.MOVE, Verb.MOVE_JOINTS)
-    operator.say("task", Operation.RESUME)
-    assert rack.run_to_end(60.0).state == State.DONE
-    assert np.abs(rack.read("world.model").position[0] - TRANSFER["to"]).max() < 0.01

@@ -33,7 +33,6 @@ class WorldRig:
 
     @property
     def model(self) -> Message:
-        """The executor's last message."""
         return cast(Message, self.rack.tasks["world"].write.model)
 
     def run(self, seconds: float, poses: Poses | None) -> list[int]:

@@ -46,7 +46,6 @@ class Silence:
         return self.state
 
     def tick(self, tick: int) -> None:
-        """Let the clock make a tick."""
         self.words[System.TICK] = tick
 
     def check(self, now: int) -> list[tuple[int, int, int, float, int]]:

@@ -71,7 +71,6 @@ def silent(watched: Watched) -> list[Alarm]:
 
 
 def burn(seconds: float) -> None:
-    """Use processor time."""
     end = time.process_time() + seconds
     while time.process_time() < end:
         pass

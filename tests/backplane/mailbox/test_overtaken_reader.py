@@ -86,13 +86,11 @@ class Overtaken:
         self._slots = Slots(rack.segment, rack.segment.layout.mailbox(NAME))
 
     def write(self, cycles: int) -> None:
-        """Run cycles of the writer."""
         for _ in range(cycles):
             self.rack.writer.cycle(self.tick)
             self.tick += 1
 
     def read(self) -> None:
-        """Read at the present tick."""
         self.rack.reader.cycle(self.tick - self.tick % READ_EVERY)
 
     def is_overtaken(self, at: int, cycles: int, stops_halfway: bool) -> bool:

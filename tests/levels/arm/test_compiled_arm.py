@@ -39,7 +39,6 @@ def driven(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
 
 
 def scene(arm: SimulatedArm, made: Cell) -> Message:
-    """Return what an arm shows."""
     seen = Message(SCENE.dtype(sizes(made)))
     arm.look(seen)
     return seen

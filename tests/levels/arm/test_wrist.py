@@ -74,32 +74,6 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
     assert np.allclose(contact.torque, expected, atol=0.02)
 
 
-def test_noise_is_that_of_the_tick_and_has_its_standard_deviation(tmp_path: Path) -> None:
-    arm, exact = arm_of(tmp_path, noise=0.5), arm_of(tmp_path)
-    samples = []
-    for _ in range(300):
-        arm.step(1)
-        exact.step(1)
-        assert np.array_equal(felt(arm), felt(arm))
-        samples.append(felt(arm) - felt(exact))
-    spread = np.std(samples, axis=0)
-    assert np.allclose(spread[:3], 0.5, rtol=0.2)
-    assert np.allclose(spread[3:], 0.05, rtol=0.2)
-
-
-def test_a_sample_beyond_the_range_is_cut_and_says_nothing_of_the_contact(tmp_path: Path) -> None:
-    arm = arm_of(tmp_path, reach=60.0)
-    contact = contact_of(arm)
-    for _ in range(50):
-        push(arm, np.array([0.0, 0.0, 100.0]), STILL[:3])
-        arm.step(1)
-    assert np.abs(felt(arm)).max() == 60.0
-    contact.take(felt(arm), np.array(arm._state), STILL)
-    assert contact.saturated
-    contact.take(np.full(6, np.nan), np.array(arm._state), STILL)
-    assert contact.saturated
-
-
 def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     arms = [arm_of(tmp_path, noise=0.2) for _ in range(2)]
     state = Message(ARM_STATE.dtype(sizes(arms[0].cell)))

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.levels.messages import Error
 from rack.levels.tables import MotionConfig
 from tests.levels.whole_rack import WholeRack
 
@@ -75,17 +74,3 @@ def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() ->
     assert rack.run_to_end(30.0).state == State.DONE
     assert rack.move.reason == ""
     assert rack.read("servo.status").touches == 0
-
-
-@pytest.mark.slow
-def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
-    motion = post_moves((2.5, (0.5, 0.30, 0.95)))
-    rack = WholeRack(
-        arm="puma560_crossing",
-        actions=[ABOVE_BLOCK],
-        motion=motion,
-        params={"elemental_move": {"patience": 0.5}},
-    )
-    status = rack.run_to_end(20.0)
-    assert (status.state, status.error) == (State.ERROR, Error.NO_PATH)
-    assert "'post'" in status.reason

@@ -51,7 +51,6 @@ class Bench(Lockstep):
             self.step()
 
     def order(self, verbs: Sequence[Verb] = PICK, first: int = 1, by: float = 0.0) -> None:
-        """Hand down a window of moves."""
         command = self.message("task.command")
         for k, verb in enumerate(verbs):
             command.moves[k]["id"], command.moves[k]["verb"] = first + k, verb
@@ -80,12 +79,10 @@ class Bench(Lockstep):
 
     @property
     def command(self) -> Message:
-        """The command of the level."""
         return self.read("elemental_move.command")
 
     @property
     def status(self) -> Message:
-        """The status of the level."""
         return self.read("elemental_move.status")
 
     def segments(self) -> list[tuple[int, int]]:

@@ -49,17 +49,6 @@ def test_blends_that_touch_leave_no_line_between_them() -> None:
     assert whole.evaluate(2.0).q == pytest.approx([1.0, 1.0])
 
 
-def test_single_waypoint_is_a_path_of_length_zero() -> None:
-    path = BlendedPath([[0.3, -0.4]], [0.7])
-    point = path.evaluate(0.5)
-    assert path.length == 0.0
-    assert path.stops == []
-    assert point.q == pytest.approx([0.3, -0.4])
-    assert not point.dq_ds.any()
-    assert not point.d2q_ds2.any()
-    assert path.sample(0.1) == pytest.approx(np.array([[0.3, -0.4]]))
-
-
 def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
     # Only a corner without a blend is a stop.
     path = BlendedPath(CORNERED, [0.0, 0.0, 0.2, 0.0])

@@ -138,18 +138,6 @@ def test_servo_that_is_stopped_for_however_long_is_waited_for(demand: Demand) ->
 
 
 @pytest.mark.slow
-def test_arm_moved_while_nobody_drove_it_does_not_fail_the_next_segment() -> None:
-    rack = PrimitiveRack()
-    rack.command(path(1, [rack.home, rack.home + TURN]))
-    assert rack.run_until_done(1)
-    rack.lose("servo", seconds(0.3))
-    rack.run(0.5)
-    rack.command(path(2, [rack.home + TURN + 0.03, rack.home]))
-    rack.run(1.0)
-    assert (rack.status.error, rack.status.current, rack.status.blocked) == (0, 2, 1)
-
-
-@pytest.mark.slow
 def test_set_points_never_jump_however_often_boards_are_lost() -> None:
     chance = np.random.default_rng(1)
     rack = PrimitiveRack()

@@ -40,7 +40,6 @@ class Dash:
         return round((APPROACH_S + self.speed / self._hardest) / TICK_S) + 4
 
     def at(self, time_s: float) -> tuple[Array, Array]:
-        """Return position and velocity."""
         u = min(max(time_s / APPROACH_S, 0.0), 1.0)
         way = self._start - self._home
         position = self._home + way * u**3 * (10 - 15 * u + 6 * u * u)

@@ -25,7 +25,6 @@ each other's motion."""
 
 
 def swinging(servos: Mapping[str, Mapping[str, Any]] = APART, **arm: float | str) -> JointRig:
-    """Return a rig whose arm swings."""
     rig = JointRig(servos, **arm)
     rig.run(WARM_UP)
     assert np.ptp(rig.positions, axis=0).min() > 0.01
@@ -136,7 +135,6 @@ class Nonsense(JointServo):
     """Writes NaN for a while."""
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Servo, and spoil the torque."""
         super().process(read, write, tick)
         if WARM_UP <= tick < WARM_UP + 20:
             write.command.torque[0] = np.nan

@@ -235,13 +235,3 @@ def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
     assert rack.run_to_end(30.0).state == State.DONE
     status = rack.read("servo.status")
     assert (status.touches, status.violations) == (0, 0)
-
-
-@pytest.mark.slow
-def test_a_fault_of_the_drives_that_nobody_resets_is_the_tasks() -> None:
-    rack, _, arm = whole()
-    rack.run(20.0, lambda rack: rack.read("primitive.status").progress > 0.5)
-    arm.fault, arm.state = "j2: encoder lost", DriveState.FAULT
-    task = rack.run_to_end(20.0)
-    assert (task.state, task.error) == (State.ERROR, Error.STALLED)
-    assert "waiting for servo: drives: j2: encoder lost" in task.reason

@@ -10,14 +10,12 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array
-from rack.levels.arm import Arm, Sensed, SimulatedArm
+from rack.levels.arm import Arm, SimulatedArm
 from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell, sensed_by
 from rack.levels.servo.sensor_monitor import tolerance
 from rack.levels.tables import RobotConfig, SceneConfig, SensorConfig
-from tests.levels.arm.test_own_arm import IdealArm
 from tests.levels.arms import CLOCK_NS, config, pendulum
 from tests.levels.servo.rig import Course, ServoRig
 
@@ -80,36 +78,6 @@ def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
     assert rig.status.state == State.HOLDING
     rig.run(600, move().at)
     assert (rig.status.state, rig.status.error) == (State.ERROR, error)
-
-
-class JitteryArm(IdealArm):
-    """Takes its samples up to 0.1 ms early or late, as a bus does that is not synchronized."""
-
-    def sense(self) -> Sensed:
-        sample = super().sense()
-        by_s = np.random.default_rng(self.tick).uniform(-1e-4, 1e-4, 2)
-        return sample._replace(position=sample.position + by_s * sample.velocity)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sensors", "brakes"), [({"resolution": 0.0}, True), (None, False)])
-def test_by_default_an_arm_of_ones_own_may_be_sampled_early_or_late(
-    tmp_path: Path, sensors: dict[str, float] | None, brakes: bool
-) -> None:
-    robot = pendulum(tmp_path, sensors=sensors)
-    rig = ServoRig(robot, SceneConfig(), arm=f"{__name__}:JitteryArm")
-    ends = np.array([0.0, 0.5]), np.array([0.7, -1.4])
-
-    def back_and_forth(time_s: float) -> tuple[Array, Array]:
-        turn = int(time_s / 1.5)
-        start, goal = ends[::-1] if turn % 2 else ends
-        return Course(start, goal, 1.4).at(time_s - 1.5 * turn)
-
-    rig.run(1800, back_and_forth)  # 4.5 s
-    assert np.abs(rig.servo.arm._qd).max() < 3.0  # type: ignore[attr-defined]
-    closed = rig.alarms().count(Alarm.BRAKES_CLOSED)
-    assert (closed > 0) == brakes
-    assert (Alarm.SENSOR_MODEL in rig.alarms()) == brakes
 
 
 def test_the_monitor_says_what_it_stands(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import SceneConfig
-from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
+from tests.levels.arms import ROBOTS, cell, config
 from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
 
 GOALS = {
@@ -77,19 +77,6 @@ def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_l
     assert (np.abs(steps_of(rig.targets[400:])) <= limits * 1.01).all()
     assert np.abs(rig.status.position - rig.status.target).max() < 1e-3
     assert rig.status.clipped == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("missed", [1, 200])
-def test_missed_cycles_do_not_stretch_simulated_time_nor_break_the_motion(missed: int) -> None:
-    rig, move = rig_of("puma560"), course("puma560", 3.0)
-    rig.run(500, move.at)
-    rig.miss(missed)
-    rig.run(1000, move.at)
-    assert rig.state.tick == rig.rack.tick - 1
-    assert rig.state.state[0] == rig.state.tick * CLOCK_NS * 1e-9
-    assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
-    assert rig.status.touches == 0
 
 
 def test_a_restarted_servo_finds_the_arm_where_it_was() -> None:

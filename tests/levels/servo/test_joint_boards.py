@@ -80,17 +80,6 @@ def test_loads_of_an_arm_that_holds_are_computed_where_it_is_and_again_only_far_
     assert not np.array_equal(loads.table, at_home)
 
 
-def test_an_arm_that_holds_a_part_carries_it() -> None:
-    puma = cell("puma560")
-    empty, loaded = JointLoads(puma), JointLoads(puma)
-    message = reference(due=20, inertia=1.0, load=0.0)
-    message.payload_mass = 2.0
-    loaded.take(message, tick=0)
-    for loads in (empty, loaded):
-        loads.hold(puma.home)
-    assert np.abs(loaded.table[1] - empty.table[1]).max() > 1.0
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [

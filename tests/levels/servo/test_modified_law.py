@@ -177,14 +177,6 @@ def test_modifications_act_at_their_hooks_in_the_order_of_the_config() -> None:
     assert Bench(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
 
 
-def test_one_put_in_again_starts_anew_and_each_acts_once_a_sample() -> None:
-    bench, last = Bench(counts="Counts", half="Half"), []
-    for name, is_on in (("counts", True), ("half", True), ("counts", False), ("counts", True)):
-        bench.switch(name, is_on)
-        last.append(bench.run(60)[-1])
-    assert last == [3.0 + 60.0, 0.5 * (3.0 + 120.0), 0.5 * 3.0, 0.5 * (3.0 + 60.0)]
-
-
 def test_one_in_place_of_the_law_replaces_another() -> None:
     bench = Bench(nine="Nine", pd={"class": COMMON + "JointPd"}, huge="Huge")
     bench.switch("nine", True)
@@ -199,14 +191,6 @@ def test_one_in_place_of_the_law_replaces_another() -> None:
     tables = {name: {"class": HERE + "Nine", "on": True} for name in ("one", "two")}
     with pytest.raises(ValueError, match="one, two are on in place of the law; permitted: one"):
         ModifiableParams.model_validate({"modifications": tables})
-
-
-def test_after_braking_the_torque_is_at_once_the_laws() -> None:
-    bench = Bench(half="Half")
-    bench.run(5)
-    bench.switch("half", True)
-    bench.law.interrupt()
-    assert bench.run(1).tolist() == [1.5]
 
 
 def test_one_that_raises_is_undone_and_taken_out_in_the_same_sample() -> None:

@@ -1,11 +1,14 @@
-"""The servo level under an operator: it holds, goes to set points within its limits, and comes back
-the way it went."""
+"""The servo level under an operator: it holds, goes to set points within its limits and
+back, takes gains and control modifications."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
+from rack.backplane.message import State
 from rack.backplane.words import Demand
 from rack.levels.algebra import Array
 from rack.levels.operator import Answer, Operation
@@ -17,7 +20,9 @@ HOME = cell("puma560").home
 LIMITS = cell("puma560").limits
 AWAY = HOME + np.array([0.3, -0.2, 0.2, 0.1, -0.2, 0.3])
 COURSE = Course(HOME, HOME + 0.5 * np.array([1.0, -0.4, 0.4, 0.5, 0.5, 1.0]), 2.0)
+QUICK = COURSE._replace(duration_s=0.6)
 SECOND = round(1.0 / TICK_S)
+PD = {"class": "rack.levels.servo.common_modifications:JointPd"}
 
 
 @pytest.fixture
@@ -121,6 +126,100 @@ def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
     assert np.abs(rig.status.position - AWAY).max() > 0.01
     rig.run(3 * SECOND)
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("key", "value"), [("bandwidth", 30.0), ("damping", 0.7)])
+def test_a_gain_set_live_is_that_of_a_level_launched_with_it(key: str, value: float) -> None:
+    launched = ServoRig(*config("puma560"), **{key: value})
+    tuned = ServoRig(*config("puma560"))
+    Operator(tuned.rack).set("servo", f"{key}={value}")
+    assert (tuned.torques(300, QUICK.at) == launched.torques(300, QUICK.at)).all()
+    assert tuned.status.answer == Answer.DONE
+
+
+@pytest.mark.slow
+def test_gains_act_from_the_cycle_after_their_tick_and_survive_a_restart() -> None:
+    tuned, plain = (ServoRig(*config("puma560")) for _ in range(2))
+    before = tuned.torques(100, QUICK.at), plain.torques(100, QUICK.at)
+    assert (before[0] == before[1]).all()
+    Operator(tuned.rack).set("servo", "bandwidth=300")
+    after = tuned.torques(100, QUICK.at), plain.torques(100, QUICK.at)
+    assert (after[0] != after[1]).any(axis=1).all()
+    tuned.restart()
+    tuned.torques(1, QUICK.at)
+    assert tuned.servo.given.bandwidth == 300.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("setting", "why"),
+    {
+        "bandwidth=-1": "params.bandwidth = -1: input should be greater than 0",
+        "bandwidth=nan": "params.bandwidth = nan: ",
+        "patience=1.0": "params.patience is not live; live: bandwidth, damping",
+        "stiffness=1": "params.stiffness is not live; live: bandwidth, damping",
+        "bandwidth": "must be key=value",
+    }.items(),
+)
+def test_a_gain_that_cannot_be_is_refused_and_the_law_goes_on(setting: str, why: str) -> None:
+    tuned, plain = (ServoRig(*config("puma560")) for _ in range(2))
+    Operator(tuned.rack).set("servo", setting)
+    assert (tuned.torques(50, QUICK.at) == plain.torques(50, QUICK.at)).all()
+    assert tuned.status.answer == Answer.REFUSED
+    assert tuned.status.objection.startswith(why)
+
+
+def rig_of(**modifications: dict[str, Any]) -> ServoRig:
+    return ServoRig(*config("puma560"), modifications=modifications)
+
+
+@pytest.mark.slow
+def test_a_law_is_replaced_under_motion_without_a_step_and_the_arm_follows_its_course() -> None:
+    rig = rig_of(pd=PD)
+    operator = Operator(rig.rack)
+    before = rig.torques(300, COURSE.at)
+    serial = operator.modify("servo", "pd", True)
+    replaced = rig.torques(200, COURSE.at)
+    assert (rig.status.order, rig.status.answer, rig.status.operator) == (
+        serial,
+        Answer.DONE,
+        serial,
+    )
+    assert (rig.status.state, rig.status.reason) == (State.EXECUTING, "modified by pd")
+    assert replaced[0] == pytest.approx(before[-1], abs=1e-12)
+    assert not np.allclose(replaced[-1], before[-1], atol=0.1)
+    operator.modify("servo", "pd", False)
+    again = rig.torques(500, COURSE.at)
+    assert again[0] == pytest.approx(replaced[-1], abs=1e-12)
+    assert rig.status.position == pytest.approx(COURSE.goal, abs=1e-3)
+    assert (rig.status.reason, rig.found) == ("", [])
+
+
+def test_a_restarted_board_puts_its_modifications_in_again() -> None:
+    rig = rig_of(pd=PD)
+    rig.torques(100, COURSE.at)
+    Operator(rig.rack).modify("servo", "pd", True)
+    rig.torques(100, COURSE.at)
+    rig.restart()
+    rig.torques(3, COURSE.at)
+    assert rig.status.reason == "modified by pd"
+
+
+def test_a_hold_stays_in_force_over_a_modification_and_an_unknown_one_is_refused() -> None:
+    rig = rig_of(pd=PD)
+    operator = Operator(rig.rack)
+    rig.torques(100, COURSE.at)
+    operator.say("servo", Operation.HOLD)
+    rig.torques(200, COURSE.at)
+    operator.modify("servo", "pd", True)
+    rig.torques(2, COURSE.at)
+    assert (rig.status.standing, rig.status.answer) == (Operation.HOLD, Answer.DONE)
+    assert rig.status.reason == "held by the operator; `resume` releases it"
+    operator.modify("servo", "notch", True)
+    rig.torques(2, COURSE.at)
+    assert (rig.status.standing, rig.status.answer) == (Operation.HOLD, Answer.REFUSED)
+    assert rig.status.objection == "no modification 'notch'; permitted: pd"
 
 
 def assert_within_limits(targets: Array) -> None:

@@ -91,23 +91,6 @@ def test_a_joint_that_crept_while_its_sensor_was_stuck_is_trusted_again_where_it
     assert rig.status.position == pytest.approx(rig.servo.arm.sense().position, abs=1e-6)
 
 
-def test_an_offset_too_small_to_matter_is_accepted_at_rest() -> None:
-    rig, slow = ServoRig(*config("puma560")), Course(move().start, GOAL, 30.0)
-    rig.run(400, slow.at)
-    rig.inject("sensor-bias", size=3e-4, joint=0)
-    rig.run(100, slow.at)
-    assert (rig.alarms(*BRAKES), rig.status.stopped) == (
-        [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED],
-        0,
-    )
-    rig.heal()
-    rig.run(100, slow.at)
-    assert (rig.alarms(*BRAKES), rig.status.stopped) == (
-        [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED] * 2,
-        0,
-    )
-
-
 def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:
     rig = rig_under_way()
     torque = rig.status.torque.copy()

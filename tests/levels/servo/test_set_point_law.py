@@ -43,14 +43,6 @@ class StuckServoArm(ServoArm):
         return found
 
 
-class PositionArm(ServoArm):
-    """Its drives have loops of position alone."""
-
-    @classmethod
-    def takes(cls, interface: Interface) -> bool:
-        return interface == "position"
-
-
 def rig(folder: Path, interface: Interface, arm: str = "", **robot: object) -> ServoRig:
     params = {"arm": arm} if arm else {}
     return ServoRig(pendulum(folder, interface=interface, **robot), SceneConfig(), **params)
@@ -158,13 +150,6 @@ def test_set_points_are_those_of_the_end_of_the_cycle(tmp_path: Path, interface:
     assert target.position == pytest.approx(later[0], abs=1e-12)
     assert target.velocity == pytest.approx(later[1] + correction, abs=1e-12)
     assert target.torque is torque
-
-
-def test_an_arm_may_take_set_points_of_one_kind_alone() -> None:
-    own = f"board.servo.params.arm='{OWN}PositionArm'"
-    resolve(load("k1607", ["robot.interface='position'", own]))
-    with pytest.raises(ConfigError, match="no `follow` of the class takes"):
-        resolve(load("k1607", ["robot.interface='velocity'", own]))
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,6 @@ def turn(time_s: float) -> tuple[Array, Array]:
 
 
 def stand(_: float) -> tuple[Array, Array]:
-    """Stay at home."""
     return HOME, np.zeros(6)
 
 

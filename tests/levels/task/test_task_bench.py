@@ -57,7 +57,6 @@ class Bench(Lockstep):
 
     @property
     def status(self) -> Message:
-        """The status of the level."""
         return self.read("task.status")
 
     def window(self) -> list[int]:
@@ -137,17 +136,6 @@ def test_task_that_stands_still_ends_and_says_why(
     status = bench.status
     assert (status.state, status.error) == (State.ERROR, Error.STALLED)
     assert status.reason == f"nothing has moved for 5 s: {why}"
-
-
-def test_task_that_an_operator_holds_stands_still_as_long_as_that_lasts() -> None:
-    bench = Bench(HOME, stalled_s=5.0)
-    bench.plan([0])
-    for _ in range(10):
-        bench.cycle(current=1, operated=1, **HELD)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, HELD["reason"])
-    for _ in range(4):
-        bench.cycle(current=1)
-    assert bench.status.error == Error.STALLED
 
 
 class Obedient(Executor):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from typing import Any
 
 import pytest
@@ -11,11 +10,10 @@ from rack.boards.config import load, resolve
 from rack.boards.errors import ConfigError
 from rack.levels.errors import ProgramError
 from rack.levels.task.program import Goto, Home, TaskConfig, Transfer, read_program
-from tests.levels.arms import ROBOTS, config
+from tests.levels.arms import config
 
 PUMA, SCENE = config("puma560")
 NASREM = load("nasrem")
-TASKS = ROBOTS.parent / "tasks"
 
 
 def read(*actions: dict[str, Any]) -> TaskConfig:
@@ -44,19 +42,6 @@ def test_actions_of_every_kind_are_read() -> None:
     assert joints.joints == (0.0,) * 6
     assert isinstance(home, Home)
     assert read_program({}, PUMA, SCENE).action == ()
-
-
-@pytest.mark.parametrize(
-    ("task", "robot"),
-    [
-        ("around-the-wall", "puma560"),
-        ("around-the-wall", "puma560_crossing"),
-        ("k1607-tour", "k1607"),
-    ],
-)
-def test_the_projects_own_programs_fit_their_cells(task: str, robot: str) -> None:
-    table = tomllib.loads((TASKS / f"{task}.toml").read_text())["task"]
-    assert read_program(table, *config(robot)).action
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from rack.levels.timing.chains import spanned
 from rack.levels.timing.forecast import NO_BUDGET, Forecast
 from rack.levels.timing.level import BoardTiming
 from rack.levels.timing.rack import RackTiming
@@ -177,3 +178,24 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     # Two ordinary tasks that compute share a core; one has it to itself.
     both = replace(FIGURE_3, priority=0, planner_priority=0)
     assert "ordinary scheduling" in Forecast.of(replace(counted, boards={"level": both})).notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (("joint1", "joint2", "joint3"), "joint1 ... joint3"),
+        (("joint9", "joint10", "joint11"), "joint9 ... joint11"),
+        (("j1.planner", "j2.planner", "j3.planner"), "j1.planner ... j3.planner"),
+        (("joint1", "joint2"), "joint1, joint2"),
+        (("joint1", "joint2", "joint4"), "joint1, joint2, joint4"),
+        (("joint2", "joint1", "joint3"), "joint2, joint1, joint3"),
+        (("a1", "b2", "c3"), "a1, b2, c3"),
+        (("joint1", "joint2", "joint3", "arm"), "joint1 ... joint3, arm"),
+        (("servo",), "servo"),
+        ((), ""),
+    ],
+)
+def test_numbered_names_are_shortened_only_if_none_is_left_out(
+    names: tuple[str, ...], text: str
+) -> None:
+    assert spanned(names) == text

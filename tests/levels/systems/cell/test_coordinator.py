@@ -63,16 +63,13 @@ class CellBench(Lockstep):
         self.cycles(2)
 
     def order(self, arm: str) -> Message:
-        """The order to an arm."""
         return self.read(f"cell.order_{arm}")
 
     def verbs(self) -> tuple[int, int]:
-        """What both arms are told."""
         return self.order("puma").what, self.order("k1607").what
 
     @property
     def status(self) -> Message:
-        """The coordinator's status."""
         return self.read("cell.status")
 
 

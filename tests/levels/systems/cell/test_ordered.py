@@ -100,7 +100,6 @@ class OrderBench(Lockstep):
         number: int = 1000,
         **said: Any,
     ) -> None:
-        """Give an order now."""
         order = self.message("lan.orders")
         write_action(action, order)
         order.program, order.id, order.what = 1, number, what
@@ -120,7 +119,6 @@ class OrderBench(Lockstep):
         return self.report
 
     def ask_and_do(self, action: Transfer | Goto | Home, number: int = 1000) -> None:
-        """Have an order begun."""
         self.order(OrderVerb.ASK, action, number)
         self.until(Response.POSSIBLE)
         self.order(OrderVerb.DO, action, number)
@@ -128,16 +126,13 @@ class OrderBench(Lockstep):
 
     @property
     def report(self) -> Message:
-        """What the level reports."""
         return self.read("task.report")
 
     @property
     def status(self) -> Message:
-        """The level's status."""
         return self.read("task.status")
 
     def verb(self) -> Verb:
-        """Return what the move under way is."""
         command, current = self.read("task.command"), self.read("elemental_move.status").current
         shown = command.moves[: command.count]
         return (
@@ -231,18 +226,6 @@ def test_arm_is_held_while_its_orders_are_lost_and_goes_on_with_the_same_order()
     assert bench.read("task.command").hold
     bench.lose_orders(False)
     assert bench.until(Response.DONE).moves_done == 8
-
-
-def test_arm_whose_coordinator_stays_away_ends_its_run_and_says_so() -> None:
-    bench = OrderBench(stalled_s=3.0)
-    bench.run(3.0)
-    assert (bench.status.state, bench.status.reason) == (
-        State.HOLDING,
-        "no orders from rack 'cell' yet",
-    )
-    bench.run(1.0)
-    assert (bench.status.state, bench.status.error) == (State.ERROR, Error.STALLED)
-    assert bench.status.reason == "nothing has moved for 3 s: no orders from rack 'cell' yet"
 
 
 @pytest.mark.slow

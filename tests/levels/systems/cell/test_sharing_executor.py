@@ -81,7 +81,6 @@ class Hoist(ServoRig):
         self.begun = 0
 
     def grip(self, opening: float) -> None:
-        """Open or close the hand."""
         self.command.opening = opening
 
     def go(self, height: float) -> None:
@@ -92,7 +91,6 @@ class Hoist(ServoRig):
         )
 
     def tick(self) -> None:
-        """Run one tick along the course."""
         began = self.begun * 2.5e-3
         self.run(1, lambda time_s: self.course.at(time_s - began))
 
@@ -238,16 +236,6 @@ def test_only_the_owner_says_where_its_body_is() -> None:
     told = body.hear(word(b"beta", owned, 3.0))
     assert told is not None
     assert told[0] == 3.0
-
-
-@pytest.mark.parametrize(
-    "message",
-    [word(b"beta", Claim(2, b"beta"), 1.0), word(b"beta", Claim(9, b"beta"), 1.0, b"peg")],
-)
-def test_a_smaller_claim_and_another_body_change_nothing(message: Message) -> None:
-    body = SharedBody(b"part", b"alpha", Claim(3, b"alpha"))
-    assert body.hear(message) is None
-    assert body.claim == Claim(3, b"alpha")
 
 
 def test_an_arm_that_still_touches_a_body_does_not_claim_it_back() -> None:

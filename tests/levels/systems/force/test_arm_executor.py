@@ -168,12 +168,3 @@ def test_the_arm_follows_again_when_the_contact_is_over(tmp_path: Path) -> None:
     assert Alarm.LATCHED in latched.alarms()
     assert (latched.status.state, latched.status.error) == (State.ERROR, Error.FORCE)
     assert latched.status.reason.endswith("not over within 0.15 s")
-
-
-def test_a_restarted_board_continues_its_count_and_its_sensing(tmp_path: Path) -> None:
-    rig = pressed(tmp_path, 0.02)
-    exceeded = rig.wrench.exceeded
-    rig.rack.lose("arm", ticks=3)
-    rig.run(10)
-    assert rig.wrench.exceeded >= exceeded > 0
-    assert abs(rig.forces[-1] - rig.forces[-20]) < 5.0

@@ -120,16 +120,6 @@ def test_without_force_axes_the_motion_is_followed_with_the_difference_as_it_is(
     assert np.array_equal(law.step(resting(cell), None, PERIOD_S, EMPTY).position, cell.home)
 
 
-def test_an_unknown_contact_stops_the_axes_of_force(cell: Cell) -> None:
-    law = HybridLaw(cell, HybridGains())
-    for _ in range(50):
-        moving = law.step(resting(cell), task(np.zeros(6)), PERIOD_S, EMPTY)
-    for _ in range(100):
-        command = law.step(resting(cell), task(None), PERIOD_S, EMPTY)
-    assert np.abs(moving.velocity).max() > 1e-3
-    assert np.abs(command.velocity).max() < 1e-4 * np.abs(moving.velocity).max()
-
-
 def test_the_force_wanted_is_fed_forward_as_joint_torques(cell: Cell) -> None:
     law, tool = HybridLaw(cell, HybridGains()), ToolKinematics(cell)
     exact = np.where(Z, 20.0, 0.0)

@@ -39,17 +39,6 @@ def test_an_object_is_lifted_kept_while_it_is_pulled_and_put_back(boards: str) -
 
 
 @pytest.mark.slow
-def test_the_grip_rises_with_the_load_and_falls_after_it() -> None:
-    rig = GraspRig("fingers", [PRESHAPE, CLOSE, SQUEEZE, {**HOLD, "seconds": 9.0}], (PULL,))
-    assert rig.go(3.0, steps=3)
-    before = rig.grasp.grip
-    rig.run(2.7 - rig.seconds)
-    assert rig.grasp.grip > before + 1.0
-    rig.run(1.5)
-    assert rig.grasp.grip == pytest.approx(before, abs=0.8)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("board", ["grasp", "joint", "hand"])
 def test_a_board_that_dies_leaves_the_object_in_the_hand(board: str) -> None:
     rig = GraspRig("loops", [PRESHAPE, CLOSE, SQUEEZE, {**HOLD, "seconds": 0.5}])

@@ -11,10 +11,8 @@ from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.kinds import KINDS
 from rack.levels.level import Demand, Fault, LevelContext
 from rack.levels.messages import Error
-from rack.levels.servo import ServoExecutor
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.messages import EXTENSOR
-from rack.levels.systems.joint_boards import ArmExecutor
 from tests.levels.arms import config
 from tests.levels.box import mute
 from tests.levels.systems.hand.hand_rig import AMPLITUDE_RAD, CLOCK_NS, EVERY, HandRig
@@ -156,17 +154,6 @@ def test_torn_tendon_is_found_within_its_bound_and_the_others_pull_on() -> None:
     assert_follows(rig)
 
 
-def test_slack_that_closed_valves_bring_about_is_no_torn_tendon() -> None:
-    rig = swinging(())
-    rig.stop(Demand.STOP, ticks=40 * EVERY)
-    rig.cycles(2)
-    rig.executor.hand._data.ctrl[:] = -60.0  # as of fingers that have moved on
-    rig.cycles(30)
-    assert rig.status.tension.max() < 0.9
-    rig.cycles(30)
-    assert rig.executor.findings == []
-
-
 def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContext]:
     """Return the context of a hand's board, then those of the boards `above` with the fingers that
     they drive."""
@@ -210,14 +197,3 @@ def test_every_joint_must_be_driven_by_one_board(
     found = [misfit[2] for misfit in HandExecutor.misfits(own, others, [])]
     assert found[:1] == ([] if why is None else [why])
     assert len(found) in (0, 4)
-
-
-@pytest.mark.parametrize("kind", [ArmExecutor, ServoExecutor])
-def test_board_of_an_arm_drives_no_hand(kind: type[ArmExecutor | ServoExecutor]) -> None:
-    own, *_ = context({})
-    first, *_ = kind.misfits(own, [], [])
-    assert first == (
-        "executor",
-        kind.__name__,
-        "it drives an arm with motors; [robot.hand] is a hand of tendons",
-    )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rack.levels.systems.state_table.checks import flaws
 from rack.levels.systems.state_table.table import RowConfig, StateTable, TableError, read_table
-from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, found, table, written
+from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, found, written
 
 MOVES = 'when = { place = "between", late = "no" }'
 ARRIVED = 'when = { place = ["open", "shut"] }'
@@ -144,29 +144,6 @@ def test_a_file_that_is_no_table_is_one_error(tmp_path: Path, text: str) -> None
         read_table(written(tmp_path, text), DOORS)
     with pytest.raises(TableError, match="cannot be read: No such file"):
         read_table(tmp_path / "none.toml", DOORS)
-
-
-def test_the_first_row_that_matches_fires(tmp_path: Path) -> None:
-    door = table(tmp_path)
-    case = {"command": "open", "new": "yes", "lock": "free", "place": "shut", "late": "no"}
-    names = [
-        door.decide(state, case | change)[1]
-        for state, change in [
-            ("shut", {}),
-            ("shut", {"new": "no"}),
-            ("shut", {"lock": "stuck"}),
-            ("moving", {}),
-        ]
-    ]
-    assert [row.name for row in names] == [
-        "open it",
-        "stay shut",
-        "locked",
-        "arrived",
-    ]
-    number, none = door.decide("nowhere", case)
-    assert (number, none.name, none.status) == (0, "", "error")
-    assert none.reason.startswith("no row of 'nowhere' takes command = open, new = yes")
 
 
 NAMES = tuple(DOORS.conditions)

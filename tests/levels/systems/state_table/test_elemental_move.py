@@ -122,7 +122,6 @@ class Arm:
         self.world.quaternion[:] = (1.0, 0.0, 0.0, 0.0)
 
     def look(self, *, lost: bool = False) -> dict[str, str]:
-        """Return what it sees."""
         self.values.world = Reading(self.world, Verdict.NEW, lost)
         self.values.status = Reading(self.below, Verdict.NEW)
         return self.level.look(self.values, 50)
@@ -155,40 +154,6 @@ def test_a_target_is_there_while_it_rests_where_it_was(arm: Arm) -> None:
         arm.world.position[0] = arm.place + np.array([0.0, offset, 0.0])
         arm.world.velocity[0] = (speed, 0.0, 0.0)
         assert arm.look()["target"] == seen
-
-
-def test_what_was_put_down_is_its_support_until_it_is_elsewhere(arm: Arm) -> None:
-    arm.below.held = 1
-    arm.below.object = 0
-    assert arm.look()["gripper"] == "holds"
-    arm.level.do_open()
-    arm.below.held = 0
-    arm.level._command.aim = arm.place
-    found = arm.look()
-    assert (found["gripper"], found["support"]) == ("free", "there")
-    arm.world.position[0] = arm.place + 1.0
-    assert arm.look()["support"] == "elsewhere"
-    assert arm.look(lost=True)["support"] == "there"
-    # Nothing was in the gripper this time.
-    arm.level.do_open()
-    assert arm.look()["support"] == "there"
-
-
-def test_gripper_and_home_are_commands_of_their_own(arm: Arm) -> None:
-    arm.look()
-    given = []
-    for do in (arm.level.do_open, arm.level.do_close, lambda: arm.level.do_move("home")):
-        do()
-        arm.level.give(arm.messages, 50)
-        command = arm.messages.command
-        given.append((command.id, command.words, command.speed, command.object))
-    plan = arm.level.table.plan
-    assert given == [
-        (1, "open", 1.0, -1),
-        (2, "close", 1.0, -1),
-        (3, "move", plan.home_speed, -1),
-    ]
-    np.testing.assert_array_equal(arm.messages.command.joints, arm.level._cell.home)
 
 
 def test_a_pose_over_an_object_is_above_where_it_rests(arm: Arm) -> None:

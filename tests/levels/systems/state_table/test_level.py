@@ -41,15 +41,12 @@ class Door(StateTableExecutor):
 
     @classmethod
     def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
-        """Return the colours."""
         return LEXICON
 
     def look(self, read: Ports, tick: int) -> dict[str, str]:
-        """Return what the test has set."""
         return {"lock": self.lock, "place": self.place}
 
     def do_drive(self, speed: str) -> None:
-        """Note the speed."""
         self.drives.append(speed)
 
 
@@ -253,20 +250,6 @@ def test_an_operator_hears_which_words_and_tables_there_are(bench: Bench) -> Non
     assert status.answer == Answer.REFUSED
     assert status.objection == "no table 'other'; tables: normal, careful"
     assert status.table == "normal"
-
-
-def test_a_table_in_force_goes_on_in_the_state_of_the_same_name_or_starts(bench: Bench) -> None:
-    for _ in range(PATIENCE_TICKS):
-        checksum = bench.cycle().checksum
-    status = bench.order(1, Operation.TABLE, "careful")
-    assert (status.table, status.in_state, status.answer) == ("careful", "closed", Answer.DONE)
-    assert status.checksum != checksum
-    # Its patience begins anew with its state.
-    assert bench.door._since == bench.tick - 1
-    bench.command(1, "open")
-    assert bench.cycle().in_state == "moving"
-    bench.door.place = "between"
-    assert bench.order(2, Operation.TABLE, "normal").in_state == "moving"
 
 
 def test_a_restarted_board_goes_on_where_its_last_status_was(bench: Bench) -> None:

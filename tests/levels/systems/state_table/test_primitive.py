@@ -3,7 +3,6 @@ points, without a rack."""
 
 from __future__ import annotations
 
-
 import numpy as np
 import pytest
 
@@ -14,7 +13,6 @@ from rack.boards.config.resolved import resolve
 from rack.levels.level import LevelContext, Ports
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
 from rack.levels.systems.state_table.primitive import (
-    GRIP_CYCLES,
     JOINT_MOVE,
     JOINT_MOVE_STATUS,
     PrimitiveTable,
@@ -50,7 +48,6 @@ class Bench:
         self.tick = 10 * context.every
 
     def message(self, kind: MessageType) -> Message:
-        """Return an empty message."""
         return Message(kind.dtype(dict(self.context.sizes)))
 
     def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
@@ -62,7 +59,6 @@ class Bench:
         self.above = {"move": Reading(command, Verdict.NEW)}
 
     def look(self) -> dict[str, str]:
-        """Return the conditions of this cycle."""
         read = Ports(
             command=self.above,
             statuses=dict(zip(BOARDS, self.readings, strict=True)),
@@ -189,19 +185,6 @@ def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) ->
         assert bench.look()["arm"] != "away"
 
 
-def test_a_gripper_counts_as_moving_until_its_motion_must_show(bench: Bench) -> None:
-    gripper = bench.level._gripper
-    assert bench.look()["gripper"] == "open"
-    bench.command(bench.home, row=1)
-    bench.look()
-    bench.level.do_close()
-    bench.arm.opening = gripper.closed
-    assert [bench.look()["gripper"] for _ in range(GRIP_CYCLES)] == ["moving"] * 5 + ["empty"]
-    bench.level.do_open()
-    bench.arm.opening = gripper.open
-    assert [bench.look()["gripper"] for _ in range(GRIP_CYCLES)] == ["moving"] * 5 + ["open"]
-
-
 @pytest.mark.parametrize(
     ("is_closed", "off", "speed", "expected"),
     [
@@ -222,35 +205,6 @@ def test_a_gripper_holds_what_keeps_it_from_closing(
     bench.arm.opening = (gripper.closed if is_closed else gripper.open) + off
     bench.arm.opening_velocity = speed
     assert bench.look()["gripper"] == expected
-
-
-@pytest.mark.parametrize("row", [0, 1, -1])
-def test_what_the_gripper_holds_is_carried_and_reported(bench: Bench, row: int) -> None:
-    level = bench.level
-    bench.command(bench.home, row=row)
-    bench.follow()
-    free = bench.write.command.load.copy()
-    assert (bench.write.command.opening, bench.write.command.payload_mass) == (
-        level._gripper.open,
-        0.0,
-    )
-    level.do_close()
-    bench.arm.opening = level._gripper.closed + 0.02
-    for _ in range(GRIP_CYCLES):
-        bench.follow()
-    command, status = bench.write.command, bench.write.status
-    assert (status.closed, status.held, status.object) == (1, 1, row)
-    # What it does not know has no mass.
-    assert command.payload_mass == (level._masses[row] if row >= 0 else 0.0)
-    assert (command.opening, command.force) == (level._gripper.closed, level._gripper.force)
-    assert np.allclose(command.load, free) == (row < 0)
-    level.do_open()
-    bench.arm.opening = level._gripper.open
-    for _ in range(GRIP_CYCLES):
-        bench.follow()
-    assert (status.closed, status.held, status.object) == (0, 0, -1)
-    assert command.payload_mass == 0
-    np.testing.assert_allclose(command.load, free)
 
 
 def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -> None:

@@ -12,6 +12,8 @@ from rack.boards import Rack
 from rack.boards.config import CONFIGS, load
 from rack.boards.config.resolved import resolve
 from rack.boards.errors import ConfigError
+from rack.levels.systems.state_table.task import TaskPlanConfig, TaskTable
+from rack.levels.tables import SceneConfig
 
 FOLDER = CONFIGS / "nist-state-table"
 KILLED = 'fault=[{ kind = "kill", board = "primitive", at = 0.3 }]'
@@ -50,6 +52,14 @@ def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -
         " peg, place right"
     )
     assert expected in str(caught.value)
+
+
+def test_objects_that_the_scene_lacks_are_named() -> None:
+    plan = TaskPlanConfig.model_validate(
+        {"step": [{"object": "a", "place": "x"}, {"object": "b", "place": "x"}]}
+    )
+    scene = SceneConfig(objects=("a", "c"))
+    assert TaskTable.plan_flaws(scene, plan) == ["plan.step[1].object: unknown 'b'; objects: a, c"]
 
 
 def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: Path) -> None:

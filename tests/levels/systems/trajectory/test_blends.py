@@ -50,7 +50,6 @@ def test_no_chain_of_requests_exceeds_a_limit(chain: list, at: float, what: str)
 
 
 def act(rig: TrajectoryRig, what: str) -> None:
-    """Do something to the level."""
     if what == "cancel":
         rig.request(MotionKind.CANCEL)
     elif what != "nothing":
