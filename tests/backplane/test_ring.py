@@ -74,15 +74,6 @@ def test_lost_rows_are_counted_exactly(bus: Segment, written: int) -> None:
     assert lost == written - len(found)
 
 
-def test_only_messages_that_a_reader_takes_are_rows(bus: Segment) -> None:
-    writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
-    write(writer, 2)
-    writer.publish(30, 31, 30, damage=(5, 70))
-    writer.lose()
-    write(writer, 1)
-    assert serials(ring) == ([1, 2, 5], 0)
-
-
 def hammer(segment: Segment) -> None:
     writer = open_writer(segment, NAME)
     while True:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -19,7 +17,7 @@ from rack.backplane.segment import SHM_FOLDER, Segment
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, exit_status, fork, forked, wait_until
+from tests.processes import FORKS, exit_status, fork, forked, wait_until
 
 FUTEX_WAIT_BITSET, FUTEX_CLOCK_REALTIME = 9, 256
 """From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the
@@ -83,25 +81,6 @@ def test_another_users_semaphore_of_that_name_is_named_and_left_alone(bus: Segme
 
     assert exit_status(fork(create)) == 0
     assert named(bus.rack) == 5
-
-
-@pytest.mark.filterwarnings(FORKS)
-def test_a_wait_lasts_as_long_as_it_says_unless_a_release_ends_it(bus: Segment) -> None:
-    semaphore = semaphores.wake_semaphore(bus.rack, "writer")
-    parent, start = os.getpid(), time.monotonic()
-    assert not semaphore.acquire(0.02)
-    assert time.monotonic() - start >= 0.02
-
-    def release_once_it_waits() -> None:
-        # Where the kernel does not show it, what is released comes before the wait at times.
-        with suppress(PermissionError):
-            wait_until(lambda: futex_call(parent))
-        semaphore.release()
-
-    with forked(release_once_it_waits) as releaser:
-        assert semaphore.acquire(BOUND_S)
-        assert exit_status(releaser) == 0
-    assert not semaphore.take()
 
 
 def wait_for_release(segment: Segment) -> None:

@@ -13,9 +13,8 @@ import pytest
 
 from rack.levels import compiled as module
 from rack.levels.compiled import compiled
-from tests.processes import FORKS, exit_status, fork
+from tests.processes import exit_status, fork
 
-PROCESSES = 4
 SCALE = 3.0
 
 
@@ -140,19 +139,6 @@ def test_damaged_code_is_compiled_again_and_said(
     assert len(heard) == 2
     assert kept(tmp_path) == [file]
     assert file.is_file()
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings(FORKS)
-def test_processes_that_find_the_damage_at_once_all_get_the_code(
-    heard: list[str], tmp_path: Path
-) -> None:
-    called()
-    flipped(kept(tmp_path)[0])
-    children = [fork(lambda: called() == 3.0) for _ in range(PROCESSES)]
-    assert [exit_status(child, 60.0) for child in children] == [0] * PROCESSES
-    assert called() == 3.0
-    assert (len(heard), len(kept(tmp_path))) == (1, 1)
 
 
 @pytest.mark.slow

@@ -108,16 +108,3 @@ def test_a_restarted_board_shows_its_last_model_and_age_until_it_sees_again() ->
     rig.run(0.1, resting)
     assert rig.rack.tick - rig.model.sensed <= PERIOD
     assert rig.model.revision > before
-
-
-def test_a_moving_body_keeps_its_velocity_until_the_next_scene_is_due() -> None:
-    rig, slide = WorldRig(), sliding(0.5, 9.0, 0.25)
-    for cycle in range(100):
-        rig.run(PERIOD * TICK_S, slide if cycle % 2 == 0 else None)
-    assert rig.model.velocity[0, 0] == pytest.approx(0.25, rel=0.2)
-    rig.run(PERIOD * TICK_S, None)
-    assert rig.model.velocity[0, 0] == pytest.approx(0.25, rel=0.2)
-    seen = rig.model.position.copy()
-    rig.run(2 * PERIOD * TICK_S, None)
-    assert not rig.model.velocity.any()
-    assert np.array_equal(rig.model.position, seen)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from dataclasses import replace
@@ -14,10 +16,11 @@ from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, in_thread, wait_until
+from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
 
 WAKES = pytest.mark.parametrize("wake", get_args(Wake), indirect=True)
 EVERY = 4
@@ -228,24 +231,6 @@ def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ah
     assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 0)
 
 
-@TIMER
-def test_a_late_clock_wakes_a_sleeping_task_with_a_post(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
-    hour_ns = 3_600_000_000_000
-    start_grid(bus, EVERY * hour_ns + hour_ns // 2, hour_ns)
-    cycle, found = NextCycle(bus, "level"), []
-    publish(bus, 0)
-    # Hours late, but the first one on the grid that is there.
-    assert cycle.wait() == 0
-    thread = threading.Thread(target=lambda: found.append(cycle.wait()), daemon=True)
-    thread.start()
-    release(bus, EVERY)
-    thread.join(BOUND_S / 2)
-    assert found == [EVERY]
-
-
 @pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: Segment) -> None:
     bus.words[System.LOCKSTEP] = 1
@@ -264,3 +249,23 @@ def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: S
     release(bus, 28)
     assert [(cycle.wait(), cycle.skipped) for _ in range(2)] == [(24, 2), (28, 0)]
     assert wake_semaphore(bus.rack, "level").value == 0
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
+def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
+    start_grid(bus)
+    cycle, ring = (
+        NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")),
+        alarm_ring(bus, "level"),
+    )
+    release(bus, 0)
+    cycle.wait()
+    with forked(signal.pause) as pid:
+        os.kill(pid, signal.SIGSTOP)
+        bus.words[System.CLOCK_PID] = pid
+        for tick in (4, 8):
+            with in_thread(cycle.wait):
+                wait_until(lambda: ring.waiting > 0)
+                assert Alarm(ring.drain().rows["code"][0]) is Alarm.CLOCK_STOPPED
+                release(bus, tick)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
 
 from rack.backplane.mailbox.mailbox import Writer
+from rack.backplane.mailbox.slots import claim
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import SporadicReader, WatchedReader, watched
+from rack.backplane.words import Slot
 from tests.backplane.bus import mailbox, message_address
 from tests.backplane.conftest import MakeBus
 
@@ -66,3 +69,16 @@ def test_a_damaged_message_is_rejected_and_reported(segment: Segment, writer: Wr
     writer.write(40)
     assert reader.read(50).value.id == 3
     assert (task.troubles, rung(segment)) == (1, [Alarm.DAMAGED])
+
+
+def test_a_forged_message_is_rejected_and_reported(segment: Segment, writer: Writer) -> None:
+    reader = open_reader(segment)
+    writer.message.id = 1
+    writer.write(10)
+    assert reader.read(11).value.id == 1
+    # A process without the claim signs as another process.
+    writer._slots.words[Slot.EPOCH] = claim(1, os.getpid() + 1)
+    writer.message.id = 2
+    writer.write(20)
+    assert reader.read(21).value.id == 1
+    assert rung(segment) == [Alarm.MASQUERADE]

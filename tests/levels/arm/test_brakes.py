@@ -114,13 +114,3 @@ def test_the_limit_monitor_counts_every_step_beyond_a_limit_and_names_the_first(
     assert 1 <= arm.violations <= 5
     assert arm.first_violation.startswith("velocity 2.")
     assert "of joint 'j2' at 0.2000 s, step 0; -1.51 to 1.51 is permitted" in arm.first_violation
-
-
-def test_the_limit_monitor_sees_a_torque_that_motor_and_brake_give_together() -> None:
-    arm, made, _ = moving()
-    arm._data.ctrl[made.actuators[0]] = 60.0
-    arm._data.qfrc_applied[made.dof[0]] = 60.0
-    arm._given = True
-    arm.step(1)
-    assert arm.violations == 5
-    assert "torque 120 N m of joint 'j1'" in arm.first_violation

@@ -15,7 +15,6 @@ from rack.levels.arm import Sensed, SimulatedArm
 from rack.levels.arm.arm import copied
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.present import PresentLink
-from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -154,14 +153,3 @@ def test_late_samples_lead_beyond_no_limit(tmp_path: Path, arm: type[LateArm]) -
     assert max(excess(cell, driven(guard, own, random_torques(cell, 0, 800)))) <= 0.0
     assert own.clipped > 50
     assert own.violations == 0
-
-
-def test_latency_that_leaves_no_speed_is_refused(tmp_path: Path) -> None:
-    robot, cell = late(tmp_path, 20)
-    own = LateArm(cell, SceneConfig(), CLOCK_NS)
-    fast = robot.model_copy(update={"acceleration": (100.0, 100.0)})
-    wide = build_cell(fast, SceneConfig(), CLOCK_NS)
-    with pytest.raises(
-        RobotError, match=r"robot\.latency_ticks: 'shoulder' may be off by .* rad/s"
-    ):
-        GuardedArm(own, wide, robot.joints, TICK_S)

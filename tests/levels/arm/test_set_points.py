@@ -234,22 +234,3 @@ def test_a_restored_arm_continues_bit_for_bit(interface: Interface, missed: int)
             each.follow(target, 0.0)
             each.step(1)
     assert saved(again).raw == saved(arm).raw
-
-
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_drives_go_on_for_their_patience_then_brake(interface: Interface) -> None:
-    arm, made = simulated("puma560", interface)
-    velocity = 0.1 * made.bounds.velocity
-    position = made.home.copy()
-    for _ in range(200):
-        assert arm.follow(JointTarget(position, velocity, load(made)), 0.0) is None
-        arm.step(1)
-        position = position + TICK_S * velocity
-    for _ in range(arm.patience - 1):
-        arm.step(1)
-        assert arm.sense().velocity == pytest.approx(velocity, rel=0.05)
-        assert not arm.braked
-    arm.step(100)
-    assert arm.braked
-    assert np.abs(arm.sense().velocity).max() < 1e-2
-    assert arm.violations == 0

@@ -205,24 +205,6 @@ def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_i
     assert bench.segments() == []
 
 
-def test_who_keeps_the_level_below_from_its_work_is_passed_on() -> None:
-    bench = planned_bench()
-    bench.cycle(
-        2,
-        current=1,
-        progress=0.25,
-        operated=1,
-        state=State.HOLDING,
-        reason="waiting for servo: brakes engaged",
-    )
-    status = bench.status
-    assert (status.state, status.reason) == (State.HOLDING, "waiting for servo: brakes engaged")
-    assert (status.progress, status.operated) == (0.25, 1)
-    bench.cycle(2, operated=0, state=State.EXECUTING, reason="")
-    status = bench.status
-    assert (status.state, status.reason, status.operated) == (State.EXECUTING, "", 0)
-
-
 def test_time_is_handed_down_less_what_the_answer_takes() -> None:
     bench = Bench()
     bench.order([Verb.MOVE_JOINTS], by=20.0)
@@ -243,31 +225,6 @@ def test_refusal_counts_when_its_move_is_due_and_not_before() -> None:
     bench.cycle(2, done=1, current=0)
     assert (bench.status.state, bench.status.error) == (State.ERROR, Error.UNREACHABLE)
     assert bench.status.reason == "something is there"
-
-
-def test_move_without_a_path_for_now_waits_and_says_why() -> None:
-    bench = Bench()
-    bench.order()
-    bench.plan(1, error=Error.NO_PATH)
-    bench.cycle(3)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "something is there")
-    bench.plan(1)
-    bench.cycle(2)
-    assert bench.segments() == [(1, 1)]
-    assert bench.status.reason == ""
-
-
-def test_another_program_begins_once_the_arm_rests() -> None:
-    bench = planned_bench()
-    bench.order(first=40)
-    bench.cycle(2, resting=0)
-    assert bench.segments() == []
-    assert bench.status.done == 0
-    bench.cycle(2, resting=1)
-    assert bench.status.done == 39
-    bench.plan(40, bench.home)
-    bench.cycle(2)
-    assert bench.segments() == [(3, 40)]
 
 
 def test_restarted_executor_continues_from_its_own_last_messages() -> None:

@@ -142,17 +142,6 @@ def test_compiled_checks_decide_as_python_does_and_are_loaded_before(
     assert list(first_blocked.load().signatures) == loaded  # type: ignore[attr-defined]
 
 
-def test_of_several_configurations_the_first_that_is_not_free_is_found(
-    puma: Cell, ik: InverseKinematics, checker: CollisionChecker
-) -> None:
-    in_the_wall = at(ik, puma, 0.5, 0.0, 0.7)
-    path = np.array([puma.home, puma.home, in_the_wall, puma.home, in_the_wall])
-    assert checker.first_blocked(path) == 2
-    assert checker.nearest() == checker.why(in_the_wall) != ""
-    assert checker.first_blocked(path[:2]) == 2
-    assert checker.first_blocked(path[:0]) == 0
-
-
 def test_a_pair_that_is_too_close_counts_though_its_bodies_have_several_geoms(puma: Cell) -> None:
     # Of bodies with several geoms MuJoCo's middle phase rules pairs out by margins of its own.
     usual, thorough = (CollisionChecker(puma, config("puma560")[1], 1e-3) for _ in range(2))

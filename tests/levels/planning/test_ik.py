@@ -58,16 +58,6 @@ def test_what_is_out_of_reach_has_no_solution_and_no_line() -> None:
     assert straight_line(ik, home, pose(away, DOWN)) is None
 
 
-def test_nearby_stays_on_its_branch_or_finds_nothing() -> None:
-    ik, home = SOLVERS["puma560"], CELLS["puma560"].home
-    branches = ik.reachable(pose((0.5, -0.2, 0.7), DOWN), home)
-    for q in branches:
-        near = ik.nearby(pose((0.5, -0.2, 0.72), DOWN), q)
-        assert near is not None
-        assert np.max(np.abs(near - q)) < 0.5
-    assert ik.nearby(pose((-0.5, 0.2, 0.7), DOWN), branches[0]) is None
-
-
 @pytest.mark.parametrize("name", CELLS)
 @pytest.mark.parametrize("way", [(0.0, 0.0, 0.1), (0.1, 0.08, 0.0), (0.0, -0.25, 0.05)])
 def test_tool_follows_a_straight_line(name: str, way: tuple[float, float, float]) -> None:

@@ -6,7 +6,6 @@ import gc
 
 import numpy as np
 import pytest
-from ompl import base
 
 from rack.levels.messages import WAYPOINTS
 from rack.levels.motion.path import BlendedPath, Path
@@ -113,34 +112,6 @@ def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
     assert path.blend[1] == 0.0
     assert planner.blocked_at(path, on_the_polyline) is None
     assert planner.rounded(corner, len).blend[1] > 0.5
-
-
-@pytest.mark.parametrize("length", [0.0, 1e-3, 0.02, 0.3])
-@pytest.mark.parametrize("allowed", [0, 1, 5, 1000])
-def test_a_motion_is_checked_at_the_places_and_in_the_order_of_ompl(
-    planner: PathPlanner, puma: Cell, length: float, allowed: int
-) -> None:
-    checked: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    one, other = puma.home, puma.home + length * np.array([1.0, 0.3, -0.7, 0.1, 0.9, -0.2])
-
-    def free(scaled: np.ndarray) -> bool:
-        checked[0].extend(scaled[: allowed + 1])
-        return len(scaled) <= allowed
-
-    ours = planner._space(np.array([one, other]), free)
-    states = [planner._state(ours, q) for q in (one, other)]
-    # Without ours, it makes its own.
-    theirs = base.SpaceInformation(ours.getStateSpace())
-
-    def valid(state: base.State) -> bool:
-        checked[1].extend(planner._values(state))
-        return len(checked[1]) <= allowed
-
-    theirs.setStateValidityChecker(valid)
-    theirs.setup()
-    assert ours.checkMotion(*states) == theirs.checkMotion(*states)
-    assert np.array_equal(*checked)
-    assert (len(checked[0]) > 20) == (length == 0.3 and allowed == 1000)
 
 
 def test_search_leaves_nothing_in_memory(

@@ -126,14 +126,6 @@ def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
         assert not watched.clear()
 
 
-def test_obstacle_on_the_part_already_passed_does_not_matter() -> None:
-    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
-    watched.watch()
-    watched.world.position[-1, :2] = watched.tool_at(NEAR + 0.2 * SWEEP)[:2]
-    assert not watched.clear()
-    assert watched.clear(time_s=0.75 * watched.trajectory.duration)
-
-
 def test_obstacle_on_its_way_into_the_path_is_seen_before_it_is_there() -> None:
     watched = Watched(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()

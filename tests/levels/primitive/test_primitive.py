@@ -77,30 +77,6 @@ def test_every_status_reports_progress_and_when_the_segment_will_be_done(
     assert done <= said <= done + 0.2
 
 
-@pytest.mark.slow
-def test_hold_ramps_to_rest_on_the_path_and_motion_continues_from_there() -> None:
-    rack = PrimitiveRack()
-    segments = two_paths(rack)
-    rack.command(*segments)
-    rack.run(0.4)
-    rack.command(*segments, hold=True)
-    rack.run(1.2)
-    held = rack.status
-    assert held.resting
-    assert held.blocked == 0
-    assert 0.0 < held.progress < 1.0
-    rack.run(0.3)
-    assert (rack.status.position == held.position).all()
-    rack.command(*segments)
-    assert rack.run_until_done(2)
-    way = (
-        np.array([p["position"] for p in rack.set_points[: first(rack, done=1)] if p["due"]])
-        - rack.home
-    )
-    beside = way - np.outer(way @ TURN / (TURN @ TURN), TURN)
-    assert np.abs(beside).max() < 1e-9
-
-
 def test_gripper_segments_close_and_open_and_say_what_is_held() -> None:
     rack = PrimitiveRack()
     rack.command(gripper(1, opening=0.0, held=1))

@@ -12,7 +12,6 @@ from rack.levels.messages import Error
 from rack.levels.motion.path import BlendedPath
 from rack.levels.primitive.path_motion import PathMotion
 from rack.levels.robot.limits import Limits
-from tests.levels.box import Shown
 from tests.levels.lockstep import CLOCK_NS
 from tests.levels.primitive.rack import TURN, PrimitiveRack, gripper, path, two_paths
 
@@ -55,44 +54,6 @@ def test_executor_that_starts_anew_keeps_its_grip(died_at_s: float) -> None:
     rack.run(1.0)
     assert (rack.status.done, rack.status.held) == (1, 0)
     assert (rack.set_points[-1]["force"], rack.set_points[-1]["opening"]) == (17.0, 0.0)
-
-
-def test_path_whose_planner_is_lost_waits_with_a_reason() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.tasks["primitive.planner"].due = -1
-    rack.run(0.9)
-    assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
-    rack.run(0.4)
-    assert rack.status.state == State.HOLDING
-    assert rack.status.reason == "segment 1 waits for its trajectory from the planner"
-    rack.restart("primitive.planner")
-    rack.run(0.2)
-    assert (rack.status.state, rack.status.reason) == (State.EXECUTING, "")
-
-
-def show_servo(rack: PrimitiveRack, ticks: int, **fields: object) -> None:
-    """Change fields of the servo's status for some time."""
-
-    def changed(visible_at: int, data: bytes) -> Shown:
-        status = rack.message("servo.status")
-        status.raw[:] = data
-        for name, value in fields.items():
-            setattr(status, name, value)
-        return ((visible_at, bytes(status.raw)),)
-
-    rack.disturb("servo.status", changed, ticks)
-
-
-def test_error_of_the_servo_level_goes_up_with_its_reason() -> None:
-    rack = PrimitiveRack()
-    rack.command(*two_paths(rack))
-    rack.run(0.3)
-    why = "sensor of j2"
-    show_servo(rack, 120, state=State.ERROR, error=Error.SENSORS, reason=why, stopped=1)
-    rack.run(0.25)
-    status = rack.status
-    assert (status.state, status.error, status.reason) == (State.ERROR, Error.SENSORS, why)
 
 
 def seconds(time_s: float) -> int:
@@ -168,3 +129,17 @@ def test_motion_that_is_found_at_the_end_of_its_path_is_finished() -> None:
         motion = PathMotion(line, Limits(*np.ones((4, 1))), bridging_s=0.5)
         motion.rest_near(np.array([length]), progress=1.0)
         assert motion.finished
+
+
+def test_silent_servo_is_an_error_until_it_speaks_again() -> None:
+    rack = PrimitiveRack(params={"silent": 0.5})
+    rack.command(*two_paths(rack))
+    rack.run(0.3)
+    servo = rack.tasks["servo"]
+    servo.due = -1
+    rack.run(0.8)
+    assert rack.status.error == Error.BELOW
+    assert rack.set_points[-1]["due"] == 0
+    servo.due = rack.tick
+    assert rack.run_until_done(2)
+    assert rack.status.error == 0

@@ -13,10 +13,10 @@ from pydantic import ValidationError
 
 from rack.backplane.message import State
 from rack.levels.errors import RobotError
-from rack.levels.robot.cell import TOUCHING_M, Cell, build_cell
+from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.servo.control import Grip
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
-from tests.levels.arms import CLOCK_NS, cell, config, four_bar, pendulum
+from tests.levels.arms import CLOCK_NS, cell, config, four_bar
 from tests.levels.robot import grippers
 from tests.levels.whole_rack import WholeRack
 
@@ -100,18 +100,6 @@ def test_a_light_drive_gets_the_inertia_that_its_loop_needs(tmp_path: Path) -> N
     assert puma.model.dof_armature[puma.gripper.dof] == 0.1
     assert table is not None
     assert (table.gains, table.still) == ((2000.0, 60.0), 0.002)
-
-
-@pytest.mark.parametrize("apart", [2e-5, 2e-4])
-def test_surfaces_that_meet_at_home_touch(tmp_path: Path, apart: float) -> None:
-    z = 0.7 + 0.03 + 0.01 + apart
-    near = f'<geom name="near" type="box" size=".01 .01 .01" pos=".2 0 {z:.9f}"/>'
-    robot = pendulum(tmp_path, first=near)
-    if apart < TOUCHING_M:
-        with pytest.raises(RobotError, match="'upper' touches 'near'"):
-            build_cell(robot, SceneConfig(), CLOCK_NS)
-    else:
-        assert build_cell(robot, SceneConfig(), CLOCK_NS).gripper is None
 
 
 @pytest.mark.thorough

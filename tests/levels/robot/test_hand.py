@@ -122,25 +122,6 @@ def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], wh
         build(retold(**what))
 
 
-def test_what_the_model_lacks_is_named() -> None:
-    robot = config("utah_mit")[0]
-    assert robot.hand is not None
-    index, *rest = robot.hand.finger
-    for tip, why in (
-        ("nail", "robot.hand.finger.tip: no site 'nail'"),
-        ("palm", "does not move the tip 'palm'"),
-    ):
-        with pytest.raises(RobotError, match=why):
-            build(retold(finger=(index.model_copy(update={"tip": tip}), *rest)))
-    names = ("muscle", *robot.hand.extensors[1:])
-    with pytest.raises(
-        RobotError, match=r"robot\.hand\.extensors: no actuator 'muscle' in the model; it has"
-    ):
-        build(retold(extensors=names))
-    with pytest.raises(RobotError, match="actuator 'index0_flexor' is named 2 times"):
-        build(retold(extensors=("index0_flexor", *robot.hand.extensors[1:])))
-
-
 def test_a_hand_has_neither_gripper_nor_torque_limits_of_its_own() -> None:
     robot = config("utah_mit")[0]
     with pytest.raises(

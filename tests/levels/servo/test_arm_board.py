@@ -168,19 +168,6 @@ def test_stop_brings_the_arm_to_rest_by_torques_before_it_is_braked() -> None:
 
 
 @pytest.mark.slow
-def test_operator_of_the_arm_holds_it_and_lets_it_go() -> None:
-    rig = swinging()
-    operator = Operator(rig.rack)
-    operator.say("arm", Operation.HOLD)
-    rig.run(300)
-    assert (rig.status.stopped, rig.status.braked, rig.status.answer) == (1, 0, Answer.DONE)
-    assert np.abs(np.diff(rig.positions[-50:], axis=0)).max() < 1e-5
-    operator.say("arm", Operation.RESUME)
-    rig.run(50)
-    assert_goes_on(rig)
-
-
-@pytest.mark.slow
 def test_operator_moves_the_joint_of_one_board() -> None:
     rig = swinging()
     operator = Operator(rig.rack)

@@ -47,24 +47,6 @@ def test_a_two_second_move_is_followed_within_a_third_of_a_milliradian(name: str
     assert (rig.status.clipped, rig.status.touches, rig.status.error) == (0, 0, Error.NONE)
 
 
-@pytest.mark.slow
-def test_the_planned_inertia_follows_the_arm_and_a_higher_bandwidth_follows_more_closely() -> None:
-    move, worst = course("puma560"), []
-    for bandwidth in (15.0, 60.0):
-        rig = rig_of("puma560", bandwidth=bandwidth)
-        rig.run(850, move.at)
-        worst.append(np.abs(rig.errors(move.at)).max())
-    assert worst[1] < 0.6 * worst[0]
-    at_goal = Dynamics(cell("puma560")).terms(move.goal, np.zeros(6)).inertia
-    assert rig.rack.read("servo.plan").inertia == pytest.approx(at_goal, abs=1e-9)
-    # Without a planner it uses the inertia where the arm is.
-    rig = rig_of("puma560")
-    rig.stop_planner()
-    rig.run(850, move.at)
-    assert not rig.rack.read("servo.plan").inertia.any()
-    assert np.abs(rig.errors(move.at)).max() < 0.33e-3
-
-
 def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_limits() -> None:
     rig, move = rig_of("puma560"), course("puma560")
     limits = np.array(config("puma560")[0].acceleration)

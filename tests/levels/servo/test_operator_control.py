@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.backplane.words import Demand
 from rack.levels.algebra import Array
 from rack.levels.operator import Answer, Operation
 from tests.levels.arms import cell, config
@@ -112,20 +111,6 @@ def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force
     assert (rig.status.answer, rig.status.standing) == (Answer.REFUSED, Operation.HOLD)
     assert rig.status.objection.startswith(f"joint '{config('puma560')[0].joints[1]}' at ")
     assert np.abs(rig.status.position - HOME).max() < 1e-3
-
-
-@pytest.mark.slow
-def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
-    operator = Operator(rig.rack)
-    rig.run(SECOND // 2)
-    operator.say("servo", Operation.SETPOINT, AWAY)
-    rig.run(SECOND // 4)
-    rig.rack.stop(Demand.BRAKE, SECOND)
-    rig.run(SECOND)
-    assert (rig.status.braked, rig.status.standing) == (1, Operation.SETPOINT)
-    assert np.abs(rig.status.position - AWAY).max() > 0.01
-    rig.run(3 * SECOND)
-    assert np.abs(rig.status.position - AWAY).max() < 1e-3
 
 
 @pytest.mark.slow

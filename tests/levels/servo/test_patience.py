@@ -120,16 +120,6 @@ def test_a_latched_fault_outlasts_a_restart_of_the_board() -> None:
     )
 
 
-def test_a_recurring_fault_is_latched_as_well() -> None:
-    rig = swinging()
-    for _ in range(12):
-        rig.inject("sensor-dropout")
-        rig.run(10, swing)
-        rig.heal()
-        rig.run(30, swing)
-    assert rig.status.error == Error.SENSORS
-
-
 def test_a_demand_on_the_arm_uses_up_no_patience_and_is_the_reason() -> None:
     rig = swinging()
     rig.inject("sensor-nan", joint=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -120,14 +119,6 @@ def test_what_cannot_be_done_is_refused_with_what_can(
     if "; in reach: [" in str(refused):
         place = str(refused).partition("in reach: [")[2].partition("]")[0].split(",")
         assert rehearsed(start, {"do": "goto", "position": [float(x) for x in place]}).moves
-
-
-def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> None:
-    moves = rehearsed(start, TRANSFER, HOME).moves
-    times = finish_times(moves, 4.0, CONTEXT, TaskParams())
-    assert times[0] > 4.0 + moves[0].duration_s
-    for (before, after), (_, duration_s) in zip(itertools.pairwise(times), moves[1:], strict=True):
-        assert after >= before + duration_s
 
 
 def test_move_with_a_time_ends_no_sooner_and_holds_up_what_follows(start: Rehearsal) -> None:

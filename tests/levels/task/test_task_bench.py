@@ -22,7 +22,6 @@ from rack.levels.messages import (
 )
 from rack.levels.task import TaskExecutor, TaskPlanner
 from tests.levels.arms import cell, config
-from tests.levels.box import lose_some
 from tests.levels.lockstep import BoardSpec, Lockstep
 
 ROBOT, SCENE = config("puma560")
@@ -192,10 +191,3 @@ def test_planner_that_is_lost_plans_again_only_what_was_lost(
     assert (status.state, plans) == (State.DONE, published)
     bench.run(5.0)
     assert bench.boxes["task.plan"].at(bench.tick)[0] == published
-
-
-def test_plan_that_is_lost_on_its_way_is_published_again() -> None:
-    bench = PlannedBench(HOME)
-    bench.disturb("task.plan", lose_some(1.0, seed=1), 1400)
-    status, plans = bench.run_to_end()
-    assert (status.state, plans) == (State.DONE, 2)

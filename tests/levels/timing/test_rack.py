@@ -122,17 +122,6 @@ def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
     assert (eq_3_3.subject, eq_3_3.left) == ("system", 226 * 2 * MS)
 
 
-def test_a_joint_that_is_slower_than_the_others_is_judged_by_itself() -> None:
-    timing = arm_of(*JOINTS[:3]).changed("joint3", every=30)
-    assert {chains.text for chains in timing.parallel} == {
-        "plan > path > joint1, joint2 > arm",
-        "plan > path > joint3 > arm",
-    }
-    assert timing.hierarchy.text == "plan > path > joint3 > arm"
-    subjects = [verdict.subject for verdict in verdicts(timing) if verdict.equation == "3.3"]
-    assert subjects == [f"system, {chains.text}" for chains in timing.parallel]
-
-
 def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
     found = rack(*boards, board("alone", 7), goal_ns=60 * 2.0 * MS).longest_cycles

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rack.levels.timing.schedule import Chart, Job, Span, simulate
+from rack.levels.timing.schedule import Chart, simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 C, R, X, W, P, U = Unit
@@ -171,29 +171,3 @@ def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
         assert {
             (job.task, job.release_ns): job.end_ns for job in chart.jobs if job.end_ns is not None
         } == ended
-
-
-SPANS = (
-    Span("a", 0, Unit.PROCESS, 0, 10, 0),
-    Span("a", 0, Unit.WRITE, 10, 14, 0),
-    Span("a", 0, Unit.PROCESS, 20, 26, 20),
-)
-JOBS = (Job("a", 0, 20, 14), Job("a", 20, 40, 45), Job("b", 0, 30, None), Job("b", 40, 70, None))
-CHART = Chart(0, 60, SPANS, JOBS)
-
-
-def test_a_job_is_late_if_it_ended_after_its_deadline_or_did_not_end_by_then() -> None:
-    assert CHART.late("a") == [JOBS[1]]
-    # The second one still has time when the chart ends.
-    assert CHART.late("b") == [JOBS[2]]
-    # In a window too, a job that is not due within it is not late.
-    assert [CHART.window(0, end).late("b") for end in (25, 30)] == [[], [JOBS[2]]]
-
-
-def test_a_window_cuts_spans_and_keeps_jobs_whole() -> None:
-    window = CHART.window(4, 12)
-    spans = [(span.unit, span.start_ns, span.end_ns) for span in window.spans]
-    assert spans == [("X", 4, 10), ("W", 10, 12)]
-    assert (window.start_ns, window.end_ns) == (4, 12)
-    assert CHART.window(42, 50).jobs == (JOBS[1], JOBS[3])
-    assert CHART.window(20, 25).jobs == (JOBS[1], JOBS[2])

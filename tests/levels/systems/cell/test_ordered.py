@@ -238,3 +238,13 @@ def test_order_is_done_once_in_whatever_cycle_a_board_dies(board: str, cycle: in
     assert bench.until(Response.DONE).moves_done == 1
     bench.run(1.0)
     assert (bench.status.action, bench.status.actions) == (1, 1)
+
+
+def test_order_that_stands_still_fails_with_the_reason() -> None:
+    bench = OrderBench(stalled_s=3.0)
+    bench.ask_and_do(TRANSFER)
+    bench.lose("elemental_move", 100_000)
+    report = bench.until(Response.FAILED)
+    assert report.error == Error.STALLED
+    assert report.reason.startswith("nothing has moved for 3 s: no status from the level below")
+    assert bench.status.state != State.ERROR

@@ -236,14 +236,3 @@ def test_only_the_owner_says_where_its_body_is() -> None:
     told = body.hear(word(b"beta", owned, 3.0))
     assert told is not None
     assert told[0] == 3.0
-
-
-def test_an_arm_that_still_touches_a_body_does_not_claim_it_back() -> None:
-    body = SharedBody(b"part", b"alpha")
-    body.touch(True)
-    body.hear(word(b"beta", Claim(2, b"beta"), 1.0))
-    body.touch(True)
-    assert body.is_elsewhere
-    body.touch(False)
-    body.touch(True)
-    assert body.claim == Claim(3, b"alpha")

@@ -80,15 +80,6 @@ def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_release
     assert (rig.mode, rig.status.reason) == (Mode.MOTION, "")
 
 
-def test_a_silent_client_that_wants_nothing_is_not_missed() -> None:
-    rig = ServerRig(silence=0.5)
-    rig.line((X, Y, HEIGHT + 0.02), 1.0)
-    rig.run(2.5)
-    rig.alive = False
-    rig.run(2.0)
-    assert (rig.status.state, rig.mode) == (State.DONE, Mode.MOTION)
-
-
 def test_a_surface_that_is_not_there_ends_compliance_with_a_reason() -> None:
     rig = ServerRig(reach=1.0)
     rig.floor = 0.0

@@ -156,27 +156,6 @@ def test_a_target_is_there_while_it_rests_where_it_was(arm: Arm) -> None:
         assert arm.look()["target"] == seen
 
 
-def test_a_pose_over_an_object_is_above_where_it_rests(arm: Arm) -> None:
-    arm.look()
-    name = arm.level.context.scene.objects[0]
-    arm.level._taken = WordCommand(False, 1, f"pick {name}")
-    pose, taught = next(iter(arm.level.table.plan.pose.items()))
-    arm.level.do_move(pose)
-    arm.level.give(arm.messages, 50)
-    command = arm.messages.command
-    assert (command.words, command.object, command.speed) == ("move", 0, taught.speed)
-    np.testing.assert_array_equal(command.aim, arm.place)
-    reached = arm.level._ik.tool_at(command.joints)
-    above = arm.place + np.array([0.0, 0.0, taught.height])
-    np.testing.assert_allclose(reached.position, above, atol=1e-4)
-    # In the gripper it is raised from where it was.
-    arm.below.held = 1
-    arm.world.position[0] = arm.place + np.array([0.0, 0.0, 0.05])
-    arm.look()
-    arm.level.do_move(pose)
-    np.testing.assert_array_equal(arm.level._command.aim, arm.place)
-
-
 @pytest.mark.parametrize("words", ["", "home"])
 def test_a_pose_over_nothing_is_not_reached_and_ends_no_board(arm: Arm, words: str) -> None:
     arm.level._taken = WordCommand(False, 3, words)

@@ -226,22 +226,6 @@ def test_an_operators_command_goes_before_that_of_the_level_above(bench: Bench) 
     assert not bench.door.holds
 
 
-def test_an_operators_command_that_ends_in_an_error_is_refused_and_the_level_holds(
-    bench: Bench,
-) -> None:
-    bench.order(3, Operation.DO, "open")
-    bench.door.place = "between"
-    for _ in range(PATIENCE_TICKS):
-        bench.cycle()
-    status = bench.cycle()
-    assert (status.fired, status.answer, status.standing) == (
-        "jams",
-        Answer.REFUSED,
-        Operation.HOLD,
-    )
-    assert status.objection == "the door jams"
-
-
 def test_an_operator_hears_which_words_and_tables_there_are(bench: Bench) -> None:
     status = bench.order(1, Operation.DO, "paint blue")
     assert (status.answer, status.standing, status.words) == (Answer.REFUSED, Operation.NONE, "")

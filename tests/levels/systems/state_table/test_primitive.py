@@ -226,29 +226,3 @@ def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -
     np.testing.assert_allclose(level._point[0], bench.home + 0.1)
     np.testing.assert_allclose(level._end, bench.home + 0.2)
     assert fresh.command.id == 77
-
-
-def test_a_set_point_is_due_two_cycles_after_its_release_and_carries_the_load_there(
-    bench: Bench,
-) -> None:
-    level = bench.level
-    every = level.context.every
-    bench.follow()
-    bench.command(bench.home + 0.3)
-    bench.look()
-    assert level._due == bench.tick + 2 * every
-    released = bench.tick
-    level.do_begin()
-    # A new curve begins where the set point before ends.
-    assert level._from == bench.tick + every
-    command = bench.give()
-    assert (command.id, command.due) == (released // every + 1, released + 2 * every)
-    for _ in range(12):
-        bench.follow()
-    assert np.abs(command.velocity).max() > 0.0
-    inertia, bias = level._dynamics.terms(command.position, command.velocity)
-    np.testing.assert_allclose(command.load, bias)
-    np.testing.assert_allclose(command.inertia, np.diagonal(inertia))
-    bench.below[1].stopped = 1
-    bench.look()
-    assert bench.give().due == 0

@@ -58,22 +58,6 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE, 3: RequestEnd.DONE}
 
 
-def test_a_body_that_outruns_the_arm_fails_the_request_and_the_arm_ramps_to_rest() -> None:
-    rig = TrackingRig(speed=1.2)
-    rig.at = 3.0
-    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
-    rig.request(MotionKind.STAY, segment=9.0)
-    rig.follow(6.0)
-    status = rig.write.status
-    assert status.state == State.ERROR
-    assert rig.ends()[2] == RequestEnd.FAILED
-    assert "request 2: " in status.reason
-    assert status.resting
-    speed, acceleration = rig.excess()
-    assert speed <= 1.05
-    assert acceleration <= 1.1
-
-
 def test_an_error_refuses_what_comes_until_a_cancel() -> None:
     rig = TrajectoryRig()
     tool = rig.cycle().tool.copy()
@@ -212,20 +196,6 @@ def test_an_operator_holds_and_resumes() -> None:
     assert acceleration <= 1.0
 
 
-def test_the_gripper_keeps_the_last_grip_and_the_arm_waits_for_it() -> None:
-    rig = TrajectoryRig()
-    rig.request(MotionKind.GRIP, opening=0.012, force=9.0, segment=0.4)
-    rig.joints([0.2, 0, 0, 0, 0, 0])
-    status = rig.run(0.3)
-    assert status.current == 1
-    assert status.resting
-    assert (rig.write.command.opening, rig.write.command.force) == (0.012, 9.0)
-    rig.restart()
-    rig.run(4.0)
-    assert (rig.write.command.opening, rig.write.command.force) == (0.012, 9.0)
-    assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE}
-
-
 def test_set_points_are_due_two_cycles_later_with_the_load_of_the_motion() -> None:
     rig = TrajectoryRig()
     rig.joints([0.5, 0.5, 0, 0, 0, 0])
@@ -236,3 +206,19 @@ def test_set_points_are_due_two_cycles_later_with_the_load_of_the_motion() -> No
     assert np.array_equal(command.load, terms.bias)
     assert np.array_equal(command.inertia, terms.inertia.diagonal())
     assert np.abs(command.velocity).max() > 0.1
+
+
+def test_a_body_that_outruns_the_arm_fails_the_request_and_the_arm_ramps_to_rest() -> None:
+    rig = TrackingRig(speed=1.2)
+    rig.at = 3.0
+    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
+    rig.request(MotionKind.STAY, segment=9.0)
+    rig.follow(6.0)
+    status = rig.write.status
+    assert status.state == State.ERROR
+    assert rig.ends()[2] == RequestEnd.FAILED
+    assert "request 2: " in status.reason
+    assert status.resting
+    speed, acceleration = rig.excess()
+    assert speed <= 1.05
+    assert acceleration <= 1.1
