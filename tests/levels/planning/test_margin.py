@@ -19,7 +19,7 @@ from rack.levels.tables import SceneConfig
 from rack.levels.task.actions import Handling
 from rack.levels.task.program import DOWN
 from rack.levels.task.rehearsal import Rehearsal
-from tests.levels.arms import CLOCK_NS, cell, config, four_bar, pendulum
+from tests.levels.arms import CLOCK_NS, cell, pendulum
 from tests.levels.robot import grippers
 
 STOP = '<geom name="post" type="box" size=".01 .01 .01" pos=".2 0 {z}"/>'
@@ -47,19 +47,6 @@ def test_links_keep_the_margin_in_planning_alone(tmp_path: Path) -> None:
     assert not planned.free(lifted)
     assert 0.0 < planned.room(lifted) < MAX_STRAY_M
     assert planned.free(lifted, planned.room(lifted))
-
-
-@pytest.mark.parametrize(
-    ("arm", "farther"),
-    [(four_bar, True), (grippers.rotary, True), (lambda _: config("puma560"), False)],
-)
-def test_only_swinging_fingers_reach_farther_when_closed(
-    tmp_path: Path, arm: object, farther: bool
-) -> None:
-    assert callable(arm)
-    robot, scene = arm(tmp_path)
-    planned = CollisionChecker(build_cell(robot, scene, CLOCK_NS), scene, MAX_STRAY_M)
-    assert (planned.longest is not None) is farther
 
 
 def lowest_grasp(folder: Path, length: float) -> float:

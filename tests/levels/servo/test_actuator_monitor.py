@@ -186,11 +186,3 @@ def test_a_motor_that_lacks_more_than_a_contact_takes_is_found_while_a_part_pres
     much = (MAX_CONTACT_PART + 0.01) * CELL.bounds.torque[1]
     found = bench.leave(SURE_CYCLES, j2=much, j3=-9.8, j5=0.4)
     assert [finding.subject for finding in found] == [1]
-
-
-def test_a_wrist_that_lacks_torque_is_found_again_once_nothing_presses() -> None:
-    bench = Bench()
-    bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1)
-    bench.leave(1)
-    found = [bench.leave(1, j5=2.0 + cycle) for cycle in range(SURE_CYCLES)]
-    assert [finding.subject for finding in found[-1]] == [4]

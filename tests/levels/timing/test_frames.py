@@ -22,13 +22,6 @@ def places(found: CoreFrames) -> list[tuple[str, float, float, str]]:
     return [(p.board, p.offset_ns / MS, round(p.slack_ns / MS, 6), p.until) for p in found.places]
 
 
-def test_every_distinct_frame_is_listed_once_with_the_numbers_of_all_that_are_alike() -> None:
-    even, odd = core_frames(timing("schedule.major_ms=16"))
-    assert (even.core, even.frames, odd.frames) == (1, (0, 2), (1, 3))
-    assert places(even) == [("fast", 0, 0.06, "even"), ("even", 1, 0.16, "")]
-    assert places(odd) == [("fast", 0, 0.06, "odd"), ("odd", 1, 0.16, "")]
-
-
 def test_boards_released_in_one_tick_follow_each_other_by_priority() -> None:
     even, _ = core_frames(timing("board.even.phase=0"))
     assert places(even) == [("fast", 0, 0, "even"), ("even", 0.94, 0.22, "")]
