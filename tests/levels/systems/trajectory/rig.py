@@ -106,7 +106,6 @@ class TrajectoryRig:
         self.brake()
 
     def brake(self) -> None:
-        """Let the boards hold where they are."""
         for status in self.statuses.values():
             status.holding, status.target_velocity = 1, 0.0
 
@@ -138,7 +137,6 @@ class TrajectoryRig:
         return Ports(requests=requests, boards=boards, world=world, **own, **self.others())
 
     def others(self) -> dict[str, Reading]:
-        """Return what else the level reads."""
         return {}
 
     def _last(self, source: Input) -> Reading:

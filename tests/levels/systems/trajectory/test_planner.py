@@ -51,7 +51,6 @@ class PlanningRig:
         self.start()
 
     def start(self) -> None:
-        """Begin anew, as after a restart."""
         self.planner = RequestPlanner(self.context)
 
     def run(self, cycles: int = 1) -> list[int]:
