@@ -41,13 +41,6 @@ def test_the_tool_points_down_at_home_away_from_singularities(name: str) -> None
     assert np.linalg.svd(jacobian[:, made.dof])[1][-1] > 0.15
 
 
-def test_a_change_to_one_model_is_in_no_other() -> None:
-    first = build(*config("puma560")).model
-    before = first.body_mass.copy()
-    first.body_mass[:] = 7.0
-    assert np.array_equal(build(*config("puma560")).model.body_mass, before)
-
-
 def test_a_free_body_listed_before_the_arm_shifts_no_index(tmp_path: Path) -> None:
     made = build(
         pendulum(tmp_path, first=BLOCK), SceneConfig(objects=("block",), supports=("floor",))

@@ -11,6 +11,7 @@ from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.servo.curves import Bridge, Curve
 from rack.levels.tables import SceneConfig
 from tests.levels.arms import ROBOTS, cell, config
 from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
@@ -32,6 +33,13 @@ def course(name: str, duration_s: float = 2.0) -> Course:
 def steps_of(values: list[Array]) -> Array:
     """Return the second differences over time, rad/s2, (n, joints)."""
     return np.asarray(np.diff(np.array(values), n=2, axis=0)) / TICK_S**2
+
+
+def test_a_bridge_needs_most_acceleration_at_its_ends() -> None:
+    rest = Curve(np.zeros(2), duration_s=1.0)
+    bridge = Bridge(rest, 0.5, (np.array([1.0, 0.0]), np.zeros(2)), duration_s=1.0)
+    assert bridge.at(0.5).position == pytest.approx([0.5, 0.0])
+    assert [bridge.is_within(np.full(2, most)) for most in (5.9, 6.1)] == [False, True]
 
 
 @pytest.mark.parametrize("name", GOALS)

@@ -137,7 +137,6 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
         MotionKind.POSE,
         MotionKind.JOINTS,
         MotionKind.POSE,
-        # Out of reach, it is queued as it stands.
         MotionKind.POSE,
     ]
     assert (rig.sent[3]["body"], rig.sent[3]["live"]) == (SCENE.bodies.index("post"), 1)
