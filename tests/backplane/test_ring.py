@@ -85,7 +85,7 @@ def test_every_row_is_whole_or_counted_while_a_writer_hammers(bus: Segment) -> N
     ring, taken, lost = MailboxRing(bus, NAME), 0, 0
     writer = fork(lambda: hammer(bus))
     try:
-        while taken < 20_000:
+        while taken < 8_000:
             wait_until(lambda: ring.waiting)
             rows, missing = ring.drain()
             whole = rows["message"]["row"] == rows["serial"][:, np.newaxis]

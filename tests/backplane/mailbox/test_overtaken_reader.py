@@ -128,7 +128,7 @@ def test_a_reader_overtaken_at_any_instruction_reports_nothing_false(
         rack.fault(kind, *([0.5] if kind != "delay" else []))
     # A message that is dropped is not in the middle of its copy.
     while reader.is_overtaken(at, DEPTH - 2 + at % (DEPTH + 4), kind != "drop") or at < LEAST:
-        at += 3 if kind else 1
+        at += 7 if kind else 2
         reader.write(READ_EVERY)
         reader.read()
         reader.write(READ_EVERY)

@@ -20,8 +20,8 @@ from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
-READS = 30_000
-KILLS = 15
+READS = 10_000
+KILLS = 8
 AT_ONCE: tuple[Protocol, ...] = ("double-buffer", "lock")
 
 

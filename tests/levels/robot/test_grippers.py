@@ -107,7 +107,6 @@ def test_a_light_drive_gets_the_inertia_that_its_loop_needs(tmp_path: Path) -> N
     "kind",
     [
         pytest.param(lambda folder: grippers.independent(folder, **FOLLOW), id="independent"),
-        pytest.param(grippers.rotary, id="rotary"),
         pytest.param(grippers.soft, id="soft"),
         pytest.param(grippers.one_finger, id="one finger"),
         pytest.param(four_bar, id="four-bar"),
