@@ -59,21 +59,14 @@ def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
     assert all(address + size <= following for (address, size), (following, _) in pairwise(areas))
 
 
-def test_a_boards_mailboxes_lie_in_its_window(full: Layout) -> None:
+def test_what_a_board_writes_lies_in_its_window(full: Layout) -> None:
     places = AddressMap(full)
-    window = next(window for window in places.windows if window.board == "writer")
-    boxes = [
-        places.mailboxes[mailbox.name] for mailbox in full.mailboxes if mailbox.writer == "writer"
-    ]
-    for address in (*boxes, places.blocks["writer"], places.blocks["writer.planner"]):
-        assert window.address <= address < window.address + window.size
-
-
-def test_operators_mailboxes_lie_in_the_window_of_the_clock(full: Layout) -> None:
-    places = AddressMap(full)
-    clock = places.windows[0]
-    for address in (places.operator, places.mailboxes["reader.operator"]):
-        assert clock.address <= address < clock.address + clock.size
+    boxes, blocks = places.mailboxes, places.blocks
+    of_writer = (boxes["writer.a"], boxes["writer.c"], blocks["writer"], blocks["writer.planner"])
+    of_clock = (places.operator, boxes["reader.operator"])
+    for window, addresses in zip(places.windows, (of_clock, of_writer), strict=False):
+        for address in addresses:
+            assert window.address <= address < window.address + window.size
     assert operator_entry_size(full) >= full.mailbox("reader.operator").size
 
 

@@ -37,21 +37,7 @@ def test_an_entry_holds_what_was_asked_for(make_bus: MakeBus) -> None:
     assert read.parameters[:3].tolist() == [0.5, -1.0, 3.25]
     assert (read.stage, read.until, read.struck_tick) == (Stage.WAITING, NEVER, -1)
     assert segment.words[System.INJECTED] == 1
-
-
-def test_a_fault_without_a_condition_waits_for_its_tick_alone(make_bus: MakeBus) -> None:
-    entry = FaultTable(make_bus(mailbox())).add(replace(WHOLE, when=None))
-    assert entry.when_box == -1
-
-
-def test_entries_are_found_by_their_stages(make_bus: MakeBus) -> None:
-    table = FaultTable(make_bus())
-    entries = [table.add(Injection(0, task)) for task in (0, 1, 1, -1)]
-    assert table.staged((Stage.ACTIVE,)) == []
-    for entry in entries[1:]:
-        entry.stage = Stage.ACTIVE
-    assert [entry.task for entry in table.staged((Stage.ACTIVE,))] == [1, 1, -1]
-    assert [entry.index for entry in table.staged((Stage.WAITING,))] == [0]
+    assert FaultTable(segment).add(replace(WHOLE, when=None)).when_box == -1
 
 
 def test_the_first_time_that_a_fault_acts_is_kept_and_how_long_it_was_hidden(

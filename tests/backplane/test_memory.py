@@ -30,7 +30,6 @@ def faults(work: Callable[[], object]) -> int:
 
 
 def use(memory: bytearray | memoryview) -> None:
-    """Write to every page of it."""
     for at in range(0, len(memory), mmap.PAGESIZE):
         memory[at] = memory[at]
 

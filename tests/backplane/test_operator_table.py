@@ -43,11 +43,7 @@ def test_an_entry_holds_what_was_asked_for(segment: Segment) -> None:
     read = OperatorTable(segment).entries[entry.index]
     assert bytes(read.message[: len(message)]) == message
     assert (read.mailbox, read.tick) == (0, 40)
-    assert (read.stage, read.serial, read.given_tick) == (
-        RequestStage.WAITING,
-        0,
-        -1,
-    )
+    assert (read.stage, read.serial, read.given_tick) == (RequestStage.WAITING, 0, -1)
 
 
 def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None:
@@ -56,6 +52,8 @@ def test_requests_wait_in_the_order_in_which_they_came(segment: Segment) -> None
     give(added[0], 1)
     added.append(table.add(Request(0, b"", 7)))
     assert [entry.tick for entry in OperatorTable(segment).waiting()] == [3, 5, 7]
+    assert [entry.ticket for entry in OperatorTable(segment).waiting()] == [2, 3, 4]
+    assert segment.words[System.REQUESTED] == 4
 
 
 def test_of_commands_issued_those_are_lacking_that_wait_for_no_tick_until_theirs(
@@ -78,39 +76,35 @@ def test_of_commands_issued_those_are_lacking_that_wait_for_no_tick_until_theirs
     assert table.lacking(issued) == issued[1:3]
 
 
-def test_a_request_that_waits_can_be_taken_back(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    entry = table.add(Request(0, b"", 9))
-    assert table.withdraw(entry, entry.ticket)
-    assert table.waiting() == []
-
-
-def test_a_request_that_was_given_stays_given(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    entry = table.add(Request(0, b"", 9))
-    give(entry, 1)
-    assert not table.withdraw(entry, entry.ticket)
-    assert entry.stage == RequestStage.GIVEN
-
-
 def test_a_request_in_a_reused_entry_is_not_withdrawn_by_an_earlier_client(
     segment: Segment,
 ) -> None:
     table = OperatorTable(segment)
     entry = table.add(Request(0, b"", 9))
     ticket = entry.ticket
-    table.withdraw(entry, ticket)
+    assert table.withdraw(entry, ticket)
+    assert table.waiting() == []
     again = table.add(Request(0, b"", 11))
     assert again.index == entry.index
     assert not table.withdraw(entry, ticket)
     assert again.stage == RequestStage.WAITING
+    give(again, 1)
+    assert not table.withdraw(again, again.ticket)
+    assert again.stage == RequestStage.GIVEN
 
 
-def test_a_claimed_request_waits_as_long_as_its_block(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    with table.claim(Request(0, b"", 9)) as entry:
-        assert OperatorTable(segment).waiting()[0].index == entry.index
+def test_a_claimed_request_waits_as_long_as_its_client_holds_it(segment: Segment) -> None:
+    table, before = OperatorTable(segment), descriptors()
+    with table.claim(Request(0, b"", 9)) as first:
+        assert OperatorTable(segment).waiting()[0].index == first.index
     assert table.waiting() == []
+    # One without a client waits in an entry that a client had.
+    assert table.add(Request(0, b"", 9)).index == first.index
+    claim = table.enter(Request(0, b"", 9))
+    assert [entry.index for entry in table.waiting()] == [first.index, claim.entry.index]
+    claim.leave()
+    assert [entry.index for entry in table.waiting()] == [first.index]
+    assert descriptors() == before
 
 
 @pytest.mark.filterwarnings(FORKS)
@@ -133,59 +127,11 @@ def test_a_dead_client_makes_room(segment: Segment) -> None:
 def test_a_full_table_makes_room_with_the_command_given_longest_ago(segment: Segment) -> None:
     table = OperatorTable(segment)
     entries = [table.add(Request(0, b"", 9)) for _ in range(OPERATOR_ENTRIES)]
+    with pytest.raises(OperatorTableError, match=f"full: {OPERATOR_ENTRIES} commands wait"):
+        table.add(Request(0, b"", 9))
     for serial, entry in enumerate(reversed(entries), 1):
         give(entry, serial)
     assert table.add(Request(0, b"", 9)).index == entries[-1].index
-
-
-def test_a_table_in_which_all_wait_refuses_one_more(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    for _ in range(OPERATOR_ENTRIES):
-        table.add(Request(0, b"", 9))
-    with pytest.raises(OperatorTableError, match=f"full: {OPERATOR_ENTRIES} commands wait"):
-        table.add(Request(0, b"", 9))
-
-
-@pytest.mark.filterwarnings(FORKS)
-def test_two_operators_at_once_fill_entries_of_their_own(segment: Segment) -> None:
-    half = OPERATOR_ENTRIES // 2
-
-    def add_half() -> None:
-        for _ in range(half):
-            OperatorTable(segment).add(Request(0, b"", 9))
-
-    pids = [fork(add_half) for _ in range(2)]
-    assert [exit_status(pid) for pid in pids] == [0, 0]
-    waiting = OperatorTable(segment).waiting()
-    assert len(waiting) == 2 * half
-    assert len({entry.ticket for entry in waiting}) == 2 * half
-
-
-def test_a_request_leaves_no_file_open(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    before = descriptors()
-    table.add(Request(0, b"", 9))
-    with table.claim(Request(0, b"", 9)):
-        pass
-    claim = table.enter(Request(0, b"", 9))
-    claim.leave()
-    assert descriptors() == before
-
-
-def test_a_request_counts_as_its_clients_while_the_client_holds_it(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    claim = table.enter(Request(0, b"", 9))
-    assert [entry.index for entry in table.waiting()] == [claim.entry.index]
-    claim.leave()
-    assert table.waiting() == []
-
-
-def test_a_request_without_a_client_waits_in_an_entry_that_a_client_had(segment: Segment) -> None:
-    table = OperatorTable(segment)
-    with table.claim(Request(0, b"", 9)) as first:
-        pass
-    assert table.add(Request(0, b"", 9)).index == first.index
-    assert [entry.index for entry in table.waiting()] == [first.index]
 
 
 @pytest.mark.parametrize(("tick", "was_withdrawn"), [(-1, True), (0, False), (1, False)])
@@ -197,9 +143,3 @@ def test_a_request_that_the_clock_is_just_giving_is_not_withdrawn(
     assert entry.tick == -1
     entry.given_tick = tick
     assert table.withdraw(entry, entry.ticket) is was_withdrawn
-
-
-def test_tickets_count_the_requests(segment: Segment) -> None:
-    tickets = [OperatorTable(segment).add(Request(0, b"", 9)).ticket for _ in range(3)]
-    assert tickets == [1, 2, 3]
-    assert segment.words[System.REQUESTED] == 3

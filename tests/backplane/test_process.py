@@ -27,7 +27,6 @@ from rack.backplane.process import (
     is_alive,
     mapped_and_locked,
     name_process,
-    pin,
     processor_ns,
     readable,
     refusal,
@@ -39,7 +38,7 @@ from rack.backplane.process import (
 )
 from tests.backplane.bus import task
 from tests.machine import needs_deadlines, needs_fifo
-from tests.processes import FORKS, descriptors, exit_status, fork, forked, kill, wait_until
+from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 
@@ -50,19 +49,8 @@ def test_a_running_process_is_alive_under_its_own_start_alone() -> None:
     assert is_alive(os.getpid())
     assert is_alive(os.getpid(), started)
     assert not is_alive(os.getpid(), started + 1)
-
-
-@pytest.mark.parametrize("pid", [0, -1])
-def test_no_process_is_not_alive(pid: int) -> None:
-    assert not is_alive(pid)
-
-
-def test_a_killed_process_is_not_alive_even_before_it_is_reaped() -> None:
-    with forked(lambda: time.sleep(60)) as pid:
-        assert is_alive(pid)
-        os.kill(pid, 9)
-        wait_until(lambda: not is_alive(pid))
-    assert not is_alive(pid)
+    assert not is_alive(0)
+    assert not is_alive(-1)
 
 
 def test_a_name_with_parentheses_and_spaces_does_not_confuse() -> None:
@@ -76,56 +64,23 @@ def test_a_name_with_parentheses_and_spaces_does_not_confuse() -> None:
         assert start_time(pid) == before > 0
 
 
-def test_a_process_is_pinned_to_one_core() -> None:
-    core = max(os.sched_getaffinity(0))
-
-    def pinned() -> bool:
-        pin(core)
-        return os.sched_getaffinity(0) == {core}
-
-    assert exit_status(fork(pinned)) == 0
-
-
-def test_a_core_that_the_machine_lacks_is_an_error() -> None:
-    def lacking() -> None:
-        with pytest.raises(OSError, match="Invalid argument"):
-            pin(1023)
-
-    child = fork(lacking)
-    try:
-        assert exit_status(child) == 0
-    finally:
-        kill(child)
-
-
-@pytest.mark.slow
 def test_cores_are_kept_awake_by_a_request_that_is_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device = tmp_path / "cpu_dma_latency"
-    device.touch()
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
+    with cores_kept_awake() as refusal:
+        assert refusal == (
+            f"idle cores sleep, since {device} cannot be opened: No such file or directory"
+        )
+    assert not device.exists()
+    device.touch()
     before = descriptors()
     with cores_kept_awake() as refusal:
         assert refusal == ""
         assert device.read_bytes() == bytes(4)
         assert descriptors() == before + 1
     assert descriptors() == before
-
-
-def test_cores_sleep_as_usual_where_the_request_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", tmp_path / "missing")
-    reason = ""
-    with cores_kept_awake() as refusal:
-        reason = refusal
-    assert (
-        reason
-        == f"idle cores sleep, since {tmp_path / 'missing'} cannot be opened: No such file or"
-        " directory"
-    )
-    assert not (tmp_path / "missing").exists()
 
 
 def test_the_kernel_says_in_which_state_a_process_is() -> None:
@@ -137,6 +92,7 @@ def test_the_kernel_says_in_which_state_a_process_is() -> None:
         os.kill(pid, signal.SIGKILL)
         wait_until(lambda: state_of(pid) in GONE)
         assert state_of(pid) == "Z"
+        assert not is_alive(pid)
         assert start_time(pid) == 0
     assert (state_of(pid), processor_ns(pid), mapped_and_locked(pid)) == ("X", 0, (0, 0))
 
@@ -180,20 +136,6 @@ def test_a_status_says_how_a_process_ended() -> None:
         "exit status 3",
         "signal SIGKILL",
     ]
-
-
-@needs_fifo
-def test_a_priority_is_that_of_the_process_itself() -> None:
-    def take() -> bool:
-        assert set_priority(7)
-        assert os.sched_getscheduler(0) == os.SCHED_FIFO
-        assert os.sched_getparam(0).sched_priority == 7
-        assert set_priority(0)
-        return os.sched_getscheduler(0) == os.SCHED_OTHER
-
-    before = os.sched_getscheduler(1)
-    assert exit_status(fork(take)) == 0
-    assert os.sched_getscheduler(1) == before
 
 
 @needs_fifo

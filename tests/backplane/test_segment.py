@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import resource
 import signal
 import stat
 import time
@@ -14,7 +13,6 @@ from types import SimpleNamespace
 import pytest
 
 from rack.backplane.errors import SegmentError
-from rack.backplane.layout import Layout
 from rack.backplane.segment import VERSION, Segment, racks, shm_path, unlink
 from rack.backplane.words import Block, Head, System
 from tests.backplane.bus import layout, mailbox
@@ -52,18 +50,13 @@ def test_segment_is_its_users_alone_and_all_of_it_is_allocated(make_bus: MakeBus
     assert found.st_blocks * 512 >= found.st_size
 
 
-def test_whoever_attaches_finds_layout_and_config(make_bus: MakeBus) -> None:
+def test_whoever_attaches_finds_layout_config_and_the_same_memory(make_bus: MakeBus) -> None:
     made = make_bus(mailbox(), mailbox("lock", name="writer.other"), config='name = "näme"\n')
     found = Segment.attach(made.rack)
     assert found.layout == made.layout
     assert found.config == made.config
     assert found.map.mailboxes == made.map.mailboxes
     assert (found.launcher, found.launcher_is_alive) == (os.getpid(), True)
-
-
-def test_attached_memory_is_the_same_memory(make_bus: MakeBus) -> None:
-    made = make_bus()
-    found = Segment.attach(made.rack)
     made.words[System.TICK] = 2**62 + 1
     found.block("reader")[Block.DONE] = -7
     assert found.words[System.TICK] == 2**62 + 1
@@ -87,45 +80,46 @@ def test_a_name_in_use_is_refused_and_the_first_segment_stays(make_bus: MakeBus)
     assert Segment.attach(first.rack).words[System.TICK] == 5
 
 
-def test_attaching_to_an_unknown_rack_names_the_racks(make_bus: MakeBus) -> None:
+@pytest.mark.parametrize("name", ["nobody-s", "a/b", "x" * 300])
+def test_attaching_to_an_unknown_rack_names_the_racks(make_bus: MakeBus, name: str) -> None:
     there = make_bus().rack
-    message = refusal(lambda: Segment.attach("nobody-s"))
-    assert "rack 'nobody-s' does not exist" in message
+    message = refusal(lambda: Segment.attach(name))
+    assert f"rack '{name}' does not exist" in message
     assert there in message
 
 
-@pytest.mark.parametrize("name", ["a/b", "x" * 300])
-def test_a_name_that_none_can_have_is_not_there(name: str) -> None:
-    assert "does not exist" in refusal(lambda: Segment.attach(name))
-
-
-def test_another_layout_version_is_refused(make_bus: MakeBus) -> None:
-    segment = make_bus()
+def raise_version(segment: Segment) -> str:
     segment.words[Head.VERSION] = VERSION + 1
-    message = refusal(lambda: Segment.attach(segment.rack))
-    assert f"layout version {VERSION + 1}; this program attaches to {VERSION}" in message
+    return f"layout version {VERSION + 1}; this program attaches to {VERSION}"
 
 
-def test_a_layout_with_a_field_unknown_to_this_program_is_refused(make_bus: MakeBus) -> None:
-    segment = make_bus()
+def change_kind(segment: Segment) -> str:
+    segment.words[Head.MAGIC] += 1
+    return segment.rack
+
+
+def rename_field(segment: Segment) -> str:
     start = segment.words[Head.LAYOUT_AT]
     text = bytes(segment.bytes[start : start + segment.words[Head.LAYOUT_SIZE]])
     segment.bytes[start : start + len(text)] = text.replace(b'"wake"', b'"woke"')
-    assert "layout unreadable" in refusal(lambda: Segment.attach(segment.rack))
+    return "layout unreadable"
 
 
-def test_a_segment_of_another_kind_is_refused(make_bus: MakeBus) -> None:
-    segment = make_bus()
-    segment.words[Head.MAGIC] += 1
-    refusal(lambda: Segment.attach(segment.rack))
-
-
-def test_a_size_other_than_the_heads_is_refused(make_bus: MakeBus) -> None:
-    segment = make_bus()
+def lengthen(segment: Segment) -> str:
     size = len(segment.bytes)
     os.truncate(shm_path(segment.rack), size + 4096)
-    message = refusal(lambda: Segment.attach(segment.rack))
-    assert f"{size + 4096} bytes; its head says {size}" in message
+    return f"{size + 4096} bytes; its head says {size}"
+
+
+@pytest.mark.parametrize("change", [raise_version, change_kind, rename_field, lengthen])
+def test_a_segment_that_this_program_does_not_understand_is_refused(
+    make_bus: MakeBus, change: Callable[[Segment], str]
+) -> None:
+    segment = make_bus()
+    why, before = change(segment), descriptors()
+    for _ in range(2):
+        assert why in refusal(lambda: Segment.attach(segment.rack))
+    assert descriptors() == before
 
 
 def test_a_segment_without_room_for_a_head_is_refused(rack_name: str) -> None:
@@ -151,27 +145,6 @@ def test_another_users_segment_is_refused(make_bus: MakeBus) -> None:
     assert exit_status(fork(lambda: attach(f"owner {ANOTHER}"))) == 0
 
 
-@pytest.mark.slow
-def test_refused_attaches_leave_no_file_open(make_bus: MakeBus) -> None:
-    segment = make_bus()
-    segment.words[Head.VERSION] = VERSION + 1
-    before = descriptors()
-    for _ in range(5):
-        refusal(lambda: Segment.attach(segment.rack))
-    assert descriptors() == before
-
-
-@pytest.mark.slow
-def test_a_closed_segment_leaves_no_file_open_and_stays_readable(make_bus: MakeBus) -> None:
-    made, before = make_bus(), descriptors()
-    found = Segment.attach(made.rack)
-    found.close()
-    found.close()
-    assert found.words[Head.SIZE] == len(made.bytes)
-    del found
-    assert descriptors() == before
-
-
 def test_a_processor_that_reorders_stores_is_refused_before_anything_is_made(
     rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,50 +158,20 @@ def test_a_processor_that_reorders_stores_is_refused_before_anything_is_made(
     assert rack_name not in racks()
 
 
-def too_large(rack: str) -> Layout:
-    return layout(rack, [mailbox(depth=1 << 40)])
-
-
 def test_a_lack_of_shared_memory_is_reported_at_creation(rack_name: str) -> None:
-    message = refusal(lambda: Segment.create(too_large(rack_name), ""))
-    assert f"rack '{rack_name}'" in message
-    assert "bytes of shared memory" in message
-    assert rack_name not in racks()
-
-
-def test_a_limit_on_file_size_is_reported_at_creation(rack_name: str) -> None:
-    def create() -> bool:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-        return "File too large" in refusal(
-            lambda: Segment.create(layout(rack_name, [mailbox()]), "")
-        )
-
-    assert exit_status(fork(create)) == 0
-    assert rack_name not in racks()
-
-
-@pytest.mark.slow
-def test_failed_creations_leave_no_file_open(rack_name: str) -> None:
-    before = descriptors()
-    for _ in range(5):
-        refusal(lambda: Segment.create(too_large(rack_name), ""))
+    too_large, before = layout(rack_name, [mailbox(depth=1 << 40)]), descriptors()
+    for _ in range(2):
+        message = refusal(lambda: Segment.create(too_large, ""))
+        assert f"rack '{rack_name}'" in message
+        assert "bytes of shared memory" in message
     assert descriptors() == before
-
-
-def test_a_segment_that_was_made_and_closed_leaves_no_file_open(rack_name: str) -> None:
-    before = descriptors()
-    for _ in range(3):
-        segment = Segment.create(layout(rack_name, []), "")
-        segment.close()
-        unlink(rack_name)
-    del segment
-    assert descriptors() == before
+    assert rack_name not in racks()
 
 
 @pytest.mark.slow
 def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str) -> None:
     spec, rng, complete = layout(rack_name, [mailbox(depth=4096)]), random.Random(1), 0
-    for _ in range(40):
+    for _ in range(20):
         creator = fork(lambda: Segment.create(spec, "x = 1"))
         time.sleep(rng.uniform(0.0, 0.006))
         kill(creator)
@@ -293,16 +236,3 @@ def test_a_segment_knows_when_its_name_means_another(make_bus: MakeBus) -> None:
     assert not first.has_its_name
     second = make_bus()
     assert (first.has_its_name, second.has_its_name) == (False, True)
-
-
-def test_unlinking_twice_is_not_an_error(rack_name: str) -> None:
-    unlink(rack_name)
-    assert rack_name not in racks()
-
-
-def test_a_segment_outlives_its_name_where_it_is_attached(make_bus: MakeBus) -> None:
-    segment = make_bus()
-    with forked(lambda: time.sleep(60)):
-        unlink(segment.rack)
-        segment.words[System.TICK] = 3
-        assert segment.words[System.TICK] == 3

@@ -51,7 +51,6 @@ def config(name: str) -> tuple[RobotConfig, SceneConfig]:
 
 
 def cell(name: str) -> Cell:
-    """Return the cell of one of the project's own arms."""
     return build_cell(*config(name), CLOCK_NS)
 
 

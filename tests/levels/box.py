@@ -77,7 +77,6 @@ Shown = Sequence[tuple[int, bytes | None]]
 
 
 def mute(visible_at: int, data: bytes) -> Shown:
-    """Publish nothing."""
     return ()
 
 

@@ -106,11 +106,6 @@ class Task:
         for box in self._outputs.values():
             box.lost = False
 
-    def forget(self, sizes_: Mapping[str, int]) -> None:
-        """Read nothing of what it wrote itself."""
-        own = [port for port, box in self._inputs.items() if box in self._outputs.values()]
-        self._inputs |= {port: Box(self._inputs[port].kind, sizes_) for port in own}
-
     def _read(self, port: str | tuple[str, str], tick: int) -> Reading:
         box = self._inputs[port]
         serial, data = box.at(tick)
@@ -204,12 +199,6 @@ class Lockstep:
         self.tasks[name].lose(self.tick, finished)
         self.after(ticks, lambda: self.restart(name))
 
-    def forget(self, name: str) -> None:
-        """Replace a task by one that finds its own mailboxes empty, as after a new launch of its
-        rack."""
-        self.restart(name)
-        self.tasks[name].forget(self.sizes)
-
     def disturb(self, mailbox: str, disturbance: Disturbance, ticks: int) -> None:
         """Let a faulty writer write `mailbox` for `ticks`."""
         self.boxes[mailbox].disturbance = disturbance
@@ -225,7 +214,6 @@ class Lockstep:
         self._coming.setdefault(self.tick + ticks, []).append(do)
 
     def message(self, mailbox: str) -> Message:
-        """Return an empty message for `mailbox`."""
         return Message(self.boxes[mailbox].dtype)
 
     def write(self, mailbox: str, message: Message) -> None:
@@ -259,12 +247,10 @@ class Lockstep:
 
     @property
     def seconds(self) -> float:
-        """Simulated time."""
         return self.tick * self._clock_ns * 1e-9
 
 
 def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
-    """Return neighbours as a tuple."""
     return boards if isinstance(boards, tuple) else (boards,) if boards else ()
 
 
@@ -276,12 +262,10 @@ def made_ports(board: BoardSpec, level: Executor | Planner) -> MadePorts:
 
 
 def outputs_of(board: BoardSpec) -> dict[str, MessageType | Output]:
-    """Return the outputs of a board's executor by port."""
     return {**board.executor.outputs, **board.executor.made_ports(board.params, {}).outputs}
 
 
 def sources(port: Input, board: BoardSpec) -> list[str]:
-    """Return the mailboxes that a port reads."""
     place, _, rest = port.source.partition(".")
     neighbours = {"own": board.name, "above": board.above, "below": board.below}
     return [f"{name}.{rest}" for name in listed(neighbours.get(place, place))]

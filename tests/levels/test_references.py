@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards import Rack
 from rack.boards.config import CONFIGS, load, loads, wire
 from rack.boards.config.schema import RackConfig
 from rack.levels.references import MOVED, current, module_and_name
@@ -53,18 +52,6 @@ def test_a_config_saved_before_is_wired_as_today(name: str) -> None:
     saved, used = as_saved_before(config)
     assert used
     assert wire(saved) == wire(config)
-
-
-@pytest.mark.thorough
-def test_a_config_saved_before_runs_as_today(rack_name: str) -> None:
-    config = load("rccl", [f"name={rack_name}", "clock.mode=lockstep"])
-    saved, used = as_saved_before(config)
-    assert {"rack.levels.servo:JointServo", "rack.levels.trajectory"} <= set(used)
-    digests = []
-    for each in (config, saved):
-        with Rack(each) as rack:
-            digests.append(rack.run(0.05).digest)
-    assert digests[0] == digests[1]
 
 
 ENDING = {

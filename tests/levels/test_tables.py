@@ -37,12 +37,3 @@ def test_the_text_below_a_field_is_its_description_unless_it_has_one() -> None:
         "bare": "not bare any more",
     }
     assert keys_of(Base)["bare"].description is None
-
-
-def test_a_table_typed_at_a_prompt_has_the_descriptions_that_it_gives() -> None:
-    known = {"__name__": "prompt", "Table": Table, "Field": Field}
-    exec("class Typed(Table):\n    a: int = 1\n    b: int = Field(2, description='given')", known)
-    typed = known["Typed"]
-    assert isinstance(typed, type)
-    assert issubclass(typed, Table)
-    assert [field.description for field in keys_of(typed).values()] == [None, "given"]

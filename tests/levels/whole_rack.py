@@ -36,17 +36,14 @@ class WholeRack(Lockstep):
 
     @property
     def task(self) -> Message:
-        """The task level's status."""
         return self.read("task.status")
 
     @property
     def move(self) -> Message:
-        """The elemental move level's status."""
         return self.read("elemental_move.status")
 
     @property
     def primitive(self) -> Message:
-        """The primitive level's status."""
         return self.read("primitive.status")
 
     def run_to_end(self, most_s: float) -> Message:

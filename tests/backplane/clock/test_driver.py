@@ -12,12 +12,11 @@ import pytest
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
-from rack.backplane.clock.released_task import by_priority
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.watch.alarms import Alarm, alarm_ring
 from rack.backplane.words import Block, Run, System
-from tests.backplane.bus import layout, task
+from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, in_thread
 
@@ -48,20 +47,14 @@ def given_out(
     return ticks
 
 
-def test_no_tick_comes_before_its_grid_point(make_bus: MakeBus) -> None:
-    segment = make_bus()
-    start(segment)
-    epoch = segment.words[System.EPOCH_NS]
-    ticks = given_out(segment, 40)
-    assert all(at >= epoch + tick * PERIOD_NS for tick, at in ticks)
-    assert all(first < second for (first, _), (second, _) in pairwise(ticks))
-
-
 def test_a_run_stops_at_its_tick_and_wakes_everybody(make_bus: MakeBus) -> None:
     segment = make_bus()
     start(segment)
     posts = [wake_semaphore(segment.rack, name) for name in ("writer", "reader")]
     ticks = given_out(segment, STOP)
+    epoch = segment.words[System.EPOCH_NS]
+    assert all(at >= epoch + tick * PERIOD_NS for tick, at in ticks)
+    assert all(first < second for (first, _), (second, _) in pairwise(ticks))
     assert segment.words[System.TICK] < STOP <= ticks[-1][0]
     assert len(ticks) > 1
     assert (segment.words[System.STATE], segment.words[System.STOP_TICK]) == (Run.STOPPED, STOP)
@@ -127,13 +120,7 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
     both = [[("begin", tick, False), ("released", tick, True)] for tick in ticks]
     assert len(ticks) > 1
     assert work == [step for steps in both for step in steps]
-
-
-def test_a_task_that_polls_is_released_without_posts(make_bus: MakeBus) -> None:
-    segment = make_bus(task("poller", wake="poll"))
-    start(segment)
-    assert len(given_out(segment, STOP)) > 1
-    # The one post is the end's.
+    # A task that polls is released without a post: the one is the end's.
     assert wake_semaphore(segment.rack, "poller").value == 1
 
 
@@ -198,18 +185,6 @@ def test_a_clock_that_starts_late_does_not_shift_its_grid(make_bus: MakeBus) -> 
     assert not any(row["since"] == 0 for row in alarm_ring(segment, CLOCK).drain()[0])
 
 
-def test_a_task_is_released_at_its_own_grid_points(make_bus: MakeBus) -> None:
-    segment = make_bus(task("fast"), task("slow", every=4, slot=3))
-    start(segment)
-    fast, slow, seen = segment.block("fast"), segment.block("slow"), []
-    ticks = given_out(
-        segment, 40, lambda tick: seen.append((fast[Block.RELEASED], slow[Block.RELEASED]))
-    )
-    # A tick sees the releases of the tick before it, even across skipped ticks.
-    before = [tick for tick, _ in ticks][:-1]
-    assert seen == [(-1, -1), *((tick, tick - tick % 4) for tick in before)]
-
-
 @pytest.mark.parametrize("skipped", [(), (5,), (4, 5, 6, 7, 8, 9, 10)])
 def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
     make_bus: MakeBus, skipped: tuple[int, ...]
@@ -238,24 +213,6 @@ def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
         assert found[spec.name] == expected
 
 
-def test_nothing_is_released_to_a_planner_within_its_time_slice(make_bus: MakeBus) -> None:
-    segment = make_bus(task("fast"), task("planner", slot=3))
-    start(segment)
-    block, released = segment.block("planner"), []
-    end_of_slice = 2 * STOP
-
-    def plan(tick: int) -> None:
-        if released or block[Block.RELEASED] >= 3:
-            released.append(block[Block.RELEASED])
-            block[Block.DEADLINE] = max(end_of_slice, block[Block.DEADLINE])
-
-    ticks = [tick for tick, _ in given_out(segment, 4 * STOP, plan)][-len(released) :]
-    # A tick sees the releases of the tick before it.
-    within = [seen for tick, seen in zip(ticks[1:], released, strict=False) if tick < end_of_slice]
-    assert set(within) == {released[0]}
-    assert released[-1] > end_of_slice
-
-
 @pytest.mark.parametrize("driver", ["realtime", "lockstep"])
 def test_a_clock_without_a_launcher_ends(make_bus: MakeBus, driver: str) -> None:
     segment = make_bus()
@@ -268,31 +225,3 @@ def test_a_clock_without_a_launcher_ends(make_bus: MakeBus, driver: str) -> None
     with in_thread(clock.run):
         pass
     assert segment.words[System.STATE] == Run.STOPPED
-
-
-def test_a_stop_requested_from_outside_ends_at_the_next_tick(make_bus: MakeBus) -> None:
-    segment = make_bus()
-    start(segment)
-
-    def request(tick: int) -> None:
-        segment.words[System.STOP_REQUEST] |= tick >= 5
-
-    ticks = given_out(segment, 10_000, request)
-    stopped = segment.words[System.STOP_TICK]
-    assert stopped > segment.words[System.TICK] >= 5
-    assert stopped > ticks[-1][0]
-
-
-def test_executors_go_before_planners_and_the_faster_first() -> None:
-    tasks = [
-        task("planner", every=1, slot=2, role="planner"),
-        task("slow", every=8, slot=3),
-        task("right", every=1, slot=5),
-        task("left", every=1, slot=4),
-    ]
-    assert [t.name for t in by_priority(layout("any", (), tasks))] == [
-        "left",
-        "right",
-        "slow",
-        "planner",
-    ]

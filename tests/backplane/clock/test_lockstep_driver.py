@@ -21,7 +21,7 @@ from rack.backplane.semaphores import done_semaphore
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, forked, in_thread, wait_until
+from tests.processes import BOUND_S, FORKS, forked, in_thread
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 HISTORY = 8
@@ -73,23 +73,15 @@ def lockstep(
     return log, ticks
 
 
-def test_lockstep_makes_every_tick_once(make_bus: MakeBus) -> None:
-    segment = make_bus(task("fast", slot=2), task("slow", every=4, slot=3))
-    _, ticks = lockstep(segment, 13, False)
-    assert ticks == list(range(14))
-    assert [segment.words[w] for w in (System.TICK, System.STOP_TICK, System.STATE)] == [
-        12,
-        13,
-        Run.STOPPED,
-    ]
-
-
 @pytest.mark.parametrize("wake", get_args(Wake))
 def test_a_lockstep_tick_begins_when_every_task_due_has_finished(
     make_bus: MakeBus, wake: Wake
 ) -> None:
     segment = make_bus(task("fast", slot=2, wake=wake), task("slow", every=4, slot=5, wake=wake))
-    log, _ = lockstep(segment, 12, False)
+    log, ticks = lockstep(segment, 12, False)
+    assert ticks == list(range(13))
+    words = (System.TICK, System.STOP_TICK, System.STATE)
+    assert [segment.words[word] for word in words] == [11, 12, Run.STOPPED]
     every = {"fast": 1, "slow": 4}
     for name, period in every.items():
         assert [tick for what, who, tick in log if (what, who) == ("begin", name)] == list(
@@ -128,28 +120,6 @@ def test_a_task_that_waits_long_for_its_turn_does_not_begin_before_it(
     names = [name for what, name, _ in log if what == "begin"]
     assert names == ["first", "second"] * 3
     assert log.index(("end", "first", 1)) < log.index(("begin", "second", 1))
-
-
-def test_lockstep_waits_for_its_recorder(make_bus: MakeBus) -> None:
-    segment = make_bus(task("fast"))
-    segment.words[System.FOLLOWER_PID] = os.getpid()
-    ahead: list[int] = []
-
-    def ended(tick: int) -> int | None:
-        ahead.append(tick - segment.words[System.FOLLOWER_TICK])
-        return 100 if tick >= 100 else None
-
-    def record() -> None:
-        while segment.words[System.STATE] != Run.STOPPED:
-            segment.words[System.FOLLOWER_TICK] = segment.words[System.TICK]
-            time.sleep(0.0005)
-
-    segment.words[System.LOCKSTEP] = 1
-    cycle = NextCycle(segment, "fast")
-    with in_thread(lambda: serve(segment, "fast", cycle, [], 0)), in_thread(record):
-        LockstepDriver(segment, ended, False, HISTORY).run()
-    assert len(ahead) == 101
-    assert max(ahead) <= HISTORY + 1
 
 
 def test_lockstep_waits_without_a_bound_for_a_recorder_that_lives(
@@ -200,62 +170,6 @@ def test_a_stop_ends_lockstep_though_a_task_hangs(make_bus: MakeBus) -> None:
     assert segment.words[System.STATE] == Run.STOPPED
 
 
-def test_a_task_that_still_works_is_waited_for_and_moves_to_the_front(make_bus: MakeBus) -> None:
-    segment = make_bus(task("fast", slot=2), task("middle", slot=3), task("slow", slot=4))
-    segment.words[System.LOCKSTEP] = 1
-    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
-    for found in driver.tasks:
-        found.block[Block.RELEASED] = found.block[Block.DONE] = 5
-        found.block[Block.DEADLINE] = 6
-    before = list(driver._last_first)
-    late = before[1]
-    late.block[Block.DONE] = 4
-    waited = []
-
-    class Reports:
-        """Stands for its semaphore: the wait for it is when it finishes."""
-
-        def wait(self) -> bool:
-            """Let it finish."""
-            waited.append(late.spec.name)
-            late.block[Block.DONE] = 5
-            return False
-
-        def take(self) -> bool:
-            """Take nothing."""
-            return False
-
-    late.done = Reports()  # type: ignore[assignment]
-    assert driver._wait_for_all(6)
-    assert driver._last_first == [late, before[0], before[2]]
-    assert waited == [late.spec.name]
-    late.block[Block.DONE] = 4
-    assert driver._wait_for_all(6)
-    assert driver._last_first == [late, before[0], before[2]]
-
-
-def test_a_wait_without_a_report_looks_around(make_bus: MakeBus) -> None:
-    segment = make_bus(task("level"))
-    segment.words[System.LOCKSTEP] = 1
-    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
-    (level,) = driver.tasks
-    with forked(signal.pause) as pid:
-        level.block[Block.PID] = pid
-        assert driver._look_around(level)
-        assert not level.is_stopped
-        os.kill(pid, signal.SIGSTOP)
-        wait_until(lambda: process.state_of(pid) in process.STOPPED)
-        # Time must not wait for it.
-        assert driver._look_around(level)
-        assert level.is_stopped
-    segment.words[System.STOP_REQUEST] = 1
-    assert not driver._look_around(level)
-    segment.words[System.STOP_REQUEST] = 0
-    assert driver._look_around(level)
-    segment.release()
-    assert not driver._look_around(level)
-
-
 @pytest.mark.parametrize(
     ("ticks", "drained", "flooded", "is_ahead"),
     [
@@ -275,30 +189,6 @@ def test_how_far_the_clock_may_be_ahead_of_its_recorder(
     segment.words[System.FOLLOWER_DRAINED] = drained
     driver.is_flooded = flooded
     assert driver._is_ahead(ticks) is is_ahead
-
-
-def test_the_host_holds_the_clock_before_a_tick_and_lets_it_go(make_bus: MakeBus) -> None:
-    segment = make_bus(task("level"))
-    driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
-    words = segment.words
-    assert driver._wait_for_step(5)
-    words[System.HOLD_AT] = 7
-    assert driver._wait_for_step(5)
-    assert words[System.HELD] == 0
-
-    def let_go() -> None:
-        wait_until(lambda: words[System.HELD])
-        assert words[System.HELD] == 7
-        words[System.HOLD_AT] = 8
-
-    with in_thread(let_go):
-        assert driver._wait_for_step(6)
-    assert words[System.HELD] == 0
-    words[System.STOP_REQUEST] = 1
-    assert driver._wait_for_step(7)
-    words[System.STOP_REQUEST] = 0
-    segment.release()
-    assert not driver._wait_for_step(7)
 
 
 class Idle:

@@ -6,7 +6,6 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import get_args
 
@@ -15,7 +14,6 @@ import pytest
 from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
-from rack.backplane.process import processor_ns, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
@@ -70,49 +68,34 @@ def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
 
 
 @WAKES
-def test_a_release_is_given_once(bus: Segment) -> None:
-    cycle, seen = NextCycle(bus, "level"), []
-    for tick in (0, 4, 8):
-        release(bus, tick)
-        seen.append((cycle.wait(), cycle.skipped))
-    assert seen == [(0, 0), (4, 0), (8, 0)]
-
-
-@WAKES
 def test_a_late_task_skips_passed_releases_and_counts_them(bus: Segment) -> None:
     cycle = NextCycle(bus, "level")
-    release(bus, 0)
-    cycle.wait()
-    for tick in (4, 8, 12):
+    # The first one counts from tick 0.
+    release(bus, 4)
+    assert (cycle.wait(), cycle.skipped) == (4, 1)
+    for tick in (8, 12, 16):
         release(bus, tick)
-    assert (cycle.wait(), cycle.skipped) == (12, 2)
-    release(bus, 16)
-    assert (cycle.wait(), cycle.skipped) == (16, 0)
-
-
-def test_the_first_release_counts_from_tick_0(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    release(bus, 8)
-    assert (cycle.wait(), cycle.skipped) == (8, 2)
-
-
-def test_a_planner_at_work_takes_no_release_and_skips_none(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    release(bus, 0)
-    cycle.wait()
-    cycle.hold_until(12)
-    for tick in (4, 8, 12):
-        release(bus, tick)
-    assert (cycle.wait(), cycle.skipped) == (12, 0)
-
-
-def test_a_planner_that_comes_late_counts_from_the_end_of_its_slice(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    release(bus, 0)
-    cycle.wait()
-    cycle.hold_until(12)
+    assert (cycle.wait(), cycle.skipped) == (16, 2)
     release(bus, 20)
-    assert (cycle.wait(), cycle.skipped) == (20, 2)
+    assert (cycle.wait(), cycle.skipped) == (20, 0)
+    # The last release is taken, however late.
+    release(bus, 24)
+    bus.words[System.STATE] = Run.STOPPED
+    assert (cycle.wait(), cycle.skipped) == (24, 0)
+    assert cycle.wait() is None
+
+
+@pytest.mark.parametrize(("releases", "skipped"), [((4, 8, 12), 0), ((20,), 2)])
+def test_a_planner_at_work_takes_no_release_and_skips_none(
+    bus: Segment, releases: tuple[int, ...], skipped: int
+) -> None:
+    cycle = NextCycle(bus, "level")
+    release(bus, 0)
+    cycle.wait()
+    cycle.hold_until(12)
+    for tick in releases:
+        release(bus, tick)
+    assert (cycle.wait(), cycle.skipped) == (releases[-1], skipped)
 
 
 @pytest.mark.parametrize(
@@ -157,16 +140,6 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     assert found == [-1, None]
 
 
-@WAKES
-def test_a_task_late_for_the_last_release_still_takes_it(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    for tick in (0, 4, 8):
-        release(bus, tick)
-    bus.words[System.STATE] = Run.STOPPED
-    assert (cycle.wait(), cycle.skipped) == (8, 2)
-    assert cycle.wait() is None
-
-
 @pytest.mark.slow
 @WAKES
 def test_the_launchers_end_ends_a_wait(bus: Segment) -> None:
@@ -177,63 +150,6 @@ def test_the_launchers_end_ends_a_wait(bus: Segment) -> None:
 def busy() -> None:
     while True:
         pass
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings(FORKS)
-@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
-@pytest.mark.parametrize(("clock", "rung"), [(busy, []), (signal.pause, [Alarm.CLOCK_STOPPED])])
-def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch, clock: Callable[[], None], rung: list[Alarm]
-) -> None:
-    monkeypatch.setattr("rack.backplane.clock.wake.CLOCK_SILENT_S", 0.05)
-    looks: list[int] = []
-    monkeypatch.setattr(
-        "rack.backplane.clock.wake.state_of", lambda pid: looks.append(pid) or state_of(pid)
-    )
-    start_grid(bus)
-    cycle = NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level"))
-    release(bus, 0)
-    cycle.wait()
-    with forked(clock) as pid:
-        # A process that has just been forked may wait for its memory.
-        wait_until(lambda: clock is not busy or processor_ns(pid) > 20_000_000)
-        bus.words[System.CLOCK_PID] = pid
-        with in_thread(cycle.wait):
-            # The checks a tenth of a second apart or more.
-            wait_until(lambda: len(looks) > 60)
-            bus.words[System.STATE] = Run.STOPPED
-            wake_semaphore(bus.rack, "level").release()
-    assert [Alarm(code) for code in alarm_ring(bus, "level").drain().rows["code"]] == rung
-
-
-@pytest.mark.filterwarnings(FORKS)
-@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
-def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
-    start_grid(bus)
-    cycle, ring = (
-        NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")),
-        alarm_ring(bus, "level"),
-    )
-    release(bus, 0)
-    cycle.wait()
-    with forked(signal.pause) as pid:
-        os.kill(pid, signal.SIGSTOP)
-        bus.words[System.CLOCK_PID] = pid
-        for tick in (4, 8):
-            with in_thread(cycle.wait):
-                wait_until(lambda: ring.waiting > 0)
-                assert Alarm(ring.drain().rows["code"][0]) is Alarm.CLOCK_STOPPED
-                release(bus, tick)
-
-
-def test_posts_that_a_task_does_not_wait_for_do_not_add_up(bus: Segment) -> None:
-    cycle = NextCycle(bus, "level")
-    for tick in range(0, 100 * EVERY, EVERY):
-        release(bus, tick)
-        if tick % 3:
-            assert cycle.wait() == tick
-    assert wake_semaphore(bus.rack, "level").value < 100 // 3 + 2
 
 
 def publish(segment: Segment, tick: int) -> None:
@@ -315,52 +231,11 @@ def test_a_sleeping_task_woken_late_takes_the_release_that_passed_not_the_one_ah
     assert (cycle.wait(), cycle.skipped) == (2 * EVERY, 0)
 
 
-@TIMER
-def test_a_late_clock_wakes_a_sleeping_task_with_a_post(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
-    hour_ns = 3_600_000_000_000
-    start_grid(bus, EVERY * hour_ns + hour_ns // 2, hour_ns)
-    cycle, found = NextCycle(bus, "level"), []
-    publish(bus, 0)
-    # Hours late, but the first one on the grid that is there.
-    assert cycle.wait() == 0
-    thread = threading.Thread(target=lambda: found.append(cycle.wait()), daemon=True)
-    thread.start()
-    release(bus, EVERY)
-    thread.join(BOUND_S / 2)
-    assert found == [EVERY]
-
-
-@TIMER
-def test_a_task_that_sleeps_before_the_clock_starts_is_woken_to_sleep_by_its_grid(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rack.backplane.clock.wake.CHECK_S", BOUND_S)
-    cycle, found = NextCycle(bus, "level"), []
-    thread = threading.Thread(target=lambda: found.append(cycle.wait()), daemon=True)
-    thread.start()
-    start_grid(bus, -4 * PERIOD_NS)
-    wake_semaphore(bus.rack, "level").release()
-    publish(bus, 0)
-    thread.join(BOUND_S / 2)
-    assert found == [0]
-
-
-@TIMER
-def test_in_lockstep_a_sleeping_task_waits_for_its_signal(bus: Segment) -> None:
-    bus.words[System.LOCKSTEP] = 1
-    # A grid in the far future: it does not count.
-    start_grid(bus, -1_000 * EVERY * PERIOD_NS)
-    cycle = NextCycle(bus, "level")
-    for tick in (0, 4, 8):
-        release(bus, tick)
-        assert (cycle.wait(), cycle.skipped) == (tick, 0)
-
-
+@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
 def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: Segment) -> None:
     bus.words[System.LOCKSTEP] = 1
+    # A grid in the far future: it does not count, for a task that sleeps neither.
+    start_grid(bus, -1_000 * EVERY * PERIOD_NS)
     block = bus.block("level")
     cycle = NextCycle(bus, "level")
     release(bus, 0)
@@ -374,3 +249,23 @@ def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: S
     release(bus, 28)
     assert [(cycle.wait(), cycle.skipped) for _ in range(2)] == [(24, 2), (28, 0)]
     assert wake_semaphore(bus.rack, "level").value == 0
+
+
+@pytest.mark.filterwarnings(FORKS)
+@pytest.mark.parametrize("wake", ["signal", "timer"], indirect=True)
+def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
+    start_grid(bus)
+    cycle, ring = (
+        NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")),
+        alarm_ring(bus, "level"),
+    )
+    release(bus, 0)
+    cycle.wait()
+    with forked(signal.pause) as pid:
+        os.kill(pid, signal.SIGSTOP)
+        bus.words[System.CLOCK_PID] = pid
+        for tick in (4, 8):
+            with in_thread(cycle.wait):
+                wait_until(lambda: ring.waiting > 0)
+                assert Alarm(ring.drain().rows["code"][0]) is Alarm.CLOCK_STOPPED
+                release(bus, tick)

@@ -66,13 +66,6 @@ def test_missed_releases_count_from_the_last_that_was_finished(released: Release
     assert released.missed == 1
 
 
-def test_a_task_is_free_from_its_deadline_on_unless_it_is_lost(released: ReleasedTask) -> None:
-    released.block[Block.DEADLINE] = 9
-    assert [released.is_free(tick) for tick in (8, 9)] == [False, True]
-    released.block[Block.LOST] = 3
-    assert not released.is_free(9)
-
-
 def test_a_tick_waits_for_a_task_whose_deadline_it_is(released: ReleasedTask) -> None:
     released.release(5)
     released.block[Block.DONE] = 1
@@ -92,12 +85,16 @@ def test_a_lost_task_is_as_it_was_found_until_it_has_rejoined(released: Released
     released.lose(7)
     block = released.block
     assert (released.lost_tick, block[Block.STATE]) == (7, TaskState.ABSENT)
+    assert not released.is_free(9)
     assert released.is_settled()
     released.missed = 3
     released.is_stopped = True
     released.rejoin()
     assert (released.lost_tick, released.missed, released.is_stopped) == (-1, 0, False)
     assert (block[Block.DONE], block[Block.DEADLINE]) == (5, 0)
+    # It is free from its deadline on.
+    block[Block.DEADLINE] = 9
+    assert [released.is_free(tick) for tick in (8, 9)] == [False, True]
 
 
 @pytest.mark.parametrize("state", TaskState)

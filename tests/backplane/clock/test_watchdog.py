@@ -46,14 +46,10 @@ class Watched:
         return self._watchdog.losses
 
 
-def test_a_responding_task_rings_no_alarm(make_bus: MakeBus) -> None:
-    watched = Watched(make_bus(), os.getpid())
-    assert [watched.release(True) for _ in range(10)] == [[]] * 10
-
-
 def test_a_late_answer_is_one_miss(make_bus: MakeBus) -> None:
     watched = Watched(make_bus(), os.getpid())
     watched.release(True)
+    assert [watched.release(True) for _ in range(5)] == [[]] * 5
     rung = [watched.release(answered) for answered in (False, False, True, True, False)]
     assert rung == [[Alarm.LATE], [], [], [], [Alarm.LATE]]
 
@@ -75,7 +71,6 @@ def silent(watched: Watched) -> list[Alarm]:
 
 
 def burn(seconds: float) -> None:
-    """Use processor time."""
     end = time.process_time() + seconds
     while time.process_time() < end:
         pass
@@ -122,21 +117,6 @@ def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> Non
     assert rung == [[Alarm.LATE], [], [], [Alarm.HANG]]
     assert watched.losses == 1
     assert not watched.task.is_free(watched.tick + 1)
-
-
-def test_a_lost_task_is_due_again_when_it_has_rejoined(make_bus: MakeBus) -> None:
-    watched = Watched(make_bus(), os.getpid())
-    task = watched.task
-    for answered in (True, False, False):
-        watched.release(answered)
-    task.lose(2)
-    assert (task.lost_tick, task.is_ready, task.is_settled()) == (2, False, True)
-    assert not task.is_free(3)
-    task.block[Block.STATE] = TaskState.READY
-    assert task.is_ready
-    task.rejoin()
-    assert (task.lost_tick, task.missed, task.is_settled()) == (-1, 0, True)
-    assert task.is_free(3)
 
 
 def test_a_task_that_finishes_every_cycle_too_late_is_late_and_not_lost(make_bus: MakeBus) -> None:

@@ -15,12 +15,6 @@ ARRIVALS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=
 """Pauses before messages, and their services."""
 
 
-def test_messages_are_served_one_at_a_time() -> None:
-    inbox = Inbox(2)
-    assert [inbox.arrive(at, 60) for at in (0, 10, 200)] == [60, 120, 260]
-    assert (inbox.lost, inbox.most_waiting) == (0, 1)
-
-
 def test_one_that_arrives_while_too_many_wait_is_lost_and_costs_nothing() -> None:
     inbox = Inbox(2)
     assert [inbox.arrive(0, 60) for _ in range(4)] == [60, 120, 180, None]
@@ -45,20 +39,6 @@ def test_no_two_services_overlap_and_no_more_wait_than_permitted(
         assert end - took == max(arrived, before)
     assert inbox.lost == len(pauses) - len(served)
     assert inbox.most_waiting <= depth
-
-
-@given(ARRIVALS, ARRIVALS, st.integers(1, 5))
-def test_after_an_idle_instant_nothing_before_it_counts(
-    first: list[tuple[int, int]], then: list[tuple[int, int]], depth: int
-) -> None:
-    used, at, ends = Inbox(depth), 0, [0]
-    for pause, service in first:
-        at += pause
-        ends.append(used.arrive(at, service) or 0)
-    at, fresh = max(at, *ends), Inbox(depth)
-    for pause, service in then:
-        at += pause
-        assert used.arrive(at, service) == fresh.arrive(at, service)
 
 
 def test_a_burst_of_all_senders_waits_for_each_other() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable
 
 import pytest
 
@@ -14,7 +13,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.semaphores import lock_semaphore
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, descriptors, fork, forked, kill, wait_until
+from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 REPORT = 200
@@ -40,16 +39,12 @@ def obtains(lock: MailboxLock) -> bool:
     return any(lock.acquire() for _ in range(3))
 
 
-def test_a_wait_for_a_living_holder_ends_at_its_bound(bus: Segment) -> None:
-    lock = MailboxLock(bus, NAME)
-    with forked(lambda: hold(bus)):
-        wait_until(lambda: bus.words[REPORT])
-        assert [lock.acquire() for _ in range(5)] == [False] * 5
-    assert obtains(lock)
-
-
 def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
     writer, reader = open_writer(bus, NAME), open_reader(bus, NAME)
+    with forked(lambda: hold(bus)):
+        wait_until(lambda: bus.words[REPORT])
+        assert reader.read(0).verdict is Verdict.NONE
+    bus.words[REPORT] = 0
     writer.message.id = 1
     assert writer.write(0, now=0)
     assert reader.read(0).is_new
@@ -58,9 +53,9 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
         cut_off = reader.read(1)
         assert (cut_off.value.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
         assert not writer.write(1, now=1)
-    assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (1, 1, 1)
+    assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (2, 1, 1)
     # Its holder lives: the reader was held up by no fault.
-    assert (reader.statistics.held_up, reader.statistics.bad_reads) == (0, 1)
+    assert (reader.statistics.held_up, reader.statistics.bad_reads) == (0, 2)
     assert writer.write(2, now=2)
     assert reader.read(2).is_new
 
@@ -76,14 +71,6 @@ def test_a_read_that_a_dead_holder_held_up_is_counted_once(bus: Segment) -> None
     assert reader.statistics.bus_errors == 0
 
 
-def test_a_bus_error_before_the_first_message_gives_none(bus: Segment) -> None:
-    reader = open_reader(bus, NAME)
-    with forked(lambda: hold(bus)):
-        wait_until(lambda: bus.words[REPORT])
-        assert reader.read(0).verdict is Verdict.NONE
-    assert reader.statistics.bus_errors == 1
-
-
 def compete(segment: Segment, word: int) -> None:
     """Wait for the holder's end, try once, report the result, and keep the lock if obtained."""
     lock = MailboxLock(segment, NAME)
@@ -95,7 +82,7 @@ def compete(segment: Segment, word: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("trial", range(15))
+@pytest.mark.parametrize("trial", range(6))
 def test_of_several_waiters_one_takes_over_from_a_killed_holder(bus: Segment, trial: int) -> None:
     reports = [REPORT + 1, REPORT + 2, REPORT + 3]
     holder = fork(lambda: hold(bus))
@@ -151,7 +138,7 @@ def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystander
         for word in range(REPORT + 1, REPORT + 1 + bystanders)
     ]
     try:
-        for _ in range(30):
+        for _ in range(15):
             bus.words[REPORT] = 0
             victim = fork(lambda: cycle(bus))
             wait_until(lambda: bus.words[REPORT])
@@ -170,25 +157,9 @@ def test_a_holder_overtaken_between_its_two_steps_is_not_the_owner(bus: Segment)
     lock_semaphore(bus.rack, NAME).acquire(0)
     assert quick.acquire()
     assert not slow._owner.take()
+    # Nor does a semaphore posted once too often let a second one in.
+    lock_semaphore(bus.rack, NAME).release()
+    assert not slow.acquire()
     quick.release()
     assert lock_semaphore(bus.rack, NAME).value == 1
     assert slow.acquire()
-
-
-def test_a_semaphore_posted_once_too_often_lets_no_second_one_in(bus: Segment) -> None:
-    first, second = MailboxLock(bus, NAME), MailboxLock(bus, NAME)
-    lock_semaphore(bus.rack, NAME).release()
-    assert first.acquire()
-    assert not second.acquire()
-    first.release()
-    assert lock_semaphore(bus.rack, NAME).value == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("opened", [open_writer, MailboxLock], ids=["writer", "lock"])
-def test_a_closed_end_leaves_no_file_open(
-    bus: Segment, opened: Callable[[Segment, str], MailboxLock]
-) -> None:
-    before = descriptors()
-    opened(bus, NAME).close()
-    assert descriptors() == before

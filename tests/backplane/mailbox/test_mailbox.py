@@ -36,43 +36,17 @@ def seen(reader: Reader, tick: int) -> tuple[int, Verdict]:
     return reading.value.id, reading.verdict
 
 
-def test_nothing_has_come_before_the_first_message(make_bus: MakeBus) -> None:
-    _, reader = ends(make_bus(mailbox()))
-    assert seen(reader, 100) == (0, NONE)
-    assert not reader.read(100).is_there
-
-
 def test_a_message_becomes_visible_at_the_end_of_its_slice(make_bus: MakeBus) -> None:
     writer, reader = ends(make_bus(mailbox(every=4, delay=8)))
+    assert seen(reader, 100) == (0, NONE)
+    assert not reader.read(100).is_there
     assert write(writer, 4, now=6)
     assert [seen(reader, tick) for tick in (6, 11)] == [(0, NONE), (0, NONE)]
     assert [seen(reader, tick) for tick in (12, 13)] == [(1, NEW), (1, OLD)]
     assert reader.newest == 4
 
 
-@pytest.mark.parametrize(("every", "delay"), [(1, 1), (2, 2), (2, 6), (4, 4)])
-@pytest.mark.parametrize("ahead", [0, 3])
-def test_reads_depend_on_ticks_alone(make_bus: MakeBus, every: int, delay: int, ahead: int) -> None:
-    writer, reader = ends(make_bus(mailbox(every=every, delay=delay, depth=32)))
-    released = -every
-    for tick in range(40):
-        # However far ahead the writer is, the reader sees the slices that have ended.
-        while released + every <= tick + ahead:
-            released += every
-            write(writer, released)
-        serial = max(0, (tick - delay) // every + 1)
-        assert seen(reader, tick)[0] == serial
-
-
-def test_a_late_message_becomes_visible_at_its_writers_next_boundary(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox(every=4, delay=4)))
-    assert write(writer, 0, now=3)
-    assert not write(writer, 4, now=9)
-    assert [seen(reader, tick) for tick in (4, 8, 11)] == [(1, NEW), (1, OLD), (1, OLD)]
-    assert seen(reader, 12) == (2, NEW)
-
-
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(12))
 def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(
     make_bus: MakeBus, seed: int
 ) -> None:
@@ -101,30 +75,6 @@ def test_with_phases_and_late_writers_a_reader_gets_what_its_tick_permits(
         tick = max(tick + every * within, now - (now - phase) % every)
     for at in range(visible[-1] + 1):
         assert seen(reader, at)[0] == sum(due <= at for due in visible)
-
-
-def test_a_message_at_the_very_boundary_is_late(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox()))
-    assert not write(writer, 0, now=1)
-    assert [seen(reader, tick) for tick in (1, 2)] == [(0, NONE), (1, NEW)]
-
-
-def test_a_slow_reader_takes_the_newest_visible(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox()))
-    for tick in range(6):
-        write(writer, tick)
-    assert seen(reader, 4) == (4, NEW)
-    assert seen(reader, 4) == (4, OLD)
-
-
-def test_messages_keep_the_tick_that_their_information_rests_on(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox()))
-    writer.write(7, basis=3)
-    reader.read(8)
-    assert reader.basis == 3
-    writer.write(8)
-    reader.read(9)
-    assert reader.basis == 8
 
 
 def test_the_host_peeks_at_the_newest_at_once(make_bus: MakeBus) -> None:
@@ -176,22 +126,15 @@ def test_a_message_overwritten_before_it_is_read_is_a_bus_error(make_bus: MakeBu
     assert seen(reader, 28) == (28, NEW)
 
 
-def test_a_bus_error_before_any_message_shows_no_message(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox(depth=8)))
-    for tick in range(30):
-        write(writer, tick)
-    assert seen(reader, 10) == (0, NONE)
-    assert not reader.read(10).is_there
-    assert reader.statistics.bus_errors == 2
-
-
-@pytest.mark.parametrize("depth", [4, 8, 32])
+@pytest.mark.parametrize("depth", [4, 32])
 def test_slots_reach_back_as_far_as_they_can(make_bus: MakeBus, depth: int) -> None:
     writer, reader = ends(make_bus(mailbox(depth=depth)))
     for tick in range(100):
         write(writer, tick)
     oldest = 100 - depth + 1
     assert seen(reader, oldest - 1) == (0, NONE)
+    assert not reader.read(oldest - 1).is_there
+    assert reader.statistics.bus_errors == 2
     assert seen(reader, oldest) == (oldest, NEW)
 
 
@@ -210,95 +153,9 @@ def test_a_second_writer_is_refused_with_the_first_ones_process(make_bus: MakeBu
     assert second(pid)
     assert exit_status(fork(lambda: second(pid))) == 0
     writer.close()
-    open_writer(segment, NAME)
-
-
-def test_the_claim_ends_with_its_process(make_bus: MakeBus) -> None:
-    segment = make_bus(mailbox())
+    # A claim ends with its process.
     assert exit_status(fork(lambda: write(open_writer(segment, NAME), 0))) == 0
     open_writer(segment, NAME)
-
-
-def test_a_new_writer_continues_after_the_last_message_in_a_new_epoch(make_bus: MakeBus) -> None:
-    segment = make_bus(mailbox())
-    slots = Slots(segment, segment.layout.mailbox(NAME))
-    first, reader = ends(segment)
-    write(first, 0)
-    first.close()
-    second = open_writer(segment, NAME)
-    assert second.serial == 1
-    write(second, 1)
-    assert [seen(reader, tick) for tick in (1, 2)] == [(1, NEW), (2, NEW)]
-    epochs = [epoch_of(slots.signature) for serial in (1, 2) if slots.fetch(serial)]
-    assert epochs == [1, 2]
-
-
-def test_the_chain_does_not_show_where_a_writer_was_replaced(make_bus: MakeBus) -> None:
-    segment = make_bus(mailbox(), mailbox(name="writer.other"))
-    whole, part = open_writer(segment, NAME), open_writer(segment, "writer.other")
-    for tick in range(6):
-        if tick == 3:
-            part.close()
-            part = open_writer(segment, "writer.other")
-        write(whole, tick)
-        write(part, tick)
-    chains = {name: open_reader(segment, name) for name in (NAME, "writer.other")}
-    for reader in chains.values():
-        reader.peek()
-    assert len({reader.slots.chain for reader in chains.values()}) == 1
-
-
-def test_the_chain_depends_on_every_earlier_message(make_bus: MakeBus) -> None:
-    segment = make_bus(mailbox(), mailbox(name="writer.other"))
-    for name, first in ((NAME, 1), ("writer.other", 2)):
-        writer = open_writer(segment, name)
-        writer.message.id = first
-        writer.write(0)
-        writer.message.id = 9
-        writer.write(1)
-    readers = [open_reader(segment, name) for name in (NAME, "writer.other")]
-    assert {reader.peek().value.id for reader in readers} == {9}
-    assert readers[0].slots.chain != readers[1].slots.chain
-
-
-def test_an_unknown_mailbox_is_no_mailbox(make_bus: MakeBus) -> None:
-    segment = make_bus(mailbox())
-    with pytest.raises(KeyError, match="nobody"):
-        open_reader(segment, "nobody.status")
-
-
-@pytest.mark.parametrize(
-    ("every", "delay", "phase", "visible"),
-    [
-        # Ticks 8 to 15 of a message released at 8, and the end of its slice or the next boundary.
-        (4, 4, 0, [12, 12, 12, 12, 16, 16, 16, 16]),
-        (4, 4, 1, [12, 12, 12, 12, 13, 17, 17, 17]),
-        (2, 6, 0, [14, 14, 14, 14, 14, 14, 16, 16]),
-        (8, 3, 0, [11, 11, 11, 12, 15, 15, 15, 18]),
-    ],
-)
-def test_a_message_is_in_time_before_the_end_of_its_slice(
-    make_bus: MakeBus, every: int, delay: int, phase: int, visible: list[int]
-) -> None:
-    spec = replace(mailbox(every=every, delay=delay), phase=phase)
-    writer = open_writer(make_bus(spec), NAME)
-    assert [writer.visible_at(8, now) for now in range(8, 16)] == visible
-    assert [writer.is_in_time(8, now) for now in range(8, 16)] == [
-        now < 8 + delay for now in range(8, 16)
-    ]
-    # Without a clock, as in a test, a writer is never late.
-    assert writer.is_in_time(8, None)
-    assert writer.visible_at(8, None) == 8 + delay
-
-
-def test_a_reader_counts_its_reads_and_the_messages_that_it_copied(make_bus: MakeBus) -> None:
-    writer, reader = ends(make_bus(mailbox()))
-    write(writer, 0)
-    writer.write(1, basis=0)
-    for tick in (0, 1, 1, 2):
-        reader.read(tick)
-    assert (reader.accesses, reader.transfers, reader.serial, reader.found) == (4, 2, 2, 2)
-    assert (reader.newest, reader.visible, reader.basis) == (1, 2, 0)
 
 
 def test_a_forged_message_is_counted_with_the_process_that_it_names(make_bus: MakeBus) -> None:

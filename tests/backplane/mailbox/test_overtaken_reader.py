@@ -86,13 +86,11 @@ class Overtaken:
         self._slots = Slots(rack.segment, rack.segment.layout.mailbox(NAME))
 
     def write(self, cycles: int) -> None:
-        """Run cycles of the writer."""
         for _ in range(cycles):
             self.rack.writer.cycle(self.tick)
             self.tick += 1
 
     def read(self) -> None:
-        """Read at the present tick."""
         self.rack.reader.cycle(self.tick - self.tick % READ_EVERY)
 
     def is_overtaken(self, at: int, cycles: int, stops_halfway: bool) -> bool:
@@ -130,7 +128,7 @@ def test_a_reader_overtaken_at_any_instruction_reports_nothing_false(
         rack.fault(kind, *([0.5] if kind != "delay" else []))
     # A message that is dropped is not in the middle of its copy.
     while reader.is_overtaken(at, DEPTH - 2 + at % (DEPTH + 4), kind != "drop") or at < LEAST:
-        at += 3 if kind else 1
+        at += 7 if kind else 2
         reader.write(READ_EVERY)
         reader.read()
         reader.write(READ_EVERY)

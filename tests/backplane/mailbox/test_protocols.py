@@ -20,8 +20,8 @@ from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
-READS = 30_000
-KILLS = 15
+READS = 10_000
+KILLS = 8
 AT_ONCE: tuple[Protocol, ...] = ("double-buffer", "lock")
 
 
@@ -49,14 +49,8 @@ def test_a_message_shows_at_once(make_bus: MakeBus, protocol: Protocol) -> None:
     assert reader.read(0).verdict is Verdict.NONE
     assert writer.write(0, now=2)
     assert [reader.read(0).verdict for _ in range(2)] == [Verdict.NEW, Verdict.OLD]
-
-
-@pytest.mark.parametrize("protocol", AT_ONCE)
-def test_a_late_message_is_reported_under_every_protocol(
-    make_bus: MakeBus, protocol: Protocol
-) -> None:
-    writer = open_writer(make_bus(mailbox(protocol, every=2, delay=4)), NAME)
-    assert [writer.write(0, now) for now in (None, 3, 4, 9)] == [True, True, False, False]
+    # And is late where it would be under the others.
+    assert [writer.write(0, now) for now in (None, 7, 8, 19)] == [True, True, False, False]
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

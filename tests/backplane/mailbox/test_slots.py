@@ -43,14 +43,6 @@ def test_between_two_serials_each_good_message_is_copied(bus: Segment) -> None:
     assert between(slots, 1, 3 + DEPTH) == [4, *range(5, 3 + DEPTH)]
 
 
-def test_what_its_writer_did_not_write_is_left_out(
-    bus: Segment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    slots = Slots(bus, bus.layout.mailbox(NAME))
-    monkeypatch.setattr(slots, "is_lawful", lambda holder: slots.message.id != 3)
-    assert between(slots, 1, 5) == [2, 4]
-
-
 def test_a_slot_that_is_used_again_is_not_kept(bus: Segment) -> None:
     slots = Slots(bus, bus.layout.mailbox(NAME))
     assert [slots.copy(serial) for serial in (1, 5)] == [True, True]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.layout import BY_TICKS, PROTOCOLS, Protocol
-from rack.backplane.watch.alarms import CLEAN_READS, Alarm
+from rack.backplane.watch.alarms import Alarm
 from tests.backplane.bus import NAME, message_address
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
 
@@ -26,23 +26,11 @@ def publish(rack: Link, tick: int, visible_at: int) -> None:
     writer.publish(tick, visible_at, tick)
 
 
-def test_messages_before_the_first_read_are_not_judged(link: MakeLink) -> None:
-    rack = link()
-    rack.fault("drop", 0.5)
-    rack.fault("corrupt", 0.5)
-    rack.fault("reorder", 0.5)
-    for tick in range(40):
-        rack.writer.cycle(tick)
-    rack.heal()
-    rack.writer.cycle(40)
-    rack.reader.cycle(41)
-    assert rack.alarms() == []
-
-
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_a_reader_that_skips_cycles_reports_nothing_false(
     link: MakeLink, protocol: Protocol
 ) -> None:
+    # The last pause is long enough for everything to be overwritten.
     rack = link(protocol)
     for pause in (1, 2, 18, 100):
         start = rack.reader.seen[-1].tick + 1 if rack.reader.seen else 0
@@ -52,26 +40,6 @@ def test_a_reader_that_skips_cycles_reports_nothing_false(
         rack.run(start + 30 + pause, start + 60 + pause)
     assert rack.alarms() == []
     assert not any(seen.is_lost for seen in rack.reader.seen)
-
-
-def test_a_late_reader_reports_nothing_false(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    # It was released at 20, and preempted while its writer continued.
-    for tick in range(20, 38):
-        rack.writer.cycle(tick)
-    assert rack.reader.cycle(20).value.id == 19
-    assert rack.reader.cycle(38).value.id == 37
-    assert rack.alarms() == []
-
-
-def test_a_reader_that_finds_everything_overwritten_continues(link: MakeLink) -> None:
-    rack = link(depth=8)
-    rack.run(0, 20)
-    for tick in range(20, 100):
-        rack.writer.cycle(tick)
-    rack.run(100, 120)
-    assert rack.alarms() == []
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -87,31 +55,6 @@ def test_a_writer_that_is_late_or_skips_cycles_is_no_fault(
     rack.writer.cycle(20, now=20 + late)
     rack.run(20 + late, 80)
     assert rack.alarms() == []
-
-
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_a_writer_that_loses_its_core_between_the_clock_and_its_slot_is_no_fault(
-    link: MakeLink, protocol: Protocol
-) -> None:
-    rack = link(protocol)
-    rack.run(0, 20)
-    for tick in range(20, 38):
-        rack.reader.cycle(tick)
-    # It read the clock in time, then stood still: the message carries a tick long past.
-    publish(rack, 20, 21)
-    rack.reader.cycle(38)
-    rack.writer.end(20)
-    rack.run(39, 80)
-    assert rack.alarms() == []
-
-
-def test_a_message_after_the_end_of_its_cycle_was_held_back(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.writer.end(20)
-    publish(rack, 20, 25)
-    rack.run(25, 30)
-    assert rack.alarms() == [(25, Alarm.HELD_BACK)]
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -147,17 +90,6 @@ def test_a_restarted_writer_is_not_taken_for_a_fault(
     assert rack.reader.seen[-1].released == 299 - (protocol in BY_TICKS)
 
 
-def test_an_episode_rings_once_and_a_later_one_again(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    for first in (20, 200):
-        rack.fault("corrupt", 0.7)
-        rack.run(first, first + 100)
-        rack.heal()
-        rack.run(first + 100, first + 102 + CLEAN_READS)
-    assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED] * 2
-
-
 @pytest.mark.parametrize("rates", [(1, 8), (1, 24)])
 def test_a_slow_reader_finds_damage_in_messages_it_skips(
     link: MakeLink, rates: tuple[int, int]
@@ -181,7 +113,9 @@ def test_a_slot_whose_head_is_damaged_is_damaged_and_not_lost(link: MakeLink) ->
     assert [code for _, code in rack.alarms()] == [Alarm.DAMAGED]
 
 
-@pytest.mark.parametrize(("messages", "alarms"), [(2, []), (3, [Alarm.BABBLE])])
+@pytest.mark.parametrize(
+    ("messages", "alarms"), [(2, []), (3, [Alarm.BABBLE]), (5, [Alarm.BABBLE])]
+)
 def test_one_message_more_than_releases_is_no_babble(
     link: MakeLink, messages: int, alarms: list[Alarm]
 ) -> None:
@@ -190,55 +124,11 @@ def test_one_message_more_than_releases_is_no_babble(
     rack.reader.cycle(20)
     for _ in range(messages):
         publish(rack, 20, 21)
+    if messages == 5:
+        # Serials begin at 1: 21 to 25 are the babble, whose single messages are not judged.
+        rack.segment.bytes[message_address(rack.segment, 23)] ^= 4
     rack.reader.cycle(21)
     assert [code for _, code in rack.alarms()] == alarms
-
-
-def test_after_a_lost_message_a_babble_is_counted_from_its_tick(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.reader.cycle(20)
-    rack.writer.ports.writers["point"].lose()
-    rack.reader.cycle(21)
-    for _ in range(3):
-        publish(rack, 21, 22)
-    rack.reader.cycle(22)
-    assert rack.alarms() == [(21, Alarm.GAP), (22, Alarm.BABBLE)]
-
-
-def test_of_a_babble_the_single_messages_are_not_judged(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.reader.cycle(20)
-    for _ in range(5):
-        publish(rack, 20, 21)
-    # Serials begin at 1: 21 to 25 are the babble.
-    rack.segment.bytes[message_address(rack.segment, 23)] ^= 4
-    rack.reader.cycle(21)
-    assert [code for _, code in rack.alarms()] == [Alarm.BABBLE]
-
-
-def test_a_later_message_of_an_earlier_release_is_out_of_order(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.reader.cycle(20)
-    publish(rack, 18, 21)
-    rack.reader.cycle(21)
-    assert rack.alarms() == [(21, Alarm.DISORDER)]
-
-
-def test_a_bad_read_is_a_trouble_of_its_task(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    task = rack.reader.ports.task
-    assert task.troubles == 0
-    rack.writer.cycle(20)
-    rack.segment.bytes[message_address(rack.segment, 21)] ^= 1
-    rack.reader.cycle(21)
-    assert (task.troubles, rack.alarms()) == (1, [(21, Alarm.DAMAGED)])
-    rack.writer.cycle(21)
-    rack.reader.cycle(22)
-    assert (task.troubles, rack.alarms()) == (1, [])
 
 
 @pytest.mark.parametrize("every", [1, 4])

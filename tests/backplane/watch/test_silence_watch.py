@@ -9,13 +9,12 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.layout import PROTOCOLS, Protocol
-from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.process import state_of
 from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME
-from tests.link import MakeLink, ReadingTask, WritingTask, links
+from tests.link import MakeLink, WritingTask, links
 from tests.processes import FORKS, forked, kill, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -33,6 +32,8 @@ def test_a_writer_that_is_only_late_is_neither_mute_nor_stale(
 ) -> None:
     rack = link(protocol)
     rack.run(0, 20)
+    # The clock may say for a lost task that it has finished.
+    rack.segment.block("writer")[Block.DONE] = 25
     for tick in range(20, 60):
         rack.reader.cycle(tick)
     assert rack.alarms() == []
@@ -65,15 +66,6 @@ def test_a_write_cut_off_by_a_lock_is_not_mute(link: MakeLink) -> None:
     assert rack.alarms() == []
 
 
-def test_the_clock_may_say_for_a_lost_task_that_it_has_finished(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.segment.block("writer")[Block.DONE] = 25
-    for tick in range(20, 60):
-        rack.reader.cycle(tick)
-    assert rack.alarms() == []
-
-
 @pytest.mark.parametrize(("number", "state"), [(signal.SIGSTOP, "T"), (signal.SIGKILL, "Z")])
 def test_a_message_whose_writer_is_dead_or_stopped_is_stale(
     link: MakeLink, number: signal.Signals, state: str
@@ -102,22 +94,6 @@ def test_a_message_whose_writer_is_dead_or_stopped_is_stale(
     rack.writer = WritingTask(rack.segment)
     rack.run(40, 60)
     assert rack.alarms() == []
-
-
-def test_a_neighbour_finds_a_death_four_cycles_old(link: MakeLink) -> None:
-    rack = link()
-    rack.writer.close()
-
-    def write() -> None:
-        writer = WritingTask(rack.segment)
-        for tick in range(20):
-            writer.cycle(tick)
-
-    with forked(write) as pid:
-        wait_until(lambda: state_of(pid) == "Z")
-        for tick in range(18, 40):
-            rack.reader.cycle(tick)
-    assert rack.alarms() == [(23, Alarm.STALE)]
 
 
 def test_a_marked_loss_shows_from_the_next_tick(link: MakeLink) -> None:
@@ -167,42 +143,8 @@ def test_a_message_that_was_due_in_a_pause_of_the_clock_was_not_suppressed(
     assert rack.alarms() == [(151, Alarm.MUTE)]
 
 
-def test_a_writer_that_was_away_when_its_message_was_due_did_not_suppress_it(
-    link: MakeLink,
-) -> None:
-    rack = link(cycles=8)
-    rack.run(0, 80)
-    for tick in range(80, 120):
-        rack.reader.cycle(tick)
-    # It comes back one tick after the message of 119 was due, and writes the next, of 127, in time.
-    rack.run(120, 140)
-    assert rack.alarms() == []
-    assert rack.reader.seen[-1].released == 135
-
-
 def test_a_pause_does_not_hide_a_writer_that_stays_away(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
     lost = [rack.reader.cycle(tick).is_lost for tick in range(60, 70)]
     assert lost == [False] * 4 + [True] * 6
-
-
-def test_a_restarted_reader_gives_its_writer_time(link: MakeLink) -> None:
-    rack = link()
-    rack.run(0, 20)
-    rack.reader = ReadingTask(rack.segment)
-    assert not rack.reader.cycle(300).is_lost
-    assert rack.alarms() == []
-
-
-def test_whoever_waits_for_a_living_holder_is_not_held_up(link: MakeLink) -> None:
-    rack = link("lock")
-    rack.run(0, 20)
-    holder = MailboxLock(rack.segment, NAME)
-    assert holder.acquire()
-    for tick in range(20, 30):
-        rack.reader.cycle(tick)
-        assert not rack.writer.cycle(tick)
-    holder.release()
-    assert rack.alarms() == rack.alarms("writer") == []
-    assert rack.reader.ports.bus_errors == rack.writer.ports.bus_errors == 10

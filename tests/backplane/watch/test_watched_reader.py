@@ -8,17 +8,13 @@ import pytest
 
 from rack.backplane.layout import TickGrid
 from rack.backplane.watch.alarms import AlarmWriter
-from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import (
     GridReader,
-    SporadicReader,
-    WatchedQueue,
     WatchedReader,
     watched,
 )
 from rack.backplane.words import Block
-from tests.backplane.bus import NAME, mailbox, queue, task
-from tests.backplane.conftest import MakeBus
+from tests.backplane.bus import NAME
 from tests.link import Link, MakeLink, links
 
 
@@ -26,26 +22,6 @@ from tests.link import Link, MakeLink, links
 def link(rack_name: str) -> Iterator[MakeLink]:
     with links(rack_name) as make:
         yield make
-
-
-def test_each_mailbox_has_the_checks_that_suit_its_writer(make_bus: MakeBus) -> None:
-    segment = make_bus(
-        *queue(4),
-        mailbox(name="writer.other"),
-        mailbox(name="reader.operator", writer="clock"),
-        task("writer"),
-        task("reader", slot=3),
-    )
-    alarms = AlarmWriter(segment, "reader")
-    kinds = {
-        name: type(watched(segment, name, alarms, ReadingTask()))
-        for name in (NAME, "writer.other", "reader.operator")
-    }
-    assert kinds == {
-        NAME: WatchedQueue,
-        "writer.other": WatchedReader,
-        "reader.operator": SporadicReader,
-    }
 
 
 class Grid:
@@ -101,14 +77,3 @@ def test_a_loss_shows_between_its_ticks_too(link: MakeLink) -> None:
     assert [grid.read(tick)[1] for tick in (13, 15)] == [True, True]
     rack.writer.cycle(15)
     assert grid.read(16)[1] is False
-
-
-def test_a_read_without_a_message_is_lost_only_with_its_writer(link: MakeLink) -> None:
-    rack = link()
-    found = Grid(rack, every=1, phase=0).watched
-    assert found.is_writer_lost(5) is False
-    rack.writer.cycle(0)
-    found.read(1)
-    rack.segment.block("writer")[Block.LOST] = 2
-    assert [found.is_writer_lost(tick) for tick in (1, 2)] == [False, True]
-    assert [found.read(tick).is_lost for tick in (1, 2)] == [False, True]

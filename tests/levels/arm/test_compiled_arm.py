@@ -39,7 +39,6 @@ def driven(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
 
 
 def scene(arm: SimulatedArm, made: Cell) -> Message:
-    """Return what an arm shows."""
     seen = Message(SCENE.dtype(sizes(made)))
     arm.look(seen)
     return seen
@@ -90,16 +89,6 @@ def test_solutions_and_coarse_samples_are_the_same_as_in_python() -> None:
         assert np.array_equal(one, other)
 
 
-def test_noise_is_normal_and_independent_of_joint_quantity_and_tick() -> None:
-    noise = np.array([samples(tick) for tick in range(4000)]).reshape(4000, 12)
-    assert np.abs(noise.mean(axis=0)).max() < 0.1
-    assert noise.std(axis=0) == pytest.approx(np.ones(12), abs=0.06)
-    assert np.mean(np.abs(noise) > 2.0) == pytest.approx(0.0455, abs=0.005)
-    together = np.hstack((noise[1:], noise[:-1]))
-    for seen in (together, together**2):
-        assert np.abs(np.corrcoef(seen.T) - np.eye(24)).max() < 0.1
-
-
 def samples(tick: int) -> Array:
     """Return the noise of a tick in standard deviations, (2, joints)."""
     encoders = Encoders(np.zeros(6), np.full(6, 1e-3))
@@ -130,29 +119,3 @@ def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> 
     ]
     machines: list[Callable[..., Any]] = [function.load() for function in functions]
     assert [len(machine.signatures) for machine in machines] == [1] * len(machines)  # type: ignore[attr-defined]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["puma560", pytest.param("k1607", marks=pytest.mark.thorough)])
-def test_what_is_clear_of_all_limits_would_also_pass_a_careful_look(name: str) -> None:
-    made = cell(name)
-    bounds, period_s = made.bounds, CLOCK_NS * 1e-9
-    quick, careful = (
-        drives.LimitGate(bounds, made.limits.acceleration, period_s, Dynamics(made))
-        for _ in range(2)
-    )
-    careful._is_clear = lambda *_: False
-    low, high = np.maximum(bounds.position[:, 0], -3.0), np.minimum(bounds.position[:, 1], 3.0)
-    clear = 0
-    for _ in range(2000):
-        q = made.home + RNG.choice([0.05, 1.0]) * (RNG.uniform(low, high) - made.home)
-        qd, torque = (
-            RNG.choice([0.2, 1.0])
-            * RNG.uniform(-1.0, 1.0, (2, len(q)))
-            * (bounds.velocity, bounds.torque)
-        )
-        mine, theirs = quick.admit(torque, q, qd), careful.admit(torque, q, qd)
-        clear += mine[0] is torque
-        assert mine[1] == theirs[1]
-        assert np.array_equal(mine[0], theirs[0])
-    assert 100 < clear < 1900

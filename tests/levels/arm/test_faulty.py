@@ -7,7 +7,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.faulty import FaultyLink
@@ -32,31 +31,19 @@ def fault(kind: str, seed: int = 7, **parameters: float) -> Fault:
 HOLDING = Dynamics(cell("puma560")).terms(cell("puma560").home, np.zeros(6)).bias.copy()
 
 
-def test_a_bias_is_on_its_joint_alone() -> None:
+def test_a_fault_of_a_sensor_is_on_its_joint_alone() -> None:
     link, arm, acted = linked(fault("sensor-bias", size=0.3, joint=2))
     assert link.sense().position - arm.sense().position == pytest.approx([0, 0, 0.3, 0, 0, 0])
     assert acted == {0: True}
-
-
-def test_a_position_that_is_no_number_hides_nothing_else() -> None:
+    # An arm may lack the joint.
+    link, arm, acted = linked(fault("sensor-nan", joint=9), fault("actuator-off", joint=9))
+    assert np.array_equal(link.sense().position, arm.sense().position)
+    link.drive(HOLDING, 0.0)
+    assert acted == {}
     link, _, _ = linked(fault("sensor-nan", joint=-1))
     sample = link.sense()
     assert np.isnan(sample.position).all()
     assert np.isfinite(sample.velocity).all()
-
-
-def test_noise_is_the_same_again_with_the_same_seed_and_tick_and_has_its_size() -> None:
-    draws = []
-    for seed in (7, 7, 8):
-        link, arm, _ = linked(fault("sensor-noise", seed=seed, size=0.01, joint=-1))
-        noise = []
-        for _ in range(100):
-            noise.append(link.sense().position - arm.sense().position)
-            arm.step(1)
-        draws.append(np.array(noise))
-    assert np.array_equal(draws[0], draws[1])
-    assert not np.array_equal(draws[0], draws[2])
-    assert np.std(draws[0]) == pytest.approx(0.01, rel=0.1)
 
 
 def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_by_enough() -> None:
@@ -75,14 +62,6 @@ def test_a_stuck_sensor_acts_once_it_differs_from_the_truth_and_shows_once_by_en
     assert sample.position[1] == arm.sense().position[1]
     assert shows == sorted(shows)
     assert 0 < sum(shows) < len(shows) == 20
-
-
-def test_a_dropout_leaves_the_tick_of_the_last_sample() -> None:
-    link, arm, acted = linked(fault("sensor-dropout"))
-    for _ in range(3):
-        assert link.sense().tick == -1
-        arm.step(1)
-        assert acted.pop(0)
 
 
 def test_a_motor_that_is_off_gives_nothing_and_the_others_give_their_command() -> None:
@@ -110,25 +89,6 @@ def test_a_saturated_motor_gives_its_part_and_a_motor_that_is_asked_for_less_is_
     assert acted == {}
 
 
-@pytest.mark.parametrize(
-    ("kind", "parameters", "alarm"),
-    [
-        ("command-nan", {}, Alarm.COMMAND_INVALID),
-        ("command-limit", {"factor": 1.1}, Alarm.COMMAND_LIMIT),
-    ],
-)
-def test_a_corrupted_command_never_reaches_the_motors(
-    kind: str, parameters: dict[str, float], alarm: Alarm
-) -> None:
-    link, arm, acted = linked(fault(kind, joint=4, **parameters))
-    found = link.drive(HOLDING, 0.0)
-    assert found is not None
-    assert (found.alarm, found.subject) == (alarm, 4)
-    assert arm.braked
-    assert acted == {0: True}
-    assert np.isfinite(HOLDING).all()  # the level's own torques stay as they are
-
-
 def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:
     link, arm, acted = linked(
         fault("sensor-bias", size=0.1, joint=0),
@@ -140,41 +100,23 @@ def test_faults_on_one_arm_add_up_and_each_says_that_it_acts() -> None:
     assert list(acted) == [0, 2, 1]
 
 
-def test_a_joint_that_the_arm_lacks_is_never_struck() -> None:
-    link, arm, acted = linked(fault("sensor-nan", joint=9), fault("actuator-off", joint=9))
-    assert np.array_equal(link.sense().position, arm.sense().position)
-    link.drive(HOLDING, 0.0)
-    assert acted == {}
-
-
+@pytest.mark.parametrize("says_held", [False, True])
 @pytest.mark.parametrize(
     ("blocks", "more", "shows"),
     [(0, 0.0, True), (1, 0.0, False), (1, 20.0, True), (2, 20.0, False)],
 )
 def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_a_resting_arm_bears_a_load(
-    blocks: int, more: float, shows: bool
+    blocks: int, more: float, shows: bool, says_held: bool
 ) -> None:
     made, acted = cell("puma560"), dict[int, bool]()
     arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
     lay_against_a_finger(made, arm, blocks)
     assert (arm.holds, arm.leans) == (blocks > 0, blocks > 1)
-    link = FaultyLink(arm, made, 1, acted)
+    link = FaultyLink(arm, made, 1, acted, holds=lambda: says_held)
     link.inject([fault("actuator-off", joint=1)])
     link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
-    assert acted == {0: shows}
-
-
-@pytest.mark.parametrize(("more", "shows"), [(0.0, False), (20.0, True)])
-def test_a_motor_that_is_off_shows_as_late_where_its_level_takes_a_part_for_held(
-    more: float, shows: bool
-) -> None:
-    made, acted = cell("puma560"), dict[int, bool]()
-    arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
-    assert not arm.holds
-    link = FaultyLink(arm, made, 1, acted, holds=lambda: True)
-    link.inject([fault("actuator-off", joint=1)])
-    link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
-    assert acted == {0: shows}
+    # Its level may take a part for held that the arm does not hold.
+    assert acted == {0: shows and (blocks > 0 or not says_held)}
 
 
 def lay_against_a_finger(made: Cell, arm: SimulatedArm, blocks: int) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import Message
-from rack.backplane.watch.alarms import Alarm
 from rack.boards.config import load, wire
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import Array, solve
@@ -95,13 +94,6 @@ def test_an_arm_named_in_the_config_is_driven_and_follows_its_set_points(rig: Se
     scene = rig.rack.read("servo.scene")
     tool = InverseKinematics(rig.servo.arm.cell, 0).tool_at(rig.positions[-2])
     assert np.abs(scene.tool_position - tool.position).max() < 1e-3
-
-
-def test_its_brakes_engage_when_the_servo_level_misses_cycles(rig: ServoRig) -> None:
-    rig.run(200, Course(START, GOAL, 2.0).at)
-    rig.miss(10)
-    rig.run(12)
-    assert rig.alarms() == [Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED]
 
 
 def test_a_restarted_board_restores_it(rig: ServoRig) -> None:

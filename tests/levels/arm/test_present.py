@@ -15,11 +15,10 @@ from rack.levels.arm import Sensed, SimulatedArm
 from rack.levels.arm.arm import copied
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.present import PresentLink
-from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import RobotConfig, SceneConfig
-from tests.levels.arm.test_guard import SEEDS, TICK_S, driven, excess, random_torques
+from tests.levels.arm.test_guard import TICK_S, driven, excess, random_torques
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
 from tests.levels.lockstep import CLOCK_NS
@@ -145,38 +144,12 @@ def test_samples_older_than_the_config_permits_are_a_finding_with_their_age(
     )
 
 
-def test_a_stuck_sensor_shows_in_late_samples_too(tmp_path: Path, arm: type[LateArm]) -> None:
-    arm.late, arm.stuck_from = 2, 150
-    servo = rig(tmp_path, 2)
-    servo.run(150, COURSE.at)
-    assert not servo.alarms()
-    servo.run(60, COURSE.at)
-    first = next(found for found in servo.found if found.finding.alarm is not Alarm.BRAKES_OPENED)
-    assert first.finding.alarm in (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL)
-    assert (first.finding.subject, first.tick <= 150 + 2 + 10) == (0, True)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("latency", [1, 4])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_late_samples_lead_beyond_no_limit(
-    tmp_path: Path, arm: type[LateArm], latency: int, seed: int
-) -> None:
-    robot, cell = late(tmp_path, latency)
-    arm.late = latency
+def test_late_samples_lead_beyond_no_limit(tmp_path: Path, arm: type[LateArm]) -> None:
+    robot, cell = late(tmp_path, 4)
+    arm.late = 4
     own = arm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(own, cell, robot.joints, TICK_S, PresentLink(own, cell, TICK_S))
-    assert max(excess(cell, driven(guard, own, random_torques(cell, seed, 800)))) <= 0.0
+    assert max(excess(cell, driven(guard, own, random_torques(cell, 0, 800)))) <= 0.0
     assert own.clipped > 50
     assert own.violations == 0
-
-
-def test_latency_that_leaves_no_speed_is_refused(tmp_path: Path) -> None:
-    robot, cell = late(tmp_path, 20)
-    own = LateArm(cell, SceneConfig(), CLOCK_NS)
-    fast = robot.model_copy(update={"acceleration": (100.0, 100.0)})
-    wide = build_cell(fast, SceneConfig(), CLOCK_NS)
-    with pytest.raises(
-        RobotError, match=r"robot\.latency_ticks: 'shoulder' may be off by .* rad/s"
-    ):
-        GuardedArm(own, wide, robot.joints, TICK_S)

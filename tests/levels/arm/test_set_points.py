@@ -119,17 +119,11 @@ def saved(arm: SimulatedArm) -> Message:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(
-    ("name", "interface"),
-    [
-        *(("puma560", interface) for interface in SET_POINTS),
-        *(pytest.param("k1607", i, marks=pytest.mark.thorough) for i in SET_POINTS),
-    ],
-)
+@pytest.mark.parametrize("interface", SET_POINTS)
 def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
-    name: str, interface: Interface, kind: str
+    interface: Interface, kind: str
 ) -> None:
-    arm, made = simulated(name, interface)
+    arm, made = simulated("puma560", interface)
     fastest = 0.0
     for target in hostile(made, kind, 400):
         assert arm.follow(target, 0.0) is None
@@ -141,18 +135,10 @@ def test_no_set_points_move_the_simulated_arm_beyond_its_limits(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "jumps",
-        "beyond",
-        *(pytest.param(k, marks=pytest.mark.thorough) for k in ("swings", "ramps")),
-    ],
-)
+@pytest.mark.parametrize("kind", ["jumps", "beyond"])
 @pytest.mark.parametrize("interface", SET_POINTS)
-@pytest.mark.parametrize("misses", [pytest.param(False, marks=pytest.mark.thorough), True])
-def test_nor_an_arm_of_ones_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interface: Interface, kind: str, misses: bool
+def test_nor_an_arm_of_ones_own_that_misses_cycles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interface: Interface, kind: str
 ) -> None:
     # Its drives cycle at 4 kHz, so they may be quick.
     monkeypatch.setattr(simulated_arm, "VELOCITY_GAIN", 400.0)
@@ -165,7 +151,7 @@ def test_nor_an_arm_of_ones_own(
         for target in hostile(arm.cell, kind, 400):
             guard.sense()
             assert (guard if is_guarded else arm).follow(target, 0.0) is None or not is_guarded
-            for _ in range(random.integers(1, arm.patience, endpoint=True) if misses else 1):
+            for _ in range(random.integers(1, arm.patience, endpoint=True)):
                 arm.step(1)
                 far = np.maximum(low - arm._q, arm._q - high)
                 fast = np.abs(arm._qd) - arm.cell.bounds.velocity
@@ -248,22 +234,3 @@ def test_a_restored_arm_continues_bit_for_bit(interface: Interface, missed: int)
             each.follow(target, 0.0)
             each.step(1)
     assert saved(again).raw == saved(arm).raw
-
-
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_drives_go_on_for_their_patience_then_brake(interface: Interface) -> None:
-    arm, made = simulated("puma560", interface)
-    velocity = 0.1 * made.bounds.velocity
-    position = made.home.copy()
-    for _ in range(200):
-        assert arm.follow(JointTarget(position, velocity, load(made)), 0.0) is None
-        arm.step(1)
-        position = position + TICK_S * velocity
-    for _ in range(arm.patience - 1):
-        arm.step(1)
-        assert arm.sense().velocity == pytest.approx(velocity, rel=0.05)
-        assert not arm.braked
-    arm.step(100)
-    assert arm.braked
-    assert np.abs(arm.sense().velocity).max() < 1e-2
-    assert arm.violations == 0

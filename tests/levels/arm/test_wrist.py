@@ -12,7 +12,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ARM_STATE
-from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.systems.force.contact_wrench import ContactWrench
 from tests.levels.systems.force.pad import pad
 
@@ -51,13 +51,6 @@ def push(arm: SimulatedArm, force: Array, torque: Array) -> None:
     )
 
 
-def test_before_its_first_step_an_arm_rests(tmp_path: Path) -> None:
-    arm = arm_of(tmp_path)
-    contact = contact_of(arm)
-    contact.take(felt(arm), np.array(arm._state), STILL)
-    assert np.abs(contact.wrench).max() < 1e-3
-
-
 @pytest.mark.parametrize(
     "home", [(0.0, 1.4, -3.1, 0.0, -1.4416, 0.0), (0.6, 1.0, -2.6, 0.7, -0.9, 1.1)]
 )
@@ -81,58 +74,6 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
     assert np.allclose(contact.torque, expected, atol=0.02)
 
 
-def test_inertia_of_the_tool_is_no_contact(tmp_path: Path) -> None:
-    arm = arm_of(tmp_path)
-    contact, before = contact_of(arm), np.zeros(6)
-    wrenches = []
-    for tick in range(300):
-        velocity = 0.4 * np.sin(4.0 * np.pi * tick * 1e-3) * np.ones(6)
-        acceleration = 4.0 * (velocity - arm._state[1]) / 0.02
-        terms = arm.dynamics.terms(*arm._state)
-        arm.drive(
-            (terms.inertia * acceleration).sum(axis=1)
-            + terms.bias
-            + arm.dynamics.friction(velocity),
-            0.0,
-        )
-        arm.step(1)
-        state = np.array(arm._state)
-        contact.take(felt(arm), state, np.zeros(6))
-        ignored = contact.wrench.copy()
-        contact.take(felt(arm), state, (state[1] - before) / 1e-3)
-        wrenches.append((ignored, contact.wrench.copy()))
-        before = state[1]
-    off = np.abs(wrenches[50:])[:, :, :3].max(axis=(0, 2))
-    assert off[0] > 2.0
-    assert off[1] < 0.3
-
-
-def test_noise_is_that_of_the_tick_and_has_its_standard_deviation(tmp_path: Path) -> None:
-    arm, exact = arm_of(tmp_path, noise=0.5), arm_of(tmp_path)
-    samples = []
-    for _ in range(300):
-        arm.step(1)
-        exact.step(1)
-        assert np.array_equal(felt(arm), felt(arm))
-        samples.append(felt(arm) - felt(exact))
-    spread = np.std(samples, axis=0)
-    assert np.allclose(spread[:3], 0.5, rtol=0.2)
-    assert np.allclose(spread[3:], 0.05, rtol=0.2)
-
-
-def test_a_sample_beyond_the_range_is_cut_and_says_nothing_of_the_contact(tmp_path: Path) -> None:
-    arm = arm_of(tmp_path, reach=60.0)
-    contact = contact_of(arm)
-    for _ in range(50):
-        push(arm, np.array([0.0, 0.0, 100.0]), STILL[:3])
-        arm.step(1)
-    assert np.abs(felt(arm)).max() == 60.0
-    contact.take(felt(arm), np.array(arm._state), STILL)
-    assert contact.saturated
-    contact.take(np.full(6, np.nan), np.array(arm._state), STILL)
-    assert contact.saturated
-
-
 def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     arms = [arm_of(tmp_path, noise=0.2) for _ in range(2)]
     state = Message(ARM_STATE.dtype(sizes(arms[0].cell)))
@@ -144,9 +85,3 @@ def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     for arm in arms:
         arm.step(1)
     assert felt(arms[0]).tobytes() == felt(arms[1]).tobytes()
-
-
-def test_an_arm_without_a_sensor_senses_nothing(tmp_path: Path) -> None:
-    robot, scene = pad(tmp_path)
-    cell: Cell = build_cell(robot.model_copy(update={"wrist": None}), scene, CLOCK_NS)
-    assert SimulatedArm(cell, scene, CLOCK_NS).feel() is None

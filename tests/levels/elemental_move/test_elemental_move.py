@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.levels.messages import Error
 from rack.levels.tables import MotionConfig
 from tests.levels.whole_rack import WholeRack
 
@@ -27,9 +26,8 @@ def post_moves(
     return [first, *(MotionConfig(body="post", at=at, to=to, speed=speed) for at, to in legs)]
 
 
-@pytest.fixture(scope="module")
-def transferred() -> tuple[WholeRack, list[tuple[int, bool]]]:
-    """A rack that has transferred a block and moved home, and when segments were under way."""
+@pytest.mark.slow
+def test_block_is_put_where_it_should_be_and_the_arm_hardly_waits_for_a_path() -> None:
     rack = WholeRack(actions=[TRANSFER, HOME])
     seen: list[tuple[int, bool]] = []
 
@@ -38,23 +36,12 @@ def transferred() -> tuple[WholeRack, list[tuple[int, bool]]]:
         return rack.task.state in (State.DONE, State.ERROR)
 
     rack.run(30.0, watch)
-    return rack, seen
-
-
-@pytest.mark.slow
-def test_block_is_put_where_it_should_be_and_nothing_is_touched(transferred: tuple) -> None:
-    rack, _ = transferred
     assert rack.task.state == State.DONE
     assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.002)
     assert rack.read("servo.status").touches == 0
     assert rack.move.replans == 0
-
-
-@pytest.mark.slow
-def test_arm_hardly_waits_for_a_path_once_it_has_begun(transferred: tuple) -> None:
     # Between two segments the primitive level may be without work for some of its cycles, not for
     # one of this level's.
-    _, seen = transferred
     begun = next(k for k, (_, busy) in enumerate(seen) if busy)
     last = max(done for done, _ in seen)
     ended = next(k for k, (done, _) in enumerate(seen) if done == last)
@@ -86,31 +73,4 @@ def test_task_waits_while_its_goal_is_blocked_and_continues_when_it_is_free() ->
     assert "'post'" in rack.move.reason
     assert rack.run_to_end(30.0).state == State.DONE
     assert rack.move.reason == ""
-    assert rack.read("servo.status").touches == 0
-
-
-@pytest.mark.slow
-def test_patience_ends_with_the_reason_that_there_is_no_path() -> None:
-    motion = post_moves((2.5, (0.5, 0.30, 0.95)))
-    rack = WholeRack(
-        arm="puma560_crossing",
-        actions=[ABOVE_BLOCK],
-        motion=motion,
-        params={"elemental_move": {"patience": 0.5}},
-    )
-    status = rack.run_to_end(20.0)
-    assert (status.state, status.error) == (State.ERROR, Error.NO_PATH)
-    assert "'post'" in status.reason
-
-
-@pytest.mark.slow
-def test_task_continues_when_boards_are_restarted_repeatedly() -> None:
-    rack = WholeRack(actions=[TRANSFER])
-    for names in (("elemental_move",), ("elemental_move.planner", "task")) * 6:
-        if rack.run(2.3, lambda _: rack.task.state in (State.DONE, State.ERROR)):
-            break
-        for name in names:
-            rack.restart(name)
-    assert rack.task.state == State.DONE
-    assert rack.read("world.model").position[BLOCK1] == pytest.approx(GOAL, abs=0.003)
     assert rack.read("servo.status").touches == 0

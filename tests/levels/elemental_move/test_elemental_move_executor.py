@@ -51,7 +51,6 @@ class Bench(Lockstep):
             self.step()
 
     def order(self, verbs: Sequence[Verb] = PICK, first: int = 1, by: float = 0.0) -> None:
-        """Hand down a window of moves."""
         command = self.message("task.command")
         for k, verb in enumerate(verbs):
             command.moves[k]["id"], command.moves[k]["verb"] = first + k, verb
@@ -80,12 +79,10 @@ class Bench(Lockstep):
 
     @property
     def command(self) -> Message:
-        """The command of the level."""
         return self.read("elemental_move.command")
 
     @property
     def status(self) -> Message:
-        """The status of the level."""
         return self.read("elemental_move.status")
 
     def segments(self) -> list[tuple[int, int]]:
@@ -102,19 +99,6 @@ def planned_bench(**params: Any) -> Bench:
         bench.plan(move)
     bench.cycle(2)
     return bench
-
-
-def test_nothing_is_handed_down_before_its_path_is_there() -> None:
-    bench = Bench()
-    bench.order()
-    bench.cycle(3)
-    assert bench.segments() == []
-    assert bench.status.state == State.EXECUTING
-    bench.plan(1)
-    bench.cycle(2)
-    assert bench.segments() == [(1, 1)]
-    assert bench.status.planned == 1
-    assert bench.status.end == pytest.approx(bench.home + 0.1)
 
 
 def test_window_stays_full_until_the_program_is_done() -> None:
@@ -173,14 +157,6 @@ def test_failure_stops_everything_with_its_reason(
     assert bench.command.hold == 1
 
 
-def test_blocked_arm_holds_and_asks_for_another_path_from_where_it_rests() -> None:
-    bench = planned_bench()
-    bench.cycle(2, current=1, blocked=1, resting=1, position=bench.home + 0.05)
-    assert bench.command.hold == 1
-    assert bench.status.replan > 0
-    assert bench.status.start == pytest.approx(bench.home + 0.05)
-
-
 def test_request_is_dropped_when_the_way_is_free_again() -> None:
     bench = planned_bench()
     bench.cycle(2, current=1, blocked=1)
@@ -194,8 +170,10 @@ def test_request_is_dropped_when_the_way_is_free_again() -> None:
 
 
 def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> None:
-    bench = planned_bench()
+    bench = planned_bench(replans=1)
     bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
+    assert (bench.command.hold, bench.status.replan > 0) == (1, True)
+    assert bench.status.start == pytest.approx(bench.home + 0.05)
     bench.plan(1, bench.home + 0.05, replan=bench.status.replan)
     bench.cycle(1)
     assert bench.segments()[0] == (3, 1)
@@ -204,6 +182,9 @@ def test_other_path_replaces_the_blocked_one_and_withdraws_what_followed() -> No
     assert bench.command.hold == 0
     assert bench.segments() == [(3, 1), (4, 2)]
     assert bench.status.replans == 1
+    # The next move may take as many other paths again.
+    bench.cycle(2, done=3, current=4, blocked=1)
+    assert (bench.status.error, bench.status.replan > 0) == (Error.NONE, True)
 
 
 def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_is_there() -> None:
@@ -222,33 +203,6 @@ def test_way_that_stays_blocked_is_an_error_after_so_many_paths_and_names_what_i
     assert (bench.status.state, bench.status.error) == (State.ERROR, Error.BLOCKED)
     assert bench.status.reason == f"3 other paths tried, still {why}"
     assert bench.segments() == []
-
-
-def test_next_move_may_take_as_many_other_paths_again() -> None:
-    bench = planned_bench(replans=1)
-    bench.cycle(2, current=1, blocked=1)
-    bench.plan(1, bench.home, replan=bench.status.replan)
-    bench.cycle(2, current=3, blocked=0)
-    bench.cycle(2, done=3, current=4, blocked=1)
-    assert (bench.status.error, bench.status.replan > 0) == (Error.NONE, True)
-
-
-def test_who_keeps_the_level_below_from_its_work_is_passed_on() -> None:
-    bench = planned_bench()
-    bench.cycle(
-        2,
-        current=1,
-        progress=0.25,
-        operated=1,
-        state=State.HOLDING,
-        reason="waiting for servo: brakes engaged",
-    )
-    status = bench.status
-    assert (status.state, status.reason) == (State.HOLDING, "waiting for servo: brakes engaged")
-    assert (status.progress, status.operated) == (0.25, 1)
-    bench.cycle(2, operated=0, state=State.EXECUTING, reason="")
-    status = bench.status
-    assert (status.state, status.reason, status.operated) == (State.EXECUTING, "", 0)
 
 
 def test_time_is_handed_down_less_what_the_answer_takes() -> None:
@@ -273,31 +227,6 @@ def test_refusal_counts_when_its_move_is_due_and_not_before() -> None:
     assert bench.status.reason == "something is there"
 
 
-def test_move_without_a_path_for_now_waits_and_says_why() -> None:
-    bench = Bench()
-    bench.order()
-    bench.plan(1, error=Error.NO_PATH)
-    bench.cycle(3)
-    assert (bench.status.state, bench.status.reason) == (State.HOLDING, "something is there")
-    bench.plan(1)
-    bench.cycle(2)
-    assert bench.segments() == [(1, 1)]
-    assert bench.status.reason == ""
-
-
-def test_another_program_begins_once_the_arm_rests() -> None:
-    bench = planned_bench()
-    bench.order(first=40)
-    bench.cycle(2, resting=0)
-    assert bench.segments() == []
-    assert bench.status.done == 0
-    bench.cycle(2, resting=1)
-    assert bench.status.done == 39
-    bench.plan(40, bench.home)
-    bench.cycle(2)
-    assert bench.segments() == [(3, 40)]
-
-
 def test_restarted_executor_continues_from_its_own_last_messages() -> None:
     bench = planned_bench()
     bench.cycle(2, done=1)
@@ -309,21 +238,6 @@ def test_restarted_executor_continues_from_its_own_last_messages() -> None:
     bench.plan(4)
     bench.cycle(2, done=2)
     assert bench.segments() == [(3, 3), (4, 4)]
-
-
-def test_after_a_restart_the_next_path_continues_from_the_one_that_replaced_the_blocked_one() -> (
-    None
-):
-    bench = planned_bench()
-    bench.restart("elemental_move")
-    bench.cycle(2, blocked=1, current=1)
-    bench.plan(1, bench.home, replan=bench.status.replan)
-    bench.cycle(1, blocked=0, current=3, resting=0)
-    assert [move for _, move in bench.segments()] == [1]
-    assert (bench.status.planned, bench.status.end) == (1, pytest.approx(bench.home + 0.1))
-    bench.plan(2, bench.home + 0.2)  # where move 2 was to end before it was withdrawn
-    bench.cycle(2)
-    assert [move for _, move in bench.segments()] == [1]
 
 
 @pytest.mark.parametrize(
@@ -341,43 +255,3 @@ def test_loss_of_a_neighbour_is_said_and_ends(mailbox: str, reason: str, hold: i
     bench.cycle(2)
     assert bench.command.hold == 0
     assert (bench.status.state, bench.status.reason) == (State.EXECUTING, "")
-
-
-def test_path_that_does_not_begin_where_the_one_before_it_ends_is_not_taken() -> None:
-    # The path of move 1 was lost, that of move 2 was not; another path for move 1 may end
-    # elsewhere.
-    bench = Bench()
-    bench.order()
-    bench.plan(2, bench.home + 0.3)
-    bench.plan(1)
-    bench.cycle(2)
-    assert bench.status.planned == 1
-    bench.plan(2)
-    bench.cycle(2)
-    assert bench.status.planned == 3
-
-
-def test_path_made_again_with_another_end_withdraws_what_was_planned_from_the_old_one() -> None:
-    bench = planned_bench()
-    assert bench.status.planned == 5
-    again = bench.message("elemental_move.plan")
-    again.move, again.kind, again.count = 4, SegmentKind.PATH, 2
-    again.waypoints[:2] = bench.ends[2], bench.ends[2] + 0.3
-    bench.write("elemental_move.plan", again)
-    bench.cycle(2)
-    assert bench.status.planned == 4
-    assert bench.status.end == pytest.approx(bench.ends[2] + 0.3)
-
-
-def test_answer_for_a_place_that_the_arm_has_left_is_requested_again() -> None:
-    bench = planned_bench()
-    bench.cycle(2, current=1, blocked=1, position=bench.home + 0.05)
-    asked = bench.status.replan
-    bench.cycle(position=bench.home + 0.09)
-    bench.plan(1, bench.home + 0.05, replan=asked)
-    bench.cycle(1)
-    assert bench.segments() == [(1, 1), (2, 2)]
-    assert bench.status.replan > asked
-    bench.plan(1, bench.home + 0.09, replan=bench.status.replan)
-    bench.cycle(1)
-    assert bench.segments()[0] == (3, 1)

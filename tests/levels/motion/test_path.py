@@ -28,13 +28,6 @@ def test_derivatives_agree_with_finite_differences() -> None:
     )  # q'' has kinks where a blend ends
 
 
-def test_second_derivative_is_continuous_and_zero_where_a_blend_ends() -> None:
-    path = BlendedPath(CORNERED, BLEND)
-    for s in path.breaks[1:-1]:
-        _, _, d2q = points(path, np.array([s - 1e-9, s, s + 1e-9]))
-        assert np.abs(d2q).max() < 1e-6
-
-
 def test_analytic_bounds_hold_and_are_tight_on_every_piece() -> None:
     path = BlendedPath(CORNERED, BLEND)
     for k, (start, end) in enumerate(zip(path.breaks[:-1], path.breaks[1:], strict=True)):
@@ -47,21 +40,6 @@ def test_analytic_bounds_hold_and_are_tight_on_every_piece() -> None:
         assert np.abs(d2q).max(axis=0) == pytest.approx(path.bounds.second[k], rel=1e-3, abs=1e-9)
 
 
-def test_only_a_corner_without_blend_is_a_stop() -> None:
-    path = BlendedPath(CORNERED, [0.0, 0.0, 0.2, 0.0])
-    assert path.stops == pytest.approx([np.linalg.norm(CORNERED[1])])
-    straight = BlendedPath([[0.0, 0.0], [0.5, 0.5], [2.0, 2.0]], [0.0, 0.0, 0.0])
-    assert straight.stops == []
-
-
-def test_rounded_corner_stays_between_the_corner_and_its_chord() -> None:
-    path = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.4, 0.0])
-    q, _, _ = points(path, np.linspace(0.6, 1.4, 101))
-    assert (q[:, 0] <= 1.0).all()
-    assert (q[:, 1] >= 0.0).all()
-    assert (q[:, 0] - q[:, 1] >= 0.6 - 1e-12).all()
-
-
 def test_blends_that_touch_leave_no_line_between_them() -> None:
     path = BlendedPath([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [2.0, 1.0]], [0.0, 0.5, 0.5, 0.0])
     assert path.breaks == pytest.approx([0.0, 0.5, 1.5, 2.5, 3.0])
@@ -71,18 +49,12 @@ def test_blends_that_touch_leave_no_line_between_them() -> None:
     assert whole.evaluate(2.0).q == pytest.approx([1.0, 1.0])
 
 
-def test_single_waypoint_is_a_path_of_length_zero() -> None:
-    path = BlendedPath([[0.3, -0.4]], [0.7])
-    point = path.evaluate(0.5)
-    assert path.length == 0.0
-    assert path.stops == []
-    assert point.q == pytest.approx([0.3, -0.4])
-    assert not point.dq_ds.any()
-    assert not point.d2q_ds2.any()
-    assert path.sample(0.1) == pytest.approx(np.array([[0.3, -0.4]]))
-
-
 def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
+    # Only a corner without a blend is a stop.
+    path = BlendedPath(CORNERED, [0.0, 0.0, 0.2, 0.0])
+    assert path.stops == pytest.approx([np.linalg.norm(CORNERED[1])])
+    straight = BlendedPath([[0.0, 0.0], [0.5, 0.5], [2.0, 2.0]], [0.0, 0.0, 0.0])
+    assert straight.stops == []
     path = BlendedPath(
         [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 1.0]], [0.0, 0.3, 0.2, 0.4, 0.0]
     )
@@ -91,12 +63,6 @@ def test_coincident_waypoints_count_once_with_the_smaller_blend() -> None:
     nowhere = BlendedPath([[1.0, 2.0]] * 3, [0.0, 0.5, 0.0])
     assert nowhere.length == 0.0
     assert nowhere.evaluate(0.0).q == pytest.approx([1.0, 2.0])
-
-
-def test_samples_are_no_further_apart_than_asked() -> None:
-    sampled = BlendedPath(CORNERED, BLEND).sample(0.05)
-    assert np.linalg.norm(np.diff(sampled, axis=0), axis=1).max() <= 0.05 + 1e-12
-    assert sampled[[0, -1]] == pytest.approx(CORNERED[[0, -1]])
 
 
 @pytest.mark.parametrize(

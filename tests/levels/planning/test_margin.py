@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 
 from rack.levels.planning.collision import CollisionChecker
+from rack.levels.planning.fixed_jaw import GAP_M, FixedJaw, find_fixed_jaw
 from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner
 from rack.levels.planning.moves import Situation
+from rack.levels.planning.payload import Payloads
+from rack.levels.planning.pose import Pose, pointing
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import SceneConfig
 from rack.levels.task.actions import Handling
+from rack.levels.task.program import DOWN
 from rack.levels.task.rehearsal import Rehearsal
-from tests.levels.arms import CLOCK_NS, config, four_bar, pendulum
+from tests.levels.arms import CLOCK_NS, cell, pendulum
 from tests.levels.robot import grippers
 
 STOP = '<geom name="post" type="box" size=".01 .01 .01" pos=".2 0 {z}"/>'
@@ -45,26 +49,6 @@ def test_links_keep_the_margin_in_planning_alone(tmp_path: Path) -> None:
     assert planned.free(lifted, planned.room(lifted))
 
 
-def test_links_that_are_close_at_home_keep_half_of_that(tmp_path: Path) -> None:
-    made, scene = hinged(tmp_path, 0.0004)
-    planned = CollisionChecker(made, scene, MAX_STRAY_M)
-    assert planned.free(made.home)
-    assert not planned.free(np.array([-0.0003 / 0.2, 0.5]))
-
-
-@pytest.mark.parametrize(
-    ("arm", "farther"),
-    [(four_bar, True), (grippers.rotary, True), (lambda _: config("puma560"), False)],
-)
-def test_only_swinging_fingers_reach_farther_when_closed(
-    tmp_path: Path, arm: object, farther: bool
-) -> None:
-    assert callable(arm)
-    robot, scene = arm(tmp_path)
-    planned = CollisionChecker(build_cell(robot, scene, CLOCK_NS), scene, MAX_STRAY_M)
-    assert (planned.longest is not None) is farther
-
-
 def lowest_grasp(folder: Path, length: float) -> float:
     """Return the height, m, above its origin at which block1 is taken with fingers of `length`,
     m."""
@@ -85,3 +69,43 @@ def test_a_grasp_leaves_room_for_fingers_that_reach_farther_as_they_close(
     tmp_path: Path, length: float, height: float
 ) -> None:
     assert lowest_grasp(tmp_path, length) == pytest.approx(height)
+
+
+JAW_M = 0.025
+"""From the tool of `grippers.one_finger` to its jaw, on the side of negative y."""
+
+
+def jaw_of(made: Cell) -> FixedJaw | None:
+    return find_fixed_jaw(made, Payloads(made, ("block1", "block2", "peg")))
+
+
+def one_finger(folder: Path) -> Cell:
+    arm = grippers.one_finger(folder)
+    return build_cell(*arm, CLOCK_NS)
+
+
+@pytest.mark.parametrize("half", [0.01, 0.02, 0.03])
+def test_the_jaw_comes_next_to_an_object_of_any_width(tmp_path: Path, half: float) -> None:
+    made = one_finger(tmp_path)
+    geom = made.model.body_geomadr[made.bodies[0]]
+    made.model.geom_size[geom] = half
+    jaw = jaw_of(made)
+    assert jaw is not None
+    seen = Pose(np.array([0.5, 0.2, 0.475]), np.array([1.0, 0.0, 0.0, 0.0]))
+    tool = Pose(seen.position, pointing(DOWN))
+    moved = tool.inverse() @ jaw.beside(tool, 0, seen)
+    assert moved.position == pytest.approx([0.0, JAW_M - half - GAP_M, 0.0], abs=2e-4)
+
+
+def test_an_object_that_the_jaw_cannot_meet_is_taken_around_the_tool(tmp_path: Path) -> None:
+    made = one_finger(tmp_path)
+    jaw = jaw_of(made)
+    assert jaw is not None
+    tool = Pose(np.array([0.5, 0.2, 0.475]), pointing(DOWN))
+    below = tool.raised(-0.2)
+    assert jaw.beside(tool, 0, below) is tool
+
+
+def test_fingers_that_both_move_have_no_fixed_jaw(tmp_path: Path) -> None:
+    assert jaw_of(cell("puma560")) is None
+    assert jaw_of(build_cell(*grippers.rotary(tmp_path), CLOCK_NS)) is None

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
+from rack.levels.planning.pose import Pose, pointing, pose
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
@@ -48,7 +48,3 @@ def test_pointing_turns_the_z_axis_to_the_direction(direction: tuple, yaw: float
 def test_yaw_about_a_direction_turns_the_tool_about_its_own_z_axis() -> None:
     still, turned = pose((0, 0, 0), pointing((0, 1, 1))), pose((0, 0, 0), pointing((0, 1, 1), 0.7))
     assert still.angle_to(turned) == pytest.approx(0.7)
-
-
-def test_yaw_is_read_back_from_an_upright_pose() -> None:
-    assert yaw_of(turned_about_z(-1.2)) == pytest.approx(-1.2)

@@ -62,7 +62,6 @@ class PrimitiveRack(Lockstep):
             self.set_points.append(_fields(self.read("primitive.command").record))
 
     def command(self, *segments: Segment, hold: bool = False) -> None:
-        """Hand down a window of segments."""
         message = self.message("em.command")
         message.id = max((segment["id"] for segment in segments), default=0)
         message.hold = hold
@@ -77,12 +76,10 @@ class PrimitiveRack(Lockstep):
 
     @property
     def status(self) -> Any:
-        """The primitive level's status now."""
         return self.read("primitive.status")
 
     @property
     def servo(self) -> Any:
-        """The servo level's status now."""
         return self.read("servo.status")
 
     def run_until_done(self, segment: int, seconds: float = 10.0) -> bool:
@@ -112,7 +109,6 @@ def two_paths(rack: PrimitiveRack) -> tuple[Segment, Segment]:
 
 
 def gripper(serial: int, opening: float, held: int = -1, force: float = 30.0) -> Segment:
-    """Return a GRIPPER segment."""
     return {
         "id": serial,
         "kind": SegmentKind.GRIPPER,

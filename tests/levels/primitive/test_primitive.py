@@ -33,12 +33,6 @@ def finished() -> PrimitiveRack:
     return rack
 
 
-def test_arm_goes_along_both_paths_and_settles_at_their_end(finished: PrimitiveRack) -> None:
-    assert np.abs(finished.servo.position - finished.home).max() < 1e-3
-    assert finished.status.state == State.DONE
-    assert finished.servo.clipped == finished.servo.touches == 0
-
-
 def test_set_points_keep_their_limits_and_agree_with_their_derivatives(
     finished: PrimitiveRack,
 ) -> None:
@@ -53,15 +47,11 @@ def test_set_points_keep_their_limits_and_agree_with_their_derivatives(
     step = 8 * 0.0025
     assert np.abs((q[2:] - q[:-2]) / (2 * step) - qd[1:-1]).max() < 0.02
     assert np.abs((qd[2:] - qd[:-2]) / (2 * step) - qdd[1:-1]).max() < 1.0
-
-
-def test_set_point_is_due_two_cycles_after_the_release_that_made_it(
-    finished: PrimitiveRack,
-) -> None:
+    # Each is due two cycles after the release that made it.
     dues = [int(p["due"]) for p in finished.set_points]
-    moving = [(8 * (k + 1), due) for k, due in enumerate(dues) if due]
-    assert moving
-    assert all(due - visible_at == 8 for visible_at, due in moving)
+    assert all(due - 8 * (k + 1) == 8 for k, due in enumerate(dues) if due)
+    assert np.abs(finished.servo.position - finished.home).max() < 1e-3
+    assert finished.servo.clipped == finished.servo.touches == 0
 
 
 def test_next_path_is_planned_while_the_arm_moves_so_that_it_does_not_wait(
@@ -73,56 +63,18 @@ def test_next_path_is_planned_while_the_arm_moves_so_that_it_does_not_wait(
     assert finished.seen[first(finished, current=1, resting=0) + 4]["wants"] == 0
 
 
-def test_every_status_echoes_the_command_and_reports_progress(finished: PrimitiveRack) -> None:
+def test_every_status_reports_progress_and_when_the_segment_will_be_done(
+    finished: PrimitiveRack,
+) -> None:
     under_way = [s for s in finished.seen if s["current"] == 2]
     progress = [float(s["progress"]) for s in under_way]
     assert all(s["echo"] == 2 and s["state"] == State.EXECUTING for s in under_way)
     assert progress == sorted(progress)
     assert progress[-1] == 1.0
-
-
-def test_segment_is_done_no_later_than_the_level_said_it_would_be(finished: PrimitiveRack) -> None:
+    assert finished.status.state == State.DONE
     said = finished.seen[first(finished, current=2, resting=0)]["ends"]
     done = (first(finished, done=2) + 1) * 8 * 0.0025
     assert done <= said <= done + 0.2
-
-
-@pytest.mark.slow
-def test_hold_ramps_to_rest_on_the_path_and_motion_continues_from_there() -> None:
-    rack = PrimitiveRack()
-    segments = two_paths(rack)
-    rack.command(*segments)
-    rack.run(0.4)
-    rack.command(*segments, hold=True)
-    rack.run(1.2)
-    held = rack.status
-    assert held.resting
-    assert held.blocked == 0
-    assert 0.0 < held.progress < 1.0
-    rack.run(0.3)
-    assert (rack.status.position == held.position).all()
-    rack.command(*segments)
-    assert rack.run_until_done(2)
-    way = (
-        np.array([p["position"] for p in rack.set_points[: first(rack, done=1)] if p["due"]])
-        - rack.home
-    )
-    beside = way - np.outer(way @ TURN / (TURN @ TURN), TURN)
-    assert np.abs(beside).max() < 1e-9
-
-
-@pytest.mark.slow
-def test_replaced_segment_starts_where_the_motion_rests() -> None:
-    rack = PrimitiveRack()
-    rack.command(path(1, [rack.home, rack.home + TURN]))
-    rack.run(0.4)
-    rack.command()
-    rack.run(1.0)
-    assert rack.status.resting
-    assert rack.status.current == 0
-    rack.command(path(2, [rack.status.position, rack.home]))
-    assert rack.run_until_done(2)
-    assert np.abs(rack.servo.position - rack.home).max() < 1e-3
 
 
 def test_gripper_segments_close_and_open_and_say_what_is_held() -> None:
@@ -137,14 +89,6 @@ def test_gripper_segments_close_and_open_and_say_what_is_held() -> None:
     assert rack.status.opening > 0.038
 
 
-@pytest.mark.slow
-def test_move_by_a_time_is_done_just_in_time() -> None:
-    rack = PrimitiveRack()
-    rack.command(path(1, [rack.home, rack.home + TURN], by=3.0))
-    assert rack.run_until_done(1)
-    assert 2.85 < rack.seconds <= 3.0
-
-
 def test_move_that_cannot_be_done_by_its_time_is_refused_before_anything_moves() -> None:
     rack = PrimitiveRack()
     rack.command(path(1, [rack.home, rack.home + TURN], by=0.7))
@@ -156,7 +100,8 @@ def test_move_that_cannot_be_done_by_its_time_is_refused_before_anything_moves()
     again = PrimitiveRack()
     again.command(path(1, [again.home, again.home + TURN], by=refused.earliest))
     assert again.run_until_done(1)
-    assert again.seconds <= refused.earliest
+    # Done just in time.
+    assert refused.earliest - 0.15 < again.seconds <= refused.earliest
 
 
 @pytest.mark.slow
@@ -183,25 +128,6 @@ def test_segment_that_cannot_be_is_an_error_and_the_next_command_is_done(
     assert rack.status.error == 0
 
 
-def test_waypoint_beyond_a_joint_range_names_joint_value_and_range() -> None:
-    rack = PrimitiveRack()
-    far = rack.home.copy()
-    far[0] = 3.0
-    rack.command(path(1, [rack.home, far]))
-    assert "waypoint 1, joint 'j1' at 3.0000 rad; valid: -2.78" in rack.run_until_error().reason
-
-
-def test_path_that_begins_slightly_off_the_arm_is_joined_smoothly() -> None:
-    rack = PrimitiveRack()
-    rack.command(path(1, [rack.home + 0.015, rack.home + TURN]))
-    assert rack.run_until_done(1)
-    assert np.abs(rack.servo.position - rack.home - TURN).max() < 1e-3
-    limits = cell("puma560").limits
-    assert (
-        np.abs(np.diff(positions(rack), n=2, axis=0)) / 0.02**2 < 1.3 * limits.acceleration
-    ).all()
-
-
 def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() -> None:
     rack = PrimitiveRack("k1607")
     corner = rack.home + 0.2
@@ -210,8 +136,3 @@ def test_arm_without_gripper_or_scene_goes_along_its_path_and_refuses_a_grasp() 
     assert np.abs(rack.servo.position - corner + 0.3).max() < 1e-3
     rack.command(gripper(2, opening=0.0))
     assert rack.run_until_error().reason == "segment 2: the arm has no gripper; valid: paths"
-
-
-def test_unknown_parameter_is_refused_with_the_valid_ones() -> None:
-    with pytest.raises(Exception, match=r"params\.lookahed.*keys: following"):
-        PrimitiveRack(params={"lookahed": 1.0})

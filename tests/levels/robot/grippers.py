@@ -54,7 +54,6 @@ ROTARY = {"joint": "finger_left", "open": 0.5, "closed": -0.4, "force": 4.0}
 
 
 def sides(finger: str, tip: str = "", armature: str = 'armature=".1"') -> str:
-    """Return a finger on either side."""
     made = []
     for side, x, turn in (("left", "", "-"), ("right", "-", "")):
         top = tip.format(side=side, turn=turn)

@@ -41,25 +41,19 @@ def worst(cell: Cell, payload: float = 0.0) -> tuple[float, int]:
     return float(np.max(parts)), joint
 
 
-def test_gravity_leaves_what_the_controllers_model_says(cell: Cell, found: Abilities) -> None:
+def test_the_payload_takes_all_of_one_joints_torque(cell: Cell, found: Abilities) -> None:
     part, joint = worst(cell)
     assert found.left == pytest.approx(1.0 - part, abs=1e-9)
     assert found.joint == joint
-
-
-def test_the_payload_takes_all_of_one_joints_torque(cell: Cell, found: Abilities) -> None:
     assert worst(cell, found.payload)[0] == pytest.approx(1.0, abs=1e-6)
     assert worst(cell, 0.99 * found.payload)[0] < 1.0
 
 
-def test_the_reach_is_that_of_the_links_stretched_out(cell: Cell, found: Abilities) -> None:
+def test_stretched_out_no_single_joint_reaches_farther(cell: Cell, found: Abilities) -> None:
     # The PUMA 560: upper arm 0.4318 m, forearm 0.4331 m with 20 mm beside it, the tool beyond the
     # wrist, all 0.15 m beside the axis of the first joint.
     wrist = 0.4318 + np.hypot(0.4331, 0.0203)
     assert np.hypot(wrist, 0.15) < found.reach < np.hypot(wrist + 0.25, 0.15)
-
-
-def test_stretched_out_no_single_joint_reaches_farther(cell: Cell, found: Abilities) -> None:
     statics = Statics(cell)
     poses = statics.poses()
     far = statics.stretched(max(poses, key=statics.distance))

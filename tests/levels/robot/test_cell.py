@@ -41,13 +41,6 @@ def test_the_tool_points_down_at_home_away_from_singularities(name: str) -> None
     assert np.linalg.svd(jacobian[:, made.dof])[1][-1] > 0.15
 
 
-def test_a_change_to_one_model_is_in_no_other() -> None:
-    first = build(*config("puma560")).model
-    before = first.body_mass.copy()
-    first.body_mass[:] = 7.0
-    assert np.array_equal(build(*config("puma560")).model.body_mass, before)
-
-
 def test_a_free_body_listed_before_the_arm_shifts_no_index(tmp_path: Path) -> None:
     made = build(
         pendulum(tmp_path, first=BLOCK), SceneConfig(objects=("block",), supports=("floor",))
@@ -88,13 +81,6 @@ def test_whatever_drives_a_joint_becomes_a_torque_motor_with_its_limit(
     assert data.qfrc_actuator[made.dof] == pytest.approx([1.5, -2.5])
 
 
-def test_a_tendon_drive_is_replaced_when_the_config_gives_torque_limits(tmp_path: Path) -> None:
-    drives = '<motor joint="shoulder"/><position name="winch" tendon="cable" kp="10"/>'
-    made = build(pendulum(tmp_path, drives, torque=(45.0, 10.0)))
-    assert made.model.nu == 2
-    assert made.bounds.torque == pytest.approx([45.0, 10.0])
-
-
 def test_sensors_and_keyframes_of_replaced_actuators_go_with_them(tmp_path: Path) -> None:
     robot = pendulum(tmp_path, MOTORS.replace("<motor", '<motor name="m"', 1))
     text = robot.model.read_text()
@@ -106,23 +92,18 @@ def test_sensors_and_keyframes_of_replaced_actuators_go_with_them(tmp_path: Path
     assert build(robot).model.nsensor == 0
 
 
-def test_every_hinge_gets_the_least_armature(tmp_path: Path) -> None:
-    made = build(pendulum(tmp_path, min_armature=0.07))
+def test_the_config_may_give_torques_ranges_armature_and_a_body_as_tool(tmp_path: Path) -> None:
+    drives = '<motor joint="shoulder"/><position name="winch" tendon="cable" kp="10"/>'
+    given = {"torque": (45.0, 10.0), "position": ((-1.0, 3.0), (-3.0, 1.0))}
+    made = build(pendulum(tmp_path, drives, **given, min_armature=0.07, tool="lower"))
+    assert made.model.nu == 2
+    assert made.bounds.torque == pytest.approx([45.0, 10.0])
+    # The tighter of two ranges holds, and the greater of two armatures.
+    assert made.bounds.position.tolist() == [[-1.0, 2.0], [-2.0, 1.0]]
     assert made.model.dof_armature[made.dof] == pytest.approx([0.07, 0.07])
-    puma, _ = config("puma560")
     assert cell("puma560").model.dof_armature[0] == pytest.approx(0.784029968642)
-    assert puma.min_armature < 0.1
-
-
-def test_the_tool_may_be_a_body(tmp_path: Path) -> None:
-    made = build(pendulum(tmp_path, tool="lower"))
     data = made.start()
     assert data.site_xpos[made.tool] == pytest.approx(data.body("lower").xpos)
-
-
-def test_the_tighter_of_two_position_ranges_holds(tmp_path: Path) -> None:
-    made = build(pendulum(tmp_path, position=((-1.0, 3.0), (-3.0, 1.0))))
-    assert made.bounds.position.tolist() == [[-1.0, 2.0], [-2.0, 1.0]]
 
 
 def gripper(**changed: str) -> GripperConfig:
@@ -231,22 +212,3 @@ def test_a_model_that_cannot_be_used_is_refused_in_one_line(tmp_path: Path, case
         build(pendulum(tmp_path, **changed, joints=joints))
     assert (message or "'shoulder2' is a ball joint; valid: hinge, slide") in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    robot = pendulum(tmp_path, actuators=MOTORS)
-    robot.model.unlink()
-    with pytest.raises(RobotError, match=r"model '.*pendulum.xml': no such file"):
-        build(robot)
-
-
-def test_the_arm_of_the_cell_for_force_control_is_the_puma() -> None:
-    puma, own = cell("puma560").model, cell("penn_cell").model
-    for name in (f"link{k}" for k in range(1, 7)):
-        one, other = puma.body(name), own.body(name)
-        for field in ("mass", "inertia", "ipos", "iquat", "pos", "quat"):
-            assert np.array_equal(getattr(one, field), getattr(other, field)), (name, field)
-    for name in (f"j{k}" for k in range(1, 7)):
-        one, other = puma.joint(name), own.joint(name)
-        for field in ("axis", "range", "armature", "damping", "frictionloss"):
-            assert np.array_equal(getattr(one, field), getattr(other, field)), (name, field)

@@ -10,7 +10,6 @@ from rack.levels.errors import RobotError
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, MOTORS, pendulum
-from tests.tools.command_line import ROOT, rack
 
 POST = '<site name="post" pos="0 0 1"/>'
 TARGET = '<body name="target" mocap="true" pos=".75 0 .7"/>'
@@ -94,20 +93,3 @@ def test_joints_that_share_an_actuator_are_refused_unless_there_is_one_for_each(
     with pytest.raises(RobotError, match="joints elbow, shoulder share one actuator"):
         build_cell(coupled(tmp_path, PAIR, one), SceneConfig(), CLOCK_NS)
     build_cell(coupled(tmp_path, PAIR, one + other), SceneConfig(), CLOCK_NS)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("words", [("check",), ("run", "--lockstep"), ("robot", "check")])
-def test_a_config_that_names_a_coupled_arm_is_refused_by_every_command(
-    tmp_path: Path, words: tuple[str, ...]
-) -> None:
-    example = ROOT / "configs" / "examples" / "own-arm"
-    gear = equality('<joint joint1="elbow" joint2="shoulder"/>')
-    model = (example / "desk-arm.xml").read_text().replace("</mujoco>", f"{gear}</mujoco>")
-    (tmp_path / "desk-arm.xml").write_text(model)
-    config = tmp_path / "coupled-desk-arm.toml"
-    config.write_text((example / "desk-arm.toml").read_text())
-    done = rack(*words, config, folder=tmp_path)
-    assert done.returncode == 2
-    assert "<joint> of 'elbow' and 'shoulder' couples shoulder, elbow," in done.stderr
-    assert "motor of" not in done.stderr

@@ -59,21 +59,7 @@ def test_a_tool_may_be_a_body_and_an_offset(tmp_path: Path) -> None:
     site = built_cell(config(tmp_path))
     ends = [built.start().site_xpos[built.tool] for built in (own, site)]
     assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(0.1)
-
-
-def test_a_tool_that_is_not_there_is_answered_with_sites_and_bodies(tmp_path: Path) -> None:
     with pytest.raises(Exception, match=r"no site 'tcp' in the model; it has: tip; bodies: world"):
         built_cell(config(tmp_path, 'tool = "tcp"'))
-
-
-def test_excluded_bodies_touch_without_a_contact(tmp_path: Path) -> None:
-    home = "home = [0.0, 1.5, 1.2, 0.0, 0.0, 0.0]"
-    with pytest.raises(Exception, match=r"touches .desk.; move home"):
-        built_cell(config(tmp_path, home))
-    pairs = [[name, "world"] for name in ("upper_arm", "forearm", "wrist", "hand", "flange")]
-    assert built_cell(config(tmp_path, f"{home}\nexclude = {pairs}".replace("'", '"')))
-
-
-def test_what_is_guessed_is_a_key_of_the_table(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"'velocities' is no key of \[robot\]"):
         config(tmp_path, 'guessed = ["home", "velocities"]')

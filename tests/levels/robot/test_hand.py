@@ -82,11 +82,6 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
     assert made.touch[geom["index_pad"], geom["stand"]]
 
 
-def test_a_valve_remembers_its_controls_for_as_long_as_it_delays_them() -> None:
-    fine = config("utah_mit")[0].model_copy(update={"substeps": 10})
-    assert build(fine).model.actuator_history[0, 0] == 21
-
-
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [
@@ -125,40 +120,6 @@ def test_a_tendon_that_is_no_half_of_a_pair_is_refused(
 def test_tensions_and_lists_that_do_not_fit_are_refused(what: dict[str, Any], why: str) -> None:
     with pytest.raises(RobotError, match=why):
         build(retold(**what))
-
-
-def test_every_joint_must_be_of_one_finger() -> None:
-    robot = config("utah_mit")[0]
-    assert robot.hand is not None
-    index, middle, *rest = robot.hand.finger
-    for joints, why in (
-        (index.joints[1:], "joint 'index0' must be of one finger; it is of none"),
-        ((*index.joints, "ring0"), "joint 'ring0' must be of one finger; it is of 'index', 'ring'"),
-        ((*index.joints, "index4"), "'index4' of 'index' is not in robot.joints"),
-    ):
-        with pytest.raises(RobotError, match=why):
-            build(retold(finger=(index.model_copy(update={"joints": joints}), middle, *rest)))
-    with pytest.raises(RobotError, match="2 fingers are named 'index'"):
-        build(retold(finger=(index, middle.model_copy(update={"name": "index"}), *rest)))
-
-
-def test_what_the_model_lacks_is_named() -> None:
-    robot = config("utah_mit")[0]
-    assert robot.hand is not None
-    index, *rest = robot.hand.finger
-    for tip, why in (
-        ("nail", "robot.hand.finger.tip: no site 'nail'"),
-        ("palm", "does not move the tip 'palm'"),
-    ):
-        with pytest.raises(RobotError, match=why):
-            build(retold(finger=(index.model_copy(update={"tip": tip}), *rest)))
-    names = ("muscle", *robot.hand.extensors[1:])
-    with pytest.raises(
-        RobotError, match=r"robot\.hand\.extensors: no actuator 'muscle' in the model; it has"
-    ):
-        build(retold(extensors=names))
-    with pytest.raises(RobotError, match="actuator 'index0_flexor' is named 2 times"):
-        build(retold(extensors=("index0_flexor", *robot.hand.extensors[1:])))
 
 
 def test_a_hand_has_neither_gripper_nor_torque_limits_of_its_own() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from rack.levels.errors import RobotError
 from rack.levels.robot.cell import Cell, build_cell
-from tests.levels.arms import CLOCK_NS, cell, four_bar
+from tests.levels.arms import CLOCK_NS, four_bar
 
 
 def built(folder: Path, old: str = "", new: str = "") -> Cell:
@@ -43,15 +43,6 @@ def away(made: Cell, data: mujoco.MjData) -> float:
     return float(np.max(np.abs(posed - data.qpos)[made.gripper.linkage.joints]))
 
 
-def test_geared_finger_follows_over_the_whole_range() -> None:
-    made = cell("puma560")
-    assert made.gripper is not None
-    for opening in (0.0, 0.0123, 0.04):
-        qpos = np.array(made.model.qpos0)
-        made.gripper.linkage.set(qpos, opening)
-        assert qpos[made.model.joint("finger_right").qposadr[0]] == pytest.approx(opening, abs=1e-9)
-
-
 def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> None:
     made = built(tmp_path)
     assert made.gripper is not None
@@ -64,22 +55,6 @@ def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> Non
     equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     assert np.abs(data.efc_pos[equality]).max() < 1e-5
     assert away(made, settled(made, -1.0)) < 1e-3
-
-
-def test_joint_on_a_spring_is_posed_at_its_stop(tmp_path: Path) -> None:
-    # Without its loop the left tip has a spring that presses it outwards against a stop, as
-    # underactuated fingers have.
-    robot, scene = four_bar(tmp_path)
-    arm = tmp_path / "puma560.xml"
-    text = arm.read_text().replace('name="loop_left"', 'name="loop_left" active="false"')
-    spring = '<joint name="tip_left" range="-10 20" stiffness=".5" springref="40" '
-    text = text.replace('<joint name="rod_left" ', '<joint name="rod_left" stiffness=".1" ')
-    arm.write_text(text.replace('<joint name="tip_left" ', spring))
-    made = build_cell(robot, scene, CLOCK_NS)
-    assert made.gripper is not None
-    qpos = np.array(made.model.qpos0)
-    made.gripper.linkage.set(qpos, 0.3)
-    assert qpos[made.model.joint("tip_left").qposadr[0]] == pytest.approx(np.deg2rad(20), abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -55,8 +55,9 @@ def places(arm: SimulatedArm) -> np.ndarray:
     return np.array(arm._data.qpos[rows])
 
 
-def test_objects_sleep_and_the_arm_does_not_until_one_is_pushed() -> None:
-    arm = arm_of()
+def test_objects_sleep_until_one_is_pushed_and_end_where_they_would_without_sleep() -> None:
+    arm, other = arm_of(), arm_of(Sleepless)
+    start = places(arm)
     assert asleep(arm) == [False] * 4
     arm.step(PUSHED_TICK)
     assert asleep(arm) == [False, True, True, True]
@@ -64,13 +65,7 @@ def test_objects_sleep_and_the_arm_does_not_until_one_is_pushed() -> None:
     assert asleep(arm) == [False, False, True, True]
     arm.step(END_TICK - PUSHED_TICK - 1)
     assert asleep(arm) == [False, True, True, True]
-
-
-def test_objects_end_where_they_would_without_sleep() -> None:
-    arm, other = arm_of(), arm_of(Sleepless)
-    start = places(arm)
-    for each in (arm, other):
-        each.step(END_TICK)
+    other.step(END_TICK)
     assert asleep(other) == [False] * 4
     assert np.abs(places(arm) - start).max() > 0.08
     assert places(arm) == pytest.approx(places(other), abs=0.005)

@@ -73,7 +73,6 @@ class JointRig:
         return cast(Message, self.rack.tasks["arm"].write.status)
 
     def run(self, ticks: int) -> None:
-        """Run `ticks` ticks."""
         for _ in range(ticks):
             arm = self.arm
             self.rack.step()

@@ -31,7 +31,6 @@ class Course(NamedTuple):
     duration_s: float
 
     def at(self, time_s: float) -> tuple[Array, Array]:
-        """Return position and velocity."""
         u = min(max(time_s / self.duration_s, 0.0), 1.0)
         way = self.goal - self.start
         return self.start + way * u**3 * (10 - 15 * u + 6 * u * u), way * 30 * u * u * (
@@ -85,7 +84,6 @@ class ServoRig:
         return cast(Message, self.rack.tasks["servo"].write.state)
 
     def set_point(self, position: Array, velocity: Array, due: int) -> None:
-        """Send one set point."""
         self.command.id += 1
         self.command.position, self.command.velocity, self.command.due = position, velocity, due
         self.rack.write("primitive.command", self.command)
@@ -139,7 +137,6 @@ class ServoRig:
         return [finding.alarm for _, finding in self.found if finding.alarm not in but]
 
     def miss(self, ticks: int) -> None:
-        """Let the executor miss its next `ticks` cycles."""
         self.rack.tasks["servo"].due += ticks
 
     def stop_planner(self) -> None:

@@ -40,7 +40,6 @@ class Dash:
         return round((APPROACH_S + self.speed / self._hardest) / TICK_S) + 4
 
     def at(self, time_s: float) -> tuple[Array, Array]:
-        """Return position and velocity."""
         u = min(max(time_s / APPROACH_S, 0.0), 1.0)
         way = self._start - self._home
         position = self._home + way * u**3 * (10 - 15 * u + 6 * u * u)
@@ -80,7 +79,7 @@ def found(rig: ServoRig) -> list[int]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "joint", "side"),
-    [("puma560", joint, (-1.0) ** joint) for joint in range(6)] + [("k1607", 3, 1.0)],
+    [("puma560", 0, 1.0), ("puma560", 1, -1.0), ("puma560", 4, 1.0), ("k1607", 3, 1.0)],
 )
 def test_a_motor_off_at_top_speed_is_found_in_five_cycles_and_breaks_no_limit(
     name: str, joint: int, side: float
@@ -92,22 +91,6 @@ def test_a_motor_off_at_top_speed_is_found_in_five_cycles_and_breaks_no_limit(
     assert (rig.status.stopped, rig.status.braked) == (1, 1)
     assert (rig.status.violations, rig.servo.arm.first_violation) == (0, "")
     assert rig.status.reason.startswith("motor of '")
-
-
-@pytest.mark.parametrize(
-    ("kind", "parameters"),
-    [("actuator-off", {"joint": 1}), ("actuator-saturated", {"joint": 1, "part": 0.05})],
-)
-def test_a_shoulder_that_loses_its_torque_at_rest_hardly_falls(
-    kind: str, parameters: dict[str, float]
-) -> None:
-    rig = ServoRig(*config("puma560"))
-    rig.run(200)
-    home = rig.status.position.copy()
-    rig.inject(kind, **parameters)
-    rig.run(150)
-    assert found(rig)[0] - rig.acted[0] <= 5
-    assert np.abs(rig.servo.arm.sense().position - home).max() < 0.01
 
 
 @pytest.mark.slow
@@ -138,47 +121,6 @@ def test_an_arm_whose_motor_can_carry_the_ramp_may_do_without_the_brakes(
     assert len(found(rig)) == 1
     assert (rig.status.stopped, rig.status.braked) == (1, braked)
     assert np.abs(rig.status.velocity).max() < 0.01
-    assert rig.status.violations == 0
-
-
-def test_an_arm_that_falls_while_it_is_to_ramp_to_rest_is_braked() -> None:
-    rig, dash = dashing("k1607", 0, 1.0, on_actuator_fault="stop")
-    rig.inject("actuator-saturated", joint=3, part=0.05)
-    rig.run(6, dash.at)
-    assert (rig.status.stopped, rig.status.braked) == (1, 0)
-    rig.run(150, dash.at)
-    assert (rig.status.violations, rig.status.stopped, rig.status.braked) == (0, 1, 1)
-
-
-def test_a_motor_that_is_asked_for_nothing_is_not_missed() -> None:
-    rig = ServoRig(*config("puma560"))
-    rig.run(200)
-    rig.inject("actuator-off", joint=0)
-    rig.run(200)
-    assert (rig.acted, rig.found) == ([], [])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "cycles"), [("command-nan", 120), ("command-limit", 1)])
-def test_a_corrupted_torque_is_found_in_its_cycle_and_the_arm_braked_until_torques_are_valid(
-    kind: str, cycles: int
-) -> None:
-    rig, dash = dashing("puma560", 0, 1.0)
-    parameters = {"factor": 5.0} if kind == "command-limit" else {}
-    begun = rig.inject(kind, joint=0, **parameters)
-    rig.run(cycles, dash.at)
-    alarm = Alarm.COMMAND_INVALID if kind == "command-nan" else Alarm.COMMAND_LIMIT
-    assert [(f.tick, f.finding.alarm) for f in rig.found if f.finding.alarm is alarm] == [
-        (begun, alarm)
-    ]
-    assert (rig.status.stopped, rig.status.braked) == (1, 1)
-    assert not rig.status.torque.any()
-    rig.heal()
-    rig.run(1, dash.at)
-    assert (rig.status.stopped, rig.status.braked) == (0, 0)
-    goal = dash.at(60.0)
-    rig.run(1600, lambda _: goal)
-    assert rig.status.position == pytest.approx(goal[0], abs=1e-3)
     assert rig.status.violations == 0
 
 
@@ -244,18 +186,3 @@ def test_a_motor_that_lacks_more_than_a_contact_takes_is_found_while_a_part_pres
     much = (MAX_CONTACT_PART + 0.01) * CELL.bounds.torque[1]
     found = bench.leave(SURE_CYCLES, j2=much, j3=-9.8, j5=0.4)
     assert [finding.subject for finding in found] == [1]
-
-
-def test_a_wrist_that_lacks_torque_is_found_again_once_nothing_presses() -> None:
-    bench = Bench()
-    bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1)
-    bench.leave(1)
-    found = [bench.leave(1, j5=2.0 + cycle) for cycle in range(SURE_CYCLES)]
-    assert [finding.subject for finding in found[-1]] == [4]
-
-
-def test_a_part_that_presses_a_little_more_in_every_cycle_is_no_motor_at_fault() -> None:
-    # Dry friction hides the push at all joints but one.
-    bench = Bench()
-    for cycle in range(100):
-        assert bench.leave(1, holds=True, j5=0.41 + 0.03 * min(cycle, 30)) == []

@@ -10,7 +10,6 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
-from rack.backplane.words import Demand
 from rack.boards.config import load
 from rack.levels.arm import DriveState, Sensed, SimulatedArm
 from rack.levels.messages import Error
@@ -20,7 +19,7 @@ from rack.levels.servo import ServoExecutor
 from rack.levels.tables import SceneConfig
 from tests.levels.arm.test_own_arm import GOAL, START, IdealArm
 from tests.levels.arms import pendulum
-from tests.levels.lockstep import Lockstep, Operator
+from tests.levels.lockstep import Operator
 from tests.levels.servo.rig import Course, ServoRig
 from tests.levels.whole_rack import WholeRack
 
@@ -51,20 +50,6 @@ class StatefulArm(IdealArm):
         super().step(ticks)
         if self.state is DriveState.ENABLING and self.tick >= self._ready_at:
             self.state = DriveState.ENABLED
-
-
-class SlowArm(StatefulArm):
-    """Its drives take some ticks to be disabled, too."""
-
-    left_at = -1
-
-    def disable(self) -> None:
-        self.left_at = self.tick + self.ticks
-
-    def step(self, ticks: int) -> None:
-        super().step(ticks)
-        if self.tick == self.left_at:
-            self.state = DriveState.DISABLED
 
 
 class OffArm(IdealArm):
@@ -189,65 +174,6 @@ def test_bring_up_slows_the_operators_set_points_until_released_and_after_a_rest
     assert (0.1 * limits < fastest).any()
 
 
-def test_an_arm_enabled_under_a_demand_is_enabled_and_waits_for_its_end(tmp_path: Path) -> None:
-    servo = rig(tmp_path)
-    servo.rack.demand = Demand.BRAKE
-    Operator(servo.rack).say("servo", Operation.ENABLE)
-    servo.run(50)
-    assert servo.status.reason.startswith("demand 'brake' on the arm")
-    assert (servo.status.error, servo.state.error, servo.status.braked) == (0, 0, 1)
-    servo.rack.demand = Demand.NONE
-    servo.run(5)
-    assert not servo.status.braked
-
-
-def test_an_arm_is_braked_at_once_when_its_operator_disables_it_however_long_its_drives_take(
-    tmp_path: Path,
-) -> None:
-    servo = rig(tmp_path, "SlowArm")
-    operator = Operator(servo.rack)
-    for _ in range(2):
-        operator.say("servo", Operation.ENABLE)
-        servo.run(50)
-        assert (servo.status.braked, servo.status.answer) == (0, Answer.DONE)
-        operator.say("servo", Operation.DISABLE)
-        servo.run(3)
-        assert servo.servo.arm.state is DriveState.ENABLED
-        assert (servo.status.braked, servo.status.error) == (1, Error.DISABLED)
-        servo.run(10)
-        assert servo.servo.arm.state is DriveState.DISABLED
-
-
-def test_a_reset_without_a_fault_leaves_the_arm_enabled(tmp_path: Path) -> None:
-    servo = rig(tmp_path)
-    operator = Operator(servo.rack)
-    for what in (Operation.ENABLE, Operation.RESET, Operation.ENABLE):
-        operator.say("servo", what)
-        servo.run(20)
-        assert (servo.status.answer, servo.status.braked) == (Answer.DONE, 0)
-
-
-def test_an_operators_way_back_ends_where_the_arm_was_enabled_again(tmp_path: Path) -> None:
-    servo = rig(tmp_path, "IdealArm", enable="at-start")
-    operator = Operator(servo.rack)
-    operator.say("servo", Operation.SETPOINT, joints=(0.4, 0.2))
-    servo.run(300)
-    operator.say("servo", Operation.HOLD)
-    servo.run(20)
-    operator.say("servo", Operation.DISABLE)
-    servo.run(20)
-    arm = servo.servo.arm
-    assert isinstance(arm, IdealArm)
-    arm._q += 0.3  # by hand
-    operator.say("servo", Operation.ENABLE)
-    servo.run(20)
-    before = servo.status.position.copy()
-    operator.say("servo", Operation.RESUME)
-    servo.run(300)
-    assert servo.status.answer == Answer.DONE
-    assert np.abs(servo.status.position - before).max() < 1e-3
-
-
 @pytest.mark.parametrize("latency_ticks", [0, 2])
 def test_offsets_make_positions_of_what_the_drives_give(tmp_path: Path, latency_ticks: int) -> None:
     calibration = {"offset": (0.1, -0.2)}
@@ -309,49 +235,3 @@ def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
     assert rack.run_to_end(30.0).state == State.DONE
     status = rack.read("servo.status")
     assert (status.touches, status.violations) == (0, 0)
-
-
-@pytest.mark.thorough
-def test_an_arm_moved_by_hand_in_the_middle_of_a_path_goes_on_to_its_end() -> None:
-    rack, operator, arm = whole()
-    rack.run(20.0, lambda rack: rack.read("primitive.status").progress > 0.5)
-    operator.say("servo", Operation.DISABLE)
-    rack.run(5.0)
-    assert rack.task.state == State.HOLDING
-    arm._data.qpos[arm.cell.qpos[0]] += 0.3
-    arm._refresh()
-    arm._brake.hold_at(arm._state[0])
-    rack.run(0.1)
-    operator.say("servo", Operation.ENABLE)
-    assert rack.run_to_end(30.0).state == State.DONE
-    assert rack.read("servo.status").touches == 0
-
-
-@pytest.mark.slow
-def test_a_fault_of_the_drives_that_nobody_resets_is_the_tasks() -> None:
-    rack, _, arm = whole()
-    rack.run(20.0, lambda rack: rack.read("primitive.status").progress > 0.5)
-    arm.fault, arm.state = "j2: encoder lost", DriveState.FAULT
-    task = rack.run_to_end(20.0)
-    assert (task.state, task.error) == (State.ERROR, Error.STALLED)
-    assert "waiting for servo: drives: j2: encoder lost" in task.reason
-
-
-@pytest.mark.slow
-def test_planned_motion_is_slow_until_the_release() -> None:
-    rack, operator, arm = whole(bring_up=0.2)
-    limits = arm.cell.limits.velocity
-    fastest = np.zeros(len(limits))
-
-    def look(rack: Lockstep) -> bool:
-        np.maximum(fastest, np.abs(arm._state[1]), out=fastest)
-        return bool(rack.read("task.status").action)
-
-    assert rack.run(60.0, look)
-    assert rack.read("servo.status").slowed
-    assert 0.1 < (fastest / limits).max() <= 0.2
-    operator.say("servo", Operation.RELEASE)
-    fastest[:] = 0.0
-    rack.run(30.0, lambda rack: look(rack) and rack.read("task.status").state == State.DONE)
-    assert rack.task.state == State.DONE
-    assert (fastest / limits).max() > 0.25

@@ -10,17 +10,14 @@ import pytest
 
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array
-from rack.levels.arm import Arm, Sensed, SimulatedArm
+from rack.levels.arm import Arm, SimulatedArm
 from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell, sensed_by
 from rack.levels.servo.sensor_monitor import tolerance
 from rack.levels.tables import RobotConfig, SceneConfig, SensorConfig
-from tests.levels.arm.test_own_arm import IdealArm
 from tests.levels.arms import CLOCK_NS, config, pendulum
 from tests.levels.servo.rig import Course, ServoRig
-from tests.levels.whole_rack import WholeRack
 
 GOAL = np.array([0.6, 1.0, -2.6, 0.4, -1.2, 0.5])
 BRAKES = (Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED)
@@ -49,9 +46,7 @@ def test_samples_are_steps_of_the_resolution_a_joint_and_brakes_and_gate_see_the
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("resolution", "noise"), [(1e-5, 0.0), (1e-5, 1e-4), (1e-3, 0.0), (1e-3, 1e-4)]
-)
+@pytest.mark.parametrize(("resolution", "noise"), [(1e-5, 1e-4), (1e-3, 0.0), (1e-3, 1e-4)])
 def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(
     resolution: float, noise: float
 ) -> None:
@@ -60,29 +55,6 @@ def test_a_move_with_coarse_encoders_reaches_its_goal_without_a_finding(
     rig.run(1000, move().at)
     assert rig.alarms(*BRAKES) == []
     assert rig.servo.arm._state[0] == pytest.approx(GOAL, abs=2e-3)  # type: ignore[attr-defined]
-
-
-@pytest.mark.timeout(200)
-def test_nasrem_grasps_with_encoders_of_1_mrad_and_nothing_is_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    from tests.levels import whole_rack
-
-    load = whole_rack.load
-    monkeypatch.setattr(
-        whole_rack,
-        "load",
-        lambda name: (lambda c: c.model_copy(update={"robot": coarse(c.robot, 1e-3)}))(load(name)),
-    )
-    rack = WholeRack("nasrem")
-    servo = rack.tasks["servo"].level
-    found: list[Alarm] = []
-    while rack.seconds < 20.0 and rack.move.held < 0:
-        rack.run(0.25)
-        found += [f.alarm for f in servo.findings if f.alarm not in BRAKES]  # type: ignore[union-attr]
-        servo.findings.clear()  # type: ignore[union-attr]
-    assert (rack.move.held >= 0, found) == (True, [])
-    assert (rack.read("servo.status").violations, rack.read("servo.status").touches) == (0, 0)
 
 
 @pytest.mark.slow
@@ -108,49 +80,17 @@ def test_a_fault_of_a_coarse_sensor_is_not_taken_for_one_of_a_motor(
     assert (rig.status.state, rig.status.error) == (State.ERROR, error)
 
 
-def test_a_list_of_another_length_is_refused_with_both_numbers(tmp_path: Path) -> None:
-    robot = pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1)))
-    with pytest.raises(
-        RobotError,
-        match=r"robot.sensors.noise: 3 values; permitted: one for all joints, or 2, one per joint",
-    ):
-        build_cell(robot, config("puma560")[1], CLOCK_NS)
-
-
-class JitteryArm(IdealArm):
-    """Takes its samples up to 0.1 ms early or late, as a bus does that is not synchronized."""
-
-    def sense(self) -> Sensed:
-        sample = super().sense()
-        by_s = np.random.default_rng(self.tick).uniform(-1e-4, 1e-4, 2)
-        return sample._replace(position=sample.position + by_s * sample.velocity)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sensors", "brakes"), [({"resolution": 0.0}, True), (None, False)])
-def test_by_default_an_arm_of_ones_own_may_be_sampled_early_or_late(
-    tmp_path: Path, sensors: dict[str, float] | None, brakes: bool
-) -> None:
-    robot = pendulum(tmp_path, sensors=sensors)
-    rig = ServoRig(robot, SceneConfig(), arm=f"{__name__}:JitteryArm")
-    ends = np.array([0.0, 0.5]), np.array([0.7, -1.4])
-
-    def back_and_forth(time_s: float) -> tuple[Array, Array]:
-        turn = int(time_s / 1.5)
-        start, goal = ends[::-1] if turn % 2 else ends
-        return Course(start, goal, 1.4).at(time_s - 1.5 * turn)
-
-    rig.run(1800, back_and_forth)  # 4.5 s
-    assert np.abs(rig.servo.arm._qd).max() < 3.0  # type: ignore[attr-defined]
-    closed = rig.alarms().count(Alarm.BRAKES_CLOSED)
-    assert (closed > 0) == brakes
-    assert (Alarm.SENSOR_MODEL in rig.alarms()) == brakes
-
-
 def test_the_monitor_says_what_it_stands(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     exact = tolerance(cell)
+    with pytest.raises(
+        RobotError,
+        match=r"robot.sensors.noise: 3 values; permitted: one for all joints, or 2, one per joint",
+    ):
+        build_cell(
+            pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1))), SceneConfig(), CLOCK_NS
+        )
     own = tolerance(sensed_by(cell, robot, Arm.sensors))
     assert exact.position.tolist() == [2.5e-5, 2.5e-5]
     assert own.position == pytest.approx([3.75e-4, 3.75e-4])

@@ -9,11 +9,11 @@ import pytest
 
 from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.errors import LevelError
 from rack.levels.messages import Error
 from rack.levels.robot.dynamics import Dynamics
+from rack.levels.servo.curves import Bridge, Curve
 from rack.levels.tables import SceneConfig
-from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config, pendulum
+from tests.levels.arms import ROBOTS, cell, config
 from tests.levels.servo.rig import PERIOD, TICK_S, Course, ServoRig
 
 GOALS = {
@@ -35,6 +35,13 @@ def steps_of(values: list[Array]) -> Array:
     return np.asarray(np.diff(np.array(values), n=2, axis=0)) / TICK_S**2
 
 
+def test_a_bridge_needs_most_acceleration_at_its_ends() -> None:
+    rest = Curve(np.zeros(2), duration_s=1.0)
+    bridge = Bridge(rest, 0.5, (np.array([1.0, 0.0]), np.zeros(2)), duration_s=1.0)
+    assert bridge.at(0.5).position == pytest.approx([0.5, 0.0])
+    assert [bridge.is_within(np.full(2, most)) for most in (5.9, 6.1)] == [False, True]
+
+
 @pytest.mark.parametrize("name", GOALS)
 def test_a_two_second_move_is_followed_within_a_third_of_a_milliradian(name: str) -> None:
     rig, move = rig_of(name), course(name)
@@ -46,26 +53,6 @@ def test_a_two_second_move_is_followed_within_a_third_of_a_milliradian(name: str
     assert np.abs(steps_of(rig.targets)).max() < 4.0
     assert rig.status.state == State.EXECUTING
     assert (rig.status.clipped, rig.status.touches, rig.status.error) == (0, 0, Error.NONE)
-
-
-@pytest.mark.slow
-def test_the_planned_inertia_follows_the_arm_and_a_higher_bandwidth_follows_more_closely() -> None:
-    move, worst = course("puma560"), []
-    for bandwidth in (15.0, 60.0):
-        rig = rig_of("puma560", bandwidth=bandwidth)
-        rig.run(850, move.at)
-        worst.append(np.abs(rig.errors(move.at)).max())
-    assert worst[1] < 0.6 * worst[0]
-    at_goal = Dynamics(cell("puma560")).terms(move.goal, np.zeros(6)).inertia
-    assert rig.rack.read("servo.plan").inertia == pytest.approx(at_goal, abs=1e-9)
-
-
-def test_without_a_planner_the_executor_uses_the_inertia_where_the_arm_is() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.stop_planner()
-    rig.run(850, move.at)
-    assert not rig.rack.read("servo.plan").inertia.any()
-    assert np.abs(rig.errors(move.at)).max() < 0.33e-3
 
 
 def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_limits() -> None:
@@ -82,33 +69,6 @@ def test_when_set_points_stop_the_motion_ramps_to_rest_within_the_acceleration_l
     assert rig.status.clipped == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("late", [1, 10 * PERIOD])
-def test_a_late_set_point_costs_no_jump(late: int) -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.run(400, move.at)
-    rig.run(late)
-    skipped = -rig.rack.tick % PERIOD
-    rig.run(skipped)
-    rig.run(500, move.at)
-    limits = np.array(config("puma560")[0].acceleration)
-    assert (np.abs(steps_of(rig.targets)) <= 2.2 * limits).all()
-    assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("missed", [1, 200])
-def test_missed_cycles_do_not_stretch_simulated_time_nor_break_the_motion(missed: int) -> None:
-    rig, move = rig_of("puma560"), course("puma560", 3.0)
-    rig.run(500, move.at)
-    rig.miss(missed)
-    rig.run(1000, move.at)
-    assert rig.state.tick == rig.rack.tick - 1
-    assert rig.state.state[0] == rig.state.tick * CLOCK_NS * 1e-9
-    assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
-    assert rig.status.touches == 0
-
-
 def test_a_restarted_servo_finds_the_arm_where_it_was() -> None:
     rig, move = rig_of("puma560"), course("puma560")
     rig.run(400, move.at)
@@ -122,33 +82,18 @@ def test_a_restarted_servo_finds_the_arm_where_it_was() -> None:
     assert rig.state.tick == rig.rack.tick - 1
 
 
-def test_a_restart_in_a_long_silence_finds_the_arm_braked() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.run(400, move.at)
-    rig.miss(10_000)
-    for _ in range(400):
-        rig.rack.step()
-    rig.rack.restart("servo")
-    rig.rack.step()
-    assert np.abs(rig.status.velocity).max() < 0.01
-    rig.run(100)
-    assert rig.status.holding == 1
-    assert np.abs(rig.status.position - rig.status.target).max() < 1e-3
-
-
 def garbage(kind: str, home: Array) -> tuple[Array, Array]:
     still = np.zeros_like(home)
     return {
         "nan": (home * np.nan, still),
         "nan velocity": (home, still * np.nan),
-        "infinite": (home + np.inf, still),
         "far": (home + 100.0, still),
         "fast": (home, still + 1e6),
         "jump": (home + 0.4, still),
     }[kind]
 
 
-@pytest.mark.parametrize("kind", ["nan", "nan velocity", "infinite", "far", "fast", "jump"])
+@pytest.mark.parametrize("kind", ["nan", "nan velocity", "far", "fast", "jump"])
 def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> None:
     (robot, _), rig = config("puma560"), rig_of("puma560")
     wrong = garbage(kind, np.array(robot.home))
@@ -158,16 +103,11 @@ def test_a_broken_set_point_neither_breaks_a_limit_nor_the_arm(kind: str) -> Non
         assert np.isfinite(rig.status.position).all()
     assert rig.status.error in (Error.NONE, Error.TOUCHED)  # "far" leads into the table
     assert kind == "jump" or rig.status.clipped > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["nan", "fast"])
-def test_after_broken_set_points_good_ones_are_followed_again(kind: str) -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    wrong = garbage(kind, move.start)
-    rig.run(10 * PERIOD, lambda _: wrong)
-    rig.run(1600, lambda _: (move.goal, np.zeros(6)))
-    assert rig.status.position == pytest.approx(move.goal, abs=1e-3)
+    if kind in ("nan", "fast"):
+        # Good ones are followed again.
+        goal = course("puma560").goal
+        rig.run(1600, lambda _: (goal, np.zeros(6)))
+        assert rig.status.position == pytest.approx(goal, abs=1e-3)
 
 
 def test_a_set_point_due_in_the_far_future_is_refused() -> None:
@@ -177,55 +117,6 @@ def test_a_set_point_due_in_the_far_future_is_refused() -> None:
     rig.run(20)
     assert rig.status.holding == 1
     assert rig.status.clipped == 20
-
-
-def test_a_scene_is_filled_in_the_cycle_before_those_of_its_readers() -> None:
-    rig, move = rig_of("puma560"), course("puma560")
-    rig.run(100, move.at)
-    seen, filled = rig.rack.tasks["servo"].write.scene.tool_position.copy(), []
-    for _ in range(4 * PERIOD):
-        rig.run(1, move.at)
-        if not np.array_equal(seen, scene := rig.rack.tasks["servo"].write.scene.tool_position):
-            seen = scene.copy()
-            filled.append(rig.rack.tick)  # the tick at which it is visible
-    assert len(filled) == 4
-    assert all(tick % PERIOD == 0 for tick in filled)
-
-
-def test_an_unknown_parameter_is_refused_with_the_valid_ones() -> None:
-    with pytest.raises(LevelError, match=r"params.bandwith = 3: .*; keys: bandwidth, damping"):
-        rig_of("puma560", bandwith=3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "drives",
-    [
-        (
-            '<motor joint="shoulder" gear="20" ctrlrange="-2 2"/><motor joint="elbow"'
-            ' ctrlrange="-20 20"/>'
-        ),
-        (
-            '<position joint="shoulder" kp="900" kv="9" forcerange="-40 40"/>'
-            '<position joint="elbow" kp="90" forcerange="-20 20"/>'
-        ),
-        (
-            '<general joint="shoulder" dyntype="filter" dynprm=".1" gainprm="9" forcerange="-40'
-            ' 40"/><velocity joint="elbow" kv="4" forcerange="-20 20"/>'
-        ),
-    ],
-)
-def test_a_foreign_arm_follows_by_its_config_alone(tmp_path: Path, drives: str) -> None:
-    robot = pendulum(tmp_path, drives)
-    rig, move = (
-        ServoRig(robot, SceneConfig()),
-        Course(np.array(robot.home), np.array([-0.5, 1.2]), 1.5),
-    )
-    rig.run(200)
-    assert rig.status.position == pytest.approx(robot.home, abs=1e-4)
-    rig = ServoRig(robot, SceneConfig())
-    rig.run(700, move.at)
-    assert np.abs(rig.errors(move.at)).max() < 0.33e-3
 
 
 WEIGHT = """
@@ -262,11 +153,7 @@ def test_the_held_object_is_in_the_plan_and_does_not_pull_the_arm_down(grasping:
     load = Dynamics(cell("puma560"))
     bare = load.terms(home, np.zeros(6)).bias.copy()
     assert grasping.status.torque[1] - bare[1] == pytest.approx(1.5 * 9.81 * 0.5, rel=0.05)
-
-
-def test_a_restart_does_not_drop_the_held_object(grasping: ServoRig) -> None:
-    home = np.array(config("puma560")[0].home)
-    grasping.run(100, lambda _: (home, np.zeros(6)))
+    # A restart does not drop it.
     grasping.miss(10_000)
     for _ in range(100):
         grasping.rack.step()
@@ -275,18 +162,3 @@ def test_a_restart_does_not_drop_the_held_object(grasping: ServoRig) -> None:
     scene = grasping.rack.read("servo.scene")
     assert scene.position[0] == pytest.approx(scene.tool_position, abs=0.01)
     assert grasping.status.touches == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("early", [3, PERIOD - 1])
-def test_set_points_that_come_early_wait_for_their_turn(early: int) -> None:
-    move, targets = course("puma560"), []
-    for ahead in (0, early):
-        rig = rig_of("puma560")
-        for _ in range(700):
-            if (rig.rack.tick + ahead) % PERIOD == 0:
-                due = rig.rack.tick + ahead + PERIOD
-                rig.set_point(*move.at(due * TICK_S - 0.1), due)
-            rig.run(1)
-        targets.append(np.array(rig.targets))
-    assert np.abs(targets[0] - targets[1]).max() < 1e-12

@@ -18,7 +18,7 @@ from rack.levels.systems.joint_boards.arm_executor import JointTorques
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads
 from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_TORQUE
 from tests.levels.arms import cell, config
-from tests.levels.servo.joint_rig import CLOCK_NS, JOINTS, JointRig
+from tests.levels.servo.joint_rig import CLOCK_NS, JOINTS
 
 SIZES = {"joints": len(JOINTS)}
 TICK = 100
@@ -78,17 +78,6 @@ def test_loads_of_an_arm_that_holds_are_computed_where_it_is_and_again_only_far_
     assert np.array_equal(loads.table, at_home)
     loads.hold(puma.home + 0.02)
     assert not np.array_equal(loads.table, at_home)
-
-
-def test_an_arm_that_holds_a_part_carries_it() -> None:
-    puma = cell("puma560")
-    empty, loaded = JointLoads(puma), JointLoads(puma)
-    message = reference(due=20, inertia=1.0, load=0.0)
-    message.payload_mass = 2.0
-    loaded.take(message, tick=0)
-    for loads in (empty, loaded):
-        loads.hold(puma.home)
-    assert np.abs(loaded.table[1] - empty.table[1]).max() > 1.0
 
 
 @pytest.mark.parametrize(
@@ -164,15 +153,3 @@ def test_a_torque_that_must_not_move_the_arm_is_named(case: str) -> None:
     read = readings(torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0))
     spoil(read)
     assert joint_torques().missing(read, TICK, since) == reason
-
-
-def test_the_board_of_the_gripper_closes_it_and_keeps_it_closed_after_a_restart() -> None:
-    rig = JointRig()
-    rig.run(100)
-    rig.swing.opening = 0.0
-    rig.run(400)
-    closed = rig.status.opening
-    assert closed < 0.001
-    rig.rack.lose("servo", ticks=20)
-    rig.run(200)
-    assert abs(rig.status.opening - closed) < 1e-4

@@ -1,12 +1,14 @@
-"""The servo level under an operator: it holds, goes to set points within its limits, and comes back
-the way it went."""
+"""The servo level under an operator: it holds, goes to set points within its limits and
+back, takes gains and control modifications."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
-from rack.backplane.words import Demand
+from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.operator import Answer, Operation
 from tests.levels.arms import cell, config
@@ -17,7 +19,9 @@ HOME = cell("puma560").home
 LIMITS = cell("puma560").limits
 AWAY = HOME + np.array([0.3, -0.2, 0.2, 0.1, -0.2, 0.3])
 COURSE = Course(HOME, HOME + 0.5 * np.array([1.0, -0.4, 0.4, 0.5, 0.5, 1.0]), 2.0)
+QUICK = COURSE._replace(duration_s=0.6)
 SECOND = round(1.0 / TICK_S)
+PD = {"class": "rack.levels.servo.common_modifications:JointPd"}
 
 
 @pytest.fixture
@@ -26,10 +30,11 @@ def rig() -> ServoRig:
 
 
 @pytest.mark.slow
-def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None:
+def test_a_hold_ramps_to_rest_and_ignores_the_level_above_until_resume(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     assert np.abs(rig.status.target_velocity).max() > 0.1
-    serial = Operator(rig.rack).say("servo", Operation.HOLD)
+    operator = Operator(rig.rack)
+    serial = operator.say("servo", Operation.HOLD)
     rig.run(1, COURSE.at)
     assert (rig.status.order, rig.status.operator, rig.status.answer) == (
         serial,
@@ -43,43 +48,22 @@ def test_a_hold_ramps_to_rest_and_ignores_the_level_above(rig: ServoRig) -> None
     assert (rig.status.holding, rig.status.stopped, rig.status.braked) == (1, 1, 0)
     assert np.abs(rig.status.position - held).max() < 1e-4
     assert_within_limits(np.array(rig.targets[SECOND:]))
-
-
-@pytest.mark.slow
-def test_after_a_hold_set_points_are_followed_again(rig: ServoRig) -> None:
-    operator = Operator(rig.rack)
-    rig.run(SECOND, COURSE.at)
-    operator.say("servo", Operation.HOLD)
-    rig.run(SECOND // 2, COURSE.at)
     serial = operator.say("servo", Operation.RESUME)
     rig.run(3 * SECOND, COURSE.at)
-    assert (rig.status.order, rig.status.answer, rig.status.standing) == (
-        serial,
-        Answer.DONE,
-        Operation.NONE,
-    )
-    assert (rig.status.holding, rig.status.stopped) == (0, 0)
+    assert (rig.status.order, rig.status.answer) == (serial, Answer.DONE)
+    assert (rig.status.holding, rig.status.stopped, rig.status.standing) == (0, 0, Operation.NONE)
     assert np.abs(rig.status.position - COURSE.goal).max() < 1e-3
-
-
-@pytest.mark.slow
-def test_a_set_point_is_reached_within_the_limits_of_every_joint(rig: ServoRig) -> None:
-    rig.run(SECOND // 2)
-    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
-    rig.run(1)
-    assert rig.status.answer == Answer.TAKEN
-    rig.run(3 * SECOND)
-    assert rig.status.answer == Answer.DONE
-    assert np.array_equal(rig.status.target, AWAY)
-    assert np.abs(rig.status.position - AWAY).max() < 1e-3
-    assert_within_limits(np.array(rig.targets))
 
 
 @pytest.mark.slow
 def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
     rig.run(SECOND, COURSE.at)
     Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
+    rig.run(1, COURSE.at)
+    assert rig.status.answer == Answer.TAKEN
     rig.run(3 * SECOND, COURSE.at)
+    assert rig.status.answer == Answer.DONE
+    assert np.array_equal(rig.status.target, AWAY)
     assert np.abs(rig.status.position - AWAY).max() < 1e-3
     assert_within_limits(np.array(rig.targets[SECOND:]))
 
@@ -88,6 +72,14 @@ def test_a_set_point_under_way_begins_with_rest(rig: ServoRig) -> None:
 def test_from_its_set_points_the_arm_returns_the_same_way(rig: ServoRig) -> None:
     operator = Operator(rig.rack)
     rig.run(SECOND // 2)
+    # A hold on the way stops there.
+    operator.say("servo", Operation.SETPOINT, AWAY)
+    rig.run(SECOND // 4)
+    operator.say("servo", Operation.HOLD)
+    rig.run(SECOND)
+    assert rig.status.answer == Answer.DONE
+    assert 0.01 < np.abs(rig.status.target - HOME).max() < np.abs(AWAY - HOME).max() - 0.01
+    assert_within_limits(np.array(rig.targets))
     second = AWAY + 0.1
     for goal in (AWAY, second):
         operator.say("servo", Operation.SETPOINT, goal)
@@ -106,18 +98,6 @@ def test_from_its_set_points_the_arm_returns_the_same_way(rig: ServoRig) -> None
     assert min(np.abs(target - AWAY).max() for target in rig.targets[began:]) < 1e-9
 
 
-def test_a_hold_on_the_way_to_a_set_point_stops_there(rig: ServoRig) -> None:
-    operator = Operator(rig.rack)
-    rig.run(SECOND // 2)
-    operator.say("servo", Operation.SETPOINT, AWAY)
-    rig.run(SECOND // 4)
-    operator.say("servo", Operation.HOLD)
-    rig.run(SECOND)
-    assert rig.status.answer == Answer.DONE
-    assert 0.01 < np.abs(rig.status.target - HOME).max() < np.abs(AWAY - HOME).max() - 0.01
-    assert_within_limits(np.array(rig.targets))
-
-
 def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force(
     rig: ServoRig,
 ) -> None:
@@ -134,27 +114,97 @@ def test_a_set_point_out_of_range_is_refused_and_the_last_command_stays_in_force
 
 
 @pytest.mark.slow
-def test_a_demand_takes_precedence_over_the_operator(rig: ServoRig) -> None:
-    operator = Operator(rig.rack)
-    rig.run(SECOND // 2)
-    operator.say("servo", Operation.SETPOINT, AWAY)
-    rig.run(SECOND // 4)
-    rig.rack.stop(Demand.BRAKE, SECOND)
-    rig.run(SECOND)
-    assert (rig.status.braked, rig.status.standing) == (1, Operation.SETPOINT)
-    assert np.abs(rig.status.position - AWAY).max() > 0.01
-    rig.run(3 * SECOND)
-    assert np.abs(rig.status.position - AWAY).max() < 1e-3
+@pytest.mark.parametrize(("key", "value"), [("bandwidth", 30.0), ("damping", 0.7)])
+def test_a_gain_set_live_is_that_of_a_level_launched_with_it(key: str, value: float) -> None:
+    launched = ServoRig(*config("puma560"), **{key: value})
+    tuned = ServoRig(*config("puma560"))
+    Operator(tuned.rack).set("servo", f"{key}={value}")
+    assert (tuned.torques(300, QUICK.at) == launched.torques(300, QUICK.at)).all()
+    assert tuned.status.answer == Answer.DONE
 
 
 @pytest.mark.slow
-def test_a_restarted_board_continues_with_the_command_in_force(rig: ServoRig) -> None:
-    Operator(rig.rack).say("servo", Operation.SETPOINT, AWAY)
-    rig.run(2 * SECOND, COURSE.at)
+def test_gains_act_from_the_cycle_after_their_tick_and_survive_a_restart() -> None:
+    tuned, plain = (ServoRig(*config("puma560")) for _ in range(2))
+    before = tuned.torques(100, QUICK.at), plain.torques(100, QUICK.at)
+    assert (before[0] == before[1]).all()
+    Operator(tuned.rack).set("servo", "bandwidth=300")
+    after = tuned.torques(100, QUICK.at), plain.torques(100, QUICK.at)
+    assert (after[0] != after[1]).any(axis=1).all()
+    tuned.restart()
+    tuned.torques(1, QUICK.at)
+    assert tuned.servo.given.bandwidth == 300.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("setting", "why"),
+    {
+        "bandwidth=-1": "params.bandwidth = -1: input should be greater than 0",
+        "bandwidth=nan": "params.bandwidth = nan: ",
+        "patience=1.0": "params.patience is not live; live: bandwidth, damping",
+        "stiffness=1": "params.stiffness is not live; live: bandwidth, damping",
+        "bandwidth": "must be key=value",
+    }.items(),
+)
+def test_a_gain_that_cannot_be_is_refused_and_the_law_goes_on(setting: str, why: str) -> None:
+    tuned, plain = (ServoRig(*config("puma560")) for _ in range(2))
+    Operator(tuned.rack).set("servo", setting)
+    assert (tuned.torques(50, QUICK.at) == plain.torques(50, QUICK.at)).all()
+    assert tuned.status.answer == Answer.REFUSED
+    assert tuned.status.objection.startswith(why)
+
+
+def rig_of(**modifications: dict[str, Any]) -> ServoRig:
+    return ServoRig(*config("puma560"), modifications=modifications)
+
+
+@pytest.mark.slow
+def test_a_law_is_replaced_under_motion_without_a_step_and_the_arm_follows_its_course() -> None:
+    rig = rig_of(pd=PD)
+    operator = Operator(rig.rack)
+    before = rig.torques(300, COURSE.at)
+    serial = operator.modify("servo", "pd", True)
+    replaced = rig.torques(200, COURSE.at)
+    assert (rig.status.order, rig.status.answer, rig.status.operator) == (
+        serial,
+        Answer.DONE,
+        serial,
+    )
+    assert (rig.status.state, rig.status.reason) == (State.EXECUTING, "modified by pd")
+    assert replaced[0] == pytest.approx(before[-1], abs=1e-12)
+    assert not np.allclose(replaced[-1], before[-1], atol=0.1)
+    operator.modify("servo", "pd", False)
+    again = rig.torques(500, COURSE.at)
+    assert again[0] == pytest.approx(replaced[-1], abs=1e-12)
+    assert rig.status.position == pytest.approx(COURSE.goal, abs=1e-3)
+    assert (rig.status.reason, rig.found) == ("", [])
+
+
+def test_a_restarted_board_puts_its_modifications_in_again() -> None:
+    rig = rig_of(pd=PD)
+    rig.torques(100, COURSE.at)
+    Operator(rig.rack).modify("servo", "pd", True)
+    rig.torques(100, COURSE.at)
     rig.restart()
-    rig.run(SECOND, COURSE.at)
-    assert (rig.status.standing, rig.status.answer) == (Operation.SETPOINT, Answer.DONE)
-    assert np.abs(rig.status.position - AWAY).max() < 1e-3
+    rig.torques(3, COURSE.at)
+    assert rig.status.reason == "modified by pd"
+
+
+def test_a_hold_stays_in_force_over_a_modification_and_an_unknown_one_is_refused() -> None:
+    rig = rig_of(pd=PD)
+    operator = Operator(rig.rack)
+    rig.torques(100, COURSE.at)
+    operator.say("servo", Operation.HOLD)
+    rig.torques(200, COURSE.at)
+    operator.modify("servo", "pd", True)
+    rig.torques(2, COURSE.at)
+    assert (rig.status.standing, rig.status.answer) == (Operation.HOLD, Answer.DONE)
+    assert rig.status.reason == "held by the operator; `resume` releases it"
+    operator.modify("servo", "notch", True)
+    rig.torques(2, COURSE.at)
+    assert (rig.status.standing, rig.status.answer) == (Operation.HOLD, Answer.REFUSED)
+    assert rig.status.objection == "no modification 'notch'; permitted: pd"
 
 
 def assert_within_limits(targets: Array) -> None:

@@ -64,52 +64,6 @@ def test_a_fault_is_found_in_time_the_arm_braked_and_motion_resumed_and_the_stat
     assert rig.alarms().count(alarm) == 1
 
 
-@pytest.mark.slow
-def test_a_bias_is_seen_by_a_restarted_servo_as_well() -> None:
-    rig = rig_under_way()
-    rig.inject("sensor-bias", size=0.02, joint=1)
-    rig.run(5, move().at)
-    for _ in range(3):
-        rig.restart()
-        rig.run(100, move().at)
-        assert rig.status.stopped == 1
-    rig.heal()
-    rig.run(30, move().at)
-    assert rig.status.stopped == 0
-
-
-def test_a_bias_that_begins_while_the_servo_is_dead_is_found_when_it_is_back() -> None:
-    rig = rig_under_way()
-    rig.miss(10_000)
-    for _ in range(20):
-        rig.step()
-    rig.inject("sensor-bias", size=0.05, joint=1)
-    rig.restart()
-    rig.run(1, move().at)
-    assert Alarm.SENSOR_MODEL in rig.alarms()
-
-
-@pytest.mark.slow
-def test_a_sensor_stuck_at_rest_is_found_once_its_joint_is_to_move() -> None:
-    rig = ServoRig(*config("puma560"))
-    home = move().start
-    rig.run(200, lambda _: (home, np.zeros(6)))
-    rig.inject("sensor-stuck", joint=0)
-    rig.run(300, lambda _: (home, np.zeros(6)))
-    assert rig.alarms() == []
-    begun = rig.rack.tick
-    later = Course(home, GOAL, 2.0)
-    rig.run(100, lambda t: later.at(t - begun * 0.0025))
-    found = next(f for f in rig.found if f.finding.alarm not in BRAKES)
-    assert found.finding.alarm in (Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL)
-    assert found.finding.subject == 0
-    assert all(found.tick - acted <= 20 for acted in rig.acted[:1])
-    rig.heal()
-    rig.run(60, lambda _: (home, np.zeros(6)))
-    rig.run(800, lambda _: (home, np.zeros(6)))
-    assert rig.status.position == pytest.approx(home, abs=1e-3)
-
-
 @pytest.mark.parametrize("speed", [2e-4, 2e-3, 2e-2])
 def test_a_stuck_sensor_is_found_before_its_joint_runs_away_however_slow_the_set_points_are(
     speed: float,
@@ -135,58 +89,6 @@ def test_a_joint_that_crept_while_its_sensor_was_stuck_is_trusted_again_where_it
     assert rig.alarms(*BRAKES) == [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED]
     assert rig.status.reason == ""
     assert rig.status.position == pytest.approx(rig.servo.arm.sense().position, abs=1e-6)
-
-
-def test_noise_on_a_joint_that_was_in_doubt_is_not_taken_for_where_it_is() -> None:
-    rig, home = ServoRig(*config("puma560")), move().start
-    rig.run(200, lambda _: (home, np.zeros(6)))
-    rig.inject("sensor-nan", joint=0)
-    rig.run(40, lambda _: (home, np.zeros(6)))
-    rig.heal()
-    rig.run(40, lambda _: (home, np.zeros(6)))
-    assert rig.status.stopped == 0
-    rig.inject("sensor-noise", size=0.01, joint=5)
-    for _ in range(100):
-        rig.run(1, lambda _: (home, np.zeros(6)))
-        assert rig.status.position == pytest.approx(home, abs=1e-3)
-    assert rig.alarms(*BRAKES)[-1] is Alarm.SENSOR_MODEL
-    rig.heal()
-    rig.run(40, lambda _: (home, np.zeros(6)))
-    assert rig.status.stopped == 0
-
-
-def test_a_bias_at_rest_is_not_accepted_because_another_sensor_was_faulty_before() -> None:
-    rig, home = ServoRig(*config("puma560")), move().start
-    rig.run(200, lambda _: (home, np.zeros(6)))
-    for joint in (0, 4):
-        rig.inject(
-            "sensor-nan" if joint == 0 else "sensor-bias",
-            joint=joint,
-            **({"size": 0.03} if joint else {}),
-        )
-        rig.run(60, lambda _: (home, np.zeros(6)))
-        assert rig.status.stopped == 1
-        rig.heal()
-        rig.run(40, lambda _: (home, np.zeros(6)))
-        assert rig.status.stopped == 0
-    assert Alarm.RE_REFERENCED not in rig.alarms()
-
-
-def test_an_offset_too_small_to_matter_is_accepted_at_rest() -> None:
-    rig, slow = ServoRig(*config("puma560")), Course(move().start, GOAL, 30.0)
-    rig.run(400, slow.at)
-    rig.inject("sensor-bias", size=3e-4, joint=0)
-    rig.run(100, slow.at)
-    assert (rig.alarms(*BRAKES), rig.status.stopped) == (
-        [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED],
-        0,
-    )
-    rig.heal()
-    rig.run(100, slow.at)
-    assert (rig.alarms(*BRAKES), rig.status.stopped) == (
-        [Alarm.SENSOR_MODEL, Alarm.RE_REFERENCED] * 2,
-        0,
-    )
 
 
 def test_one_lost_sample_is_bridged_with_the_last_torque() -> None:

@@ -19,7 +19,7 @@ from rack.levels.operator import Answer, Operation
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.servo.control import LoopGains, SetPointLaw
 from rack.levels.servo.curves import Motion
-from rack.levels.tables import CalibrationConfig, Interface, SceneConfig
+from rack.levels.tables import Interface, SceneConfig
 from tests.levels.arm.test_own_arm import GOAL, START
 from tests.levels.arm.test_set_points import SET_POINTS, ServoArm
 from tests.levels.arms import CLOCK_NS, pendulum
@@ -29,7 +29,6 @@ from tests.levels.servo.rig import TICK_S, Course, ServoRig
 COURSE = Course(START, GOAL, 0.8)
 OWN = "tests.levels.servo.test_set_point_law:"
 STUCK_AT = 150
-ONE = ["position", pytest.param("velocity", marks=pytest.mark.thorough)]
 
 
 class StuckServoArm(ServoArm):
@@ -42,14 +41,6 @@ class StuckServoArm(ServoArm):
             self._rows[0, 1] = kept[1]
             self._rows[1, 1] = 0.0
         return found
-
-
-class PositionArm(ServoArm):
-    """Its drives have loops of position alone."""
-
-    @classmethod
-    def takes(cls, interface: Interface) -> bool:
-        return interface == "position"
 
 
 def rig(folder: Path, interface: Interface, arm: str = "", **robot: object) -> ServoRig:
@@ -73,23 +64,8 @@ def test_it_follows_a_course(tmp_path: Path, interface: Interface, arm: str) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", SET_POINTS)
-def test_drives_that_count_from_elsewhere_get_set_points_as_they_count(
-    tmp_path: Path, interface: Interface
-) -> None:
-    servo = rig(tmp_path, interface, calibration=CalibrationConfig(offset=(0.3, -0.2)))
-    servo.run(500, COURSE.at)
-    truth = servo.servo.arm.sense().position + np.array([0.3, -0.2])
-    assert np.abs(truth - GOAL).max() < 5e-4
-    assert not servo.alarms()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("interface", ONE)
-def test_the_end_of_a_bring_up_does_not_move_the_set_points(
-    tmp_path: Path, interface: Interface
-) -> None:
-    servo = rig(tmp_path, interface, OWN + "ServoArm", bring_up=0.5)
+def test_the_end_of_a_bring_up_does_not_move_the_set_points(tmp_path: Path) -> None:
+    servo = rig(tmp_path, "position", OWN + "ServoArm", bring_up=0.5)
     slow = Course(START, GOAL, 1.6)
     servo.run(320, slow.at)
     Operator(servo.rack).say("servo", Operation.RELEASE)
@@ -100,44 +76,24 @@ def test_the_end_of_a_bring_up_does_not_move_the_set_points(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interface", ONE)
-def test_a_restarted_board_goes_on(tmp_path: Path, interface: Interface) -> None:
-    servo = rig(tmp_path, interface)
-    servo.run(160, COURSE.at)
-    servo.restart()
-    servo.run(440, COURSE.at)
-    assert np.abs(servo.status.position - GOAL).max() < 5e-4
-    assert servo.status.violations == 0
-    assert set(servo.alarms()) <= {Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED}
-
-
 @pytest.mark.parametrize("interface", SET_POINTS)
-def test_missed_cycles_brake_it_and_it_goes_on(tmp_path: Path, interface: Interface) -> None:
-    servo = rig(tmp_path, interface)
-    servo.run(150, COURSE.at)
-    servo.miss(1)
-    servo.run(50, COURSE.at)
-    assert not servo.alarms()
-    servo.miss(12)
-    servo.run(400, COURSE.at)
-    assert servo.alarms() == [Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED]
-    assert servo.found[0].finding.subject == NO_TORQUE
-    assert np.abs(servo.status.position - GOAL).max() < 5e-4
-    assert servo.status.violations == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("interface", ONE)
 def test_as_often_as_cycles_are_missed_the_first_set_point_is_where_the_arm_is(
     tmp_path: Path, interface: Interface
 ) -> None:
     servo = rig(tmp_path, interface)
     random = np.random.default_rng(4)
     course = Course(START, GOAL, 0.8)
-    for _ in range(30):
+    servo.run(5, course.at)
+    servo.miss(12)
+    servo.run(20, course.at)
+    assert servo.alarms() == [Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED]
+    assert servo.found[0].finding.subject == NO_TORQUE
+    for _ in range(20):
         servo.run(int(random.integers(5, 20)), course.at)
         # Some of these outlast the patience of the drives.
         servo.miss(int(random.integers(1, 7)))
+    # So it is after a restart.
+    servo.restart()
     servo.run(400, course.at)
     assert set(servo.alarms()) == {Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED}
     assert np.abs(servo.status.position - GOAL).max() < 5e-4
@@ -180,31 +136,6 @@ def test_a_drive_that_does_not_follow_is_a_motor_fault(
 
 
 @pytest.mark.parametrize("interface", SET_POINTS)
-@pytest.mark.parametrize(
-    ("kind", "alarm"), [("command-nan", Alarm.COMMAND_INVALID), ("sensor-nan", Alarm.SENSOR_RANGE)]
-)
-def test_what_is_not_finite_is_not_followed(
-    tmp_path: Path, interface: Interface, kind: str, alarm: Alarm
-) -> None:
-    servo = rig(tmp_path, interface)
-    servo.run(100, COURSE.at)
-    servo.inject(kind, joint=1)
-    servo.run(3, COURSE.at)
-    assert servo.servo.arm.braked
-    assert alarm in servo.alarms()
-    assert servo.status.violations == 0
-
-
-def test_a_refused_set_point_is_said(tmp_path: Path) -> None:
-    servo = rig(tmp_path, "position")
-    servo.run(20)
-    servo.servo.stopping.refuse(Finding(Alarm.SET_POINT, 1, 0.25), servo.rack.tick)
-    assert servo.servo.stopping.reason.startswith(
-        "rejected: set point of 'elbow' is 0.25 rad from the joint"
-    )
-
-
-@pytest.mark.parametrize("interface", SET_POINTS)
 def test_set_points_are_those_of_the_end_of_the_cycle(tmp_path: Path, interface: Interface) -> None:
     cell: Cell = build_cell(pendulum(tmp_path, interface=interface), SceneConfig(), CLOCK_NS)
     law = SetPointLaw(cell, LoopGains(), TICK_S)
@@ -219,13 +150,6 @@ def test_set_points_are_those_of_the_end_of_the_cycle(tmp_path: Path, interface:
     assert target.position == pytest.approx(later[0], abs=1e-12)
     assert target.velocity == pytest.approx(later[1] + correction, abs=1e-12)
     assert target.torque is torque
-
-
-def test_an_arm_may_take_set_points_of_one_kind_alone() -> None:
-    own = f"board.servo.params.arm='{OWN}PositionArm'"
-    resolve(load("k1607", ["robot.interface='position'", own]))
-    with pytest.raises(ConfigError, match="no `follow` of the class takes"):
-        resolve(load("k1607", ["robot.interface='velocity'", own]))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, State
+from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext, Ports
 from rack.levels.systems.figures import FIGURE_PLAN, FIGURE_STATUS, FigureExecutor, FigurePlanner
@@ -49,9 +49,7 @@ def test_an_executor_computes_for_its_time_in_every_cycle() -> None:
     times = [computing_ns(executor, tick) for tick in (0, 4, 8)]
     assert all(time >= 3 * MS for time in times)
     assert min(times) < 4 * MS
-
-
-def test_several_times_are_taken_in_turn_cycle_by_cycle() -> None:
+    # Several times are taken by turns.
     executor = FigureExecutor(context(process_ms=[6.0, 1.0]))
     # A cycle that is skipped takes its turn with it.
     assert [computing_ns(executor, tick) >= 6 * MS for tick in (0, 4, 12, 16)] == [
@@ -60,17 +58,6 @@ def test_several_times_are_taken_in_turn_cycle_by_cycle() -> None:
         False,
         True,
     ]
-
-
-def test_an_executor_reports_which_plan_is_in_force() -> None:
-    executor, write = (
-        FigureExecutor(context(process_ms=0.0)),
-        Ports(status=Message(FIGURE_STATUS.dtype({}))),
-    )
-    executor.process(ports(plan=None), write, 8)
-    assert (write.status.cycle, write.status.plan, write.status.state) == (8, -1, State.EXECUTING)
-    executor.process(ports(plan=plan_of(4)), write, 12)
-    assert (write.status.cycle, write.status.plan) == (12, 4)
 
 
 def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:

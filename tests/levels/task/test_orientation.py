@@ -20,7 +20,6 @@ from rack.levels.task.actions import goto, rehearse
 from rack.levels.task.program import Goto, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
 from tests.levels.arms import CLOCK_NS, config
-from tests.levels.task.layouts import ORIGIN_Z, arm, draw
 from tests.levels.whole_rack import WholeRack
 
 FIVE = """
@@ -158,14 +157,7 @@ def moved(
     return rehearse(program, scene, rehearsal(robot, scene))
 
 
-@pytest.mark.slow
-def test_a_block_is_taken_otherwise_where_its_goal_cannot_be_reached_so() -> None:
-    done = moved((0.793, -0.149, 0.475))
-    assert np.degrees(leaning_of(done)) > 9.0
-    assert done.situation.object_pose(0).position[:2] == pytest.approx((0.793, -0.149), abs=1e-6)
-
-
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
     with pytest.raises(
         Refused,
@@ -173,11 +165,3 @@ def test_a_place_behind_the_wall_is_refused_with_the_reason() -> None:
     ) as refused:
         moved((0.62, 0.0, 0.475))
     assert refused.value.code == Error.NO_PATH
-
-
-@pytest.mark.thorough
-def test_a_place_that_only_a_lean_between_those_of_ten_degrees_reaches(tmp_path: Path) -> None:
-    layout = draw(np.random.default_rng([1990, 21]))
-    x, y = layout.end[0]
-    end = moved((x, y, ORIGIN_Z), arm(tmp_path / "cell", layout))
-    assert np.degrees(leaning_of(end)) % 10 == pytest.approx(5.0, abs=0.01)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,7 +62,9 @@ def refusal(start: Rehearsal, action: Mapping[str, Any]) -> Refused:
 
 
 def test_transfer_is_eight_moves_and_leaves_the_object_at_its_goal(start: Rehearsal) -> None:
-    end = rehearsed(start, TRANSFER)
+    end = rehearsed(start, {**TRANSFER, "yaw": 0.6})
+    assert start.moves == ()
+    assert start.situation.object_pose(BLOCK1).position == pytest.approx([0.5, 0.3, 0.475])
     verbs = [r.move.verb for r in end.moves]
     assert verbs == [
         Verb.MOVE,
@@ -80,21 +80,10 @@ def test_transfer_is_eight_moves_and_leaves_the_object_at_its_goal(start: Rehear
     assert end.situation.held is None
     put = end.situation.object_pose(BLOCK1).position
     assert put[:2] == pytest.approx(TRANSFER["to"][:2])
-    # The block's half height over the table: at most 1 mm of air below it when the gripper opens.
-    assert 0.475 <= put[2] <= 0.476
-
-
-@pytest.mark.slow
-def test_later_actions_know_what_earlier_ones_have_moved(start: Rehearsal) -> None:
-    onto_its_place = {"do": "transfer", "object": "block2", "to": [0.50, 0.30, 0.475]}
-    end = rehearsed(start, TRANSFER, onto_its_place)
-    assert end.situation.object_pose(BLOCK2).position[:2] == pytest.approx([0.50, 0.30])
-
-
-def test_object_is_turned_as_wanted(start: Rehearsal) -> None:
-    end = rehearsed(start, {**TRANSFER, "yaw": 0.6})
     w, _, _, z = end.situation.object_pose(BLOCK1).quaternion
     assert 2.0 * np.arctan2(z, w) == pytest.approx(0.6, abs=1e-6)
+    # The block's half height over the table: at most 1 mm of air below it when the gripper opens.
+    assert 0.475 <= put[2] <= 0.476
 
 
 @pytest.mark.slow
@@ -112,12 +101,6 @@ def test_object_is_turned_as_wanted(start: Rehearsal) -> None:
             Error.UNREACHABLE,
             "35 mm deep in 'table'; valid z: 0.475",
         ),
-        pytest.param(
-            {**TRANSFER, "to": [0.9, 0.5, 0.475]},
-            Error.UNREACHABLE,
-            "out of reach: [",
-            marks=pytest.mark.thorough,
-        ),
         ({"do": "goto", "position": [0.5, 0.0, 0.6]}, Error.NO_PATH, "'wall'"),
         ({"do": "goto", "position": [1.5, 0.0, 0.6]}, Error.UNREACHABLE, "out of reach: ["),
         (
@@ -133,37 +116,9 @@ def test_what_cannot_be_done_is_refused_with_what_can(
     refused = refusal(start, action)
     assert refused.code == code
     assert words in str(refused)
-
-
-@pytest.mark.slow
-def test_refused_transfer_says_that_to_pick_is_blocked(start: Rehearsal) -> None:
-    on_block1 = Pose(np.array([0.50, 0.30, 0.526]), np.array([1.0, 0.0, 0.0, 0.0]))
-    buried = replace(start, situation=start.situation.with_body(BLOCK2, on_block1))
-    refused = refusal(buried, TRANSFER)
-    assert refused.code == Error.NO_PATH
-    assert "pick block1: " in str(refused)
-    assert "'block2' are" in str(refused)
-
-
-@pytest.mark.slow
-def test_place_named_as_reachable_is_reachable(start: Rehearsal) -> None:
-    text = str(refusal(start, {"do": "goto", "position": [1.5, 0.0, 0.6]}))
-    place = [float(x) for x in text.partition("in reach: [")[2].partition("]")[0].split(",")]
-    assert rehearsed(start, {"do": "goto", "position": place}).moves
-
-
-def test_rehearsal_can_be_gone_back_to(start: Rehearsal) -> None:
-    rehearsed(start, TRANSFER)
-    assert start.moves == ()
-    assert start.situation.object_pose(BLOCK1).position == pytest.approx([0.5, 0.3, 0.475])
-
-
-def test_finish_times_rise_and_leave_room_for_each_motion(start: Rehearsal) -> None:
-    moves = rehearsed(start, TRANSFER, HOME).moves
-    times = finish_times(moves, 4.0, CONTEXT, TaskParams())
-    assert times[0] > 4.0 + moves[0].duration_s
-    for (before, after), (_, duration_s) in zip(itertools.pairwise(times), moves[1:], strict=True):
-        assert after >= before + duration_s
+    if "; in reach: [" in str(refused):
+        place = str(refused).partition("in reach: [")[2].partition("]")[0].split(",")
+        assert rehearsed(start, {"do": "goto", "position": [float(x) for x in place]}).moves
 
 
 def test_move_with_a_time_ends_no_sooner_and_holds_up_what_follows(start: Rehearsal) -> None:
@@ -192,22 +147,6 @@ def test_time_that_cannot_be_met_is_refused_at_once_with_the_earliest(
     assert refused_run.primitive.done == 0
     assert not refused_run.primitive.current
     assert refused_run.read("servo.status").position == pytest.approx(ROBOT.home, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_earliest_time_that_was_reported_can_be_met(refused_run: WholeRack) -> None:
-    earliest = refused_run.read("task.plan").earliest
-    rack = WholeRack(actions=[REACH, {**HOME, "by": earliest + 1e-6}])
-    assert rack.run_to_end(earliest + 2.0).state == State.DONE
-    assert rack.seconds <= earliest + 1.0
-
-
-@pytest.mark.slow
-def test_arm_takes_the_time_that_it_is_given() -> None:
-    rack = WholeRack(actions=[{**REACH, "by": 10.0}])
-    assert rack.run_to_end(15.0).state == State.DONE
-    # Done at the task level by then, and not a cycle of its own before.
-    assert 9.0 < rack.seconds <= 10.0 + 1.0
 
 
 def test_time_of_another_rack_is_not_refused_for_the_rounding_of_its_offset() -> None:

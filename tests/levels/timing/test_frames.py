@@ -22,18 +22,6 @@ def places(found: CoreFrames) -> list[tuple[str, float, float, str]]:
     return [(p.board, p.offset_ns / MS, round(p.slack_ns / MS, 6), p.until) for p in found.places]
 
 
-def test_every_distinct_frame_is_listed_once_with_the_numbers_of_all_that_are_alike() -> None:
-    even, odd = core_frames(timing("schedule.major_ms=16"))
-    assert (even.core, even.frames, odd.frames) == (1, (0, 2), (1, 3))
-    assert places(even) == [("fast", 0, 0.06, "even"), ("even", 1, 0.16, "")]
-    assert places(odd) == [("fast", 0, 0.06, "odd"), ("odd", 1, 0.16, "")]
-
-
-def test_a_rack_without_a_schedule_has_no_frames() -> None:
-    config = load("cyclic").model_copy(update={"schedule": None})
-    assert core_frames(rack_timing(config, wire(config))) == ()
-
-
 def test_boards_released_in_one_tick_follow_each_other_by_priority() -> None:
     even, _ = core_frames(timing("board.even.phase=0"))
     assert places(even) == [("fast", 0, 0, "even"), ("even", 0.94, 0.22, "")]
@@ -59,18 +47,3 @@ def test_a_board_longer_than_its_frame_fails_by_what_is_left_of_it_at_the_end() 
     assert places(even)[1] == ("even", 1, -0.24, "")
     # What it takes of the next frame is missing there: 'odd' waits for it.
     assert places(odd)[1][2] == -0.02
-
-
-def test_the_clock_takes_its_part_of_every_place_on_its_core() -> None:
-    on_core_1 = ("clock.core=1", "timing.clock_ms=0.06", "board.even.budget.process_ms=2.0")
-    even, _ = core_frames(timing(*on_core_1))
-    assert places(even)[0] == ("fast", 0, -0.04, "even")
-
-
-def test_planners_have_no_place_in_frames() -> None:
-    planner = (
-        "board.even.planner=rack.levels.systems.figures:FigurePlanner",
-        "board.even.coupling=tight",
-    )
-    even, _ = core_frames(timing(*planner, "board.even.budget.plan_ms=5.0"))
-    assert [name for name, *_ in places(even)] == ["fast", "even"]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from rack.levels.timing.chains import spanned
 from rack.levels.timing.forecast import NO_BUDGET, Forecast
 from rack.levels.timing.level import BoardTiming
 from rack.levels.timing.rack import RackTiming
@@ -68,14 +69,6 @@ def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
     assert all(verdict.holds for verdict in verdicts(longer))
 
 
-def test_a_planner_has_the_ceiling_of_its_executor_only_in_a_critical_section() -> None:
-    planners = [
-        rack(replace(FIGURE_3, is_critical=critical)).tasks[1] for critical in (True, False)
-    ]
-    found = [(planner.ceiling, planner.parts[-1].preemptible) for planner in planners]
-    assert found == [(80, False), (0, True)]
-
-
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
     timing = rack(
         board("top", 40, below="a"), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7)
@@ -129,43 +122,10 @@ def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
     assert (eq_3_3.subject, eq_3_3.left) == ("system", 226 * 2 * MS)
 
 
-def test_a_joint_that_is_slower_than_the_others_is_judged_by_itself() -> None:
-    timing = arm_of(*JOINTS[:3]).changed("joint3", every=30)
-    assert {chains.text for chains in timing.parallel} == {
-        "plan > path > joint1, joint2 > arm",
-        "plan > path > joint3 > arm",
-    }
-    assert timing.hierarchy.text == "plan > path > joint3 > arm"
-    subjects = [verdict.subject for verdict in verdicts(timing) if verdict.equation == "3.3"]
-    assert subjects == [f"system, {chains.text}" for chains in timing.parallel]
-
-
-def test_chains_of_equal_cycles_are_one_only_if_they_are_every_combination() -> None:
-    pairs = [board("a", 40), board("b", 4, "a"), board("c", 40), board("d", 4, "c")]
-    assert [chains.text for chains in rack(*pairs).parallel] == ["a > b", "c > d"]
-    slower = rack(*pairs).changed("c", every=80).longest_cycles
-    assert slower == {"a": 40, "b": 40, "c": 80, "d": 80}
-    crossed = rack(*pairs[:3], board("d", 4, "a c"))
-    assert [chains.text for chains in crossed.parallel] == ["a > b", "a > d", "c > d"]
-    assert set(crossed.changed("c", every=80).longest_cycles.values()) == {80}
-
-
-def test_a_response_through_a_queue_is_said_to_be_that_of_an_empty_one() -> None:
-    notes = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
-    assert notes[0] == "the system's response is that of empty queues: plan.requests"
-    assert not any("queue" in note for note in Forecast.of(arm_of(*JOINTS)).notes)
-
-
 def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
     boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
     found = rack(*boards, board("alone", 7), goal_ns=60 * 2.0 * MS).longest_cycles
     assert found == {"top": 20, "middle": 20, "low": 20, "alone": 7}
-
-
-def test_boards_without_a_budget_are_named_and_not_judged() -> None:
-    forecast = Forecast.of(rack(board("top", 40, below="a"), board("a", 4, "top")))
-    assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
-    assert {"top", "a"} <= forecast.uncounted.keys()
 
 
 def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
@@ -178,6 +138,10 @@ def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
     assert found.keys() - {CLOCK.name} == {"silent.planner", "unknown", "unknown.planner"}
     assert {why for name, why in found.items() if name != CLOCK.name} == {NO_BUDGET}
     assert not Forecast.of(rack(FIGURE_3, plain)).uncounted.keys() - {CLOCK.name}
+    # Without any budget only the system is judged.
+    forecast = Forecast.of(rack(board("top", 40, below="a"), board("a", 4, "top")))
+    assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
+    assert {"top", "a"} <= forecast.uncounted.keys()
 
 
 def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
@@ -193,6 +157,8 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
+    queued = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
+    assert queued[0] == "the system's response is that of empty queues: plan.requests"
     # Without a budget there is nothing to say about times.
     bare = Forecast.of(
         replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False
@@ -201,3 +167,24 @@ def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
     # Two ordinary tasks that compute share a core; one has it to itself.
     both = replace(FIGURE_3, priority=0, planner_priority=0)
     assert "ordinary scheduling" in Forecast.of(replace(counted, boards={"level": both})).notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (("joint1", "joint2", "joint3"), "joint1 ... joint3"),
+        (("joint9", "joint10", "joint11"), "joint9 ... joint11"),
+        (("j1.planner", "j2.planner", "j3.planner"), "j1.planner ... j3.planner"),
+        (("joint1", "joint2"), "joint1, joint2"),
+        (("joint1", "joint2", "joint4"), "joint1, joint2, joint4"),
+        (("joint2", "joint1", "joint3"), "joint2, joint1, joint3"),
+        (("a1", "b2", "c3"), "a1, b2, c3"),
+        (("joint1", "joint2", "joint3", "arm"), "joint1 ... joint3, arm"),
+        (("servo",), "servo"),
+        ((), ""),
+    ],
+)
+def test_numbered_names_are_shortened_only_if_none_is_left_out(
+    names: tuple[str, ...], text: str
+) -> None:
+    assert spanned(names) == text

@@ -5,20 +5,17 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
 
 from rack.levels.timing.response_time import (
-    TURN_NS,
     Load,
     blocking_ns,
     load_of,
     response_time,
     task_responses,
 )
-from rack.levels.timing.schedule import simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 SETS = 100
@@ -135,21 +132,15 @@ def test_overload_has_no_bound(above: list[Load]) -> None:
     assert response(2, above) is None
 
 
-def test_a_search_that_creeps_is_given_up() -> None:
+def test_the_search_ends_at_its_horizon_or_when_it_creeps() -> None:
+    assert response(0, []) == 0
     # A billionth of the core is left: the end lies 10^10 jobs ahead, and before the horizon.
     assert response(500_000, [(9_999, 10_000), (99_999, 10**9)], horizon=10**15) is None
-
-
-def test_the_search_ends_at_its_horizon() -> None:
     above = [(5, 10), (49_999, 100_000)]
     assert response(7, above, horizon=100_000) is None
     found = response(7, above, horizon=10_000_000)
     assert found is not None
     assert found > 100_000
-
-
-def test_what_takes_no_time_responds_at_once() -> None:
-    assert response(0, []) == 0
 
 
 def test_two_context_switches_come_with_every_job() -> None:
@@ -179,16 +170,6 @@ def test_two_tasks_respond(
     assert [found.get("one"), found.get("other")] == expected
 
 
-def test_ordinary_tasks_share_time_by_turns() -> None:
-    tasks = [timed("brief", 0, 0, 100, computing(3)), timed("long", 0, 0, 1000, computing(200))]
-    long, seldom = 50 * TURN_NS, 1000 * TURN_NS
-    assert response(3, [], sharing=[(long, seldom)], horizon=seldom) == 3 + 3 + TURN_NS
-    often = 25 * TURN_NS
-    assert response(long, [], sharing=[(3, often)], horizon=seldom) == long + 3 * 3
-    # A turn of the kernel's, 4 ms, is longer than all of it.
-    assert response_times(tasks) == {"brief": 203, "long": 209}
-
-
 def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:
     update = Part(Unit.UPDATE, 3, preemptible=False)
     planner = timed("level.planner", 0, 5, 40, Part(Unit.PLAN, 6), update, ceiling=20)
@@ -204,96 +185,3 @@ def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:
         "level.planner": 0,
     }
     assert response_times(tasks) == {"above": 1, "own": 1 + 1 + 3, "low": 12, "level.planner": 11}
-
-
-@pytest.mark.slow
-def test_no_schedule_of_executors_and_planners_goes_beyond_the_bound() -> None:
-    draw, attained = random.Random(14), 0
-    for _ in range(SETS):
-        switch, tasks = draw.randint(0, 1), levels_drawn(draw)
-        bounds, periods = (
-            response_times(tasks, switch),
-            {task.name: task.period_ns for task in tasks},
-        )
-        for job in simulate(tasks, 480, switch).jobs:
-            bound = bounds[job.task]
-            # A task that was late once may take up its next release late.
-            if job.end_ns is not None and bound is not None and bound <= periods[job.task]:
-                # A schedule gives the end of a job's last part; the switch out of it comes after.
-                assert job.end_ns + switch - job.release_ns <= bound, (job, tasks)
-                attained += job.end_ns + switch - job.release_ns == bound
-    assert attained > SETS
-
-
-def levels_drawn(draw: random.Random) -> list[TimedTask]:
-    """Return levels on two cores, of different priorities, with planners whose update keeps their
-    executor out."""
-    tasks, priorities = [], iter(draw.sample(range(50, 99), 3))
-    for name, priority in zip(("task", "primitive", "servo"), priorities, strict=True):
-        core, every, within = draw.randint(0, 1), draw.choice(PERIODS), draw.randint(1, 4)
-        tasks.append(timed(name, core, priority, every, computing(draw.randint(1, 3))))
-        parts = (
-            Part(Unit.PLAN, draw.randint(1, 6)),
-            Part(Unit.UPDATE, 1, preemptible=draw.random() < 0.5),
-        )
-        own, ceiling = priority - 49, 0 if parts[1].preemptible else priority
-        tasks.append(
-            TimedTask(f"{name}.planner", name, "planner", core, own, every, parts, within, ceiling)
-        )
-    return tasks
-
-
-def stepped(tasks: list[TimedTask], until: int) -> dict[str, int] | None:
-    """Return the longest response of each task, by giving the processor away unit by unit; None if
-    one is late."""
-    left: dict[str, tuple[int, int]] = {}
-    worst = dict.fromkeys((task.name for task in tasks), 0)
-    for now in range(until):
-        for task in tasks:
-            if now >= task.phase_ns and (now - task.phase_ns) % task.every_ns == 0:
-                if task.name in left:
-                    return None
-                left[task.name] = now, task.cost_ns
-        for task in sorted(tasks, key=lambda task: -task.priority):
-            if task.name in left:
-                release, cost = left.pop(task.name)
-                if cost > 1:
-                    left[task.name] = release, cost - 1
-                else:
-                    worst[task.name] = max(worst[task.name], now + 1 - release)
-                break
-    return worst
-
-
-def test_with_phases_responses_are_those_of_the_schedule_and_never_longer_than_without() -> None:
-    draw, exact = random.Random(0), 0
-    for _ in range(SETS):
-        plain = drawn(draw)
-        together = [
-            timed(f"t{at}", 0, 9 - at, t.period, computing(t.cost)) for at, t in enumerate(plain)
-        ]
-        tasks = [replace(task, phase_ns=draw.randrange(task.every_ns)) for task in together]
-        found, bound = response_times(tasks), response_times(together)
-        expected = stepped(tasks, 360)
-        assert all(found[name] <= limit for name, limit in bound.items() if limit is not None)
-        if expected is not None and any(task.phase_ns for task in tasks):
-            assert found == expected
-            exact += found != bound
-    assert exact > SETS // 4
-
-
-def test_tasks_of_one_priority_that_may_wait_together_keep_their_bound() -> None:
-    def pair(phase: int) -> list[TimedTask]:
-        first = timed("a", 0, 0, 10, computing(4))
-        return [first, replace(first, name="b", board="b", phase_ns=phase)]
-
-    assert response_times(pair(5)) == {"a": 4, "b": 4}
-    assert response_times(pair(3)) == response_times(pair(0))
-
-
-def test_a_planner_has_no_fixed_place_in_a_schedule() -> None:
-    executor = replace(timed("a", 0, 2, 10, computing(4)), phase_ns=5)
-    planner = replace(executor, name="a.planner", role="planner", priority=1, within_cycles=2)
-    other = timed("b", 0, 3, 20, computing(4))
-    tasks = [executor, planner, other]
-    assert response_times(tasks) == response_times([replace(task, phase_ns=0) for task in tasks])

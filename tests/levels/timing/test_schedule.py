@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rack.levels.timing.schedule import Chart, Job, Span, simulate
+from rack.levels.timing.schedule import Chart, simulate
 from rack.levels.timing.tasks import Part, TimedTask, Unit
 
 C, R, X, W, P, U = Unit
@@ -52,12 +52,22 @@ FIG_4 = (executor("C1 R1 X2 W1", 6), planner("P6 U1", 6, 2, core=2, ceiling=0))
 
 def test_figure_2_is_as_in_the_paper() -> None:
     assert row(simulate(FIG_2, 32)) == "RXXWPPPPRXXWPPU-" * 2
-
-
-def test_figure_2_with_an_executor_of_3_then_2_ms_fills_two_cycles_to_the_millisecond() -> None:
+    # An executor of 3, then 2 ms fills two cycles to the millisecond.
     chart = simulate(FIG_2, 32, variants={"level": (parts("R1 X3 W1"), parts("R1 X2 W1"))})
     assert row(chart) == "RXXXWPPPRXXWPPPU" * 2
     assert not chart.late("level.planner")
+
+
+def test_figure_4_works_on_two_processors_with_waste() -> None:
+    chart = simulate(FIG_4, 24)
+    assert row(chart, 1) == "CRXXW-" * 4
+    assert row(chart, 2) == "PPPPPPU-----" * 2
+    assert not chart.late("level")
+    assert not chart.late("level.planner")
+    # A longer executor misses every cycle.
+    chart = simulate((executor("C1 R1 X4 W1", 6), FIG_4[1]), 60)
+    assert row(chart, 1) == ("CRXXXXW" * 9)[:60]
+    assert len(chart.late("level")) == 10
 
 
 def test_figure_3_has_no_plan_within_three_cycles() -> None:
@@ -69,47 +79,6 @@ def test_figure_3_has_no_plan_within_three_cycles() -> None:
     assert not chart.late("level")
 
 
-def test_figure_4_works_on_two_processors_with_waste() -> None:
-    chart = simulate(FIG_4, 24)
-    assert row(chart, 1) == "CRXXW-" * 4
-    assert row(chart, 2) == "PPPPPPU-----" * 2
-    assert not chart.late("level")
-    assert not chart.late("level.planner")
-
-
-def test_figure_4_with_a_longer_executor_misses_every_cycle() -> None:
-    chart = simulate((executor("C1 R1 X4 W1", 6), FIG_4[1]), 60)
-    assert row(chart, 1) == ("CRXXXXW" * 9)[:60]
-    assert len(chart.late("level")) == 10
-
-
-def test_a_late_task_takes_the_newest_release_and_skips_the_others() -> None:
-    chart = simulate([executor("X25", 10)], 60)
-    # Done at 25 and at 45: the releases of 10 and of 30 have passed, those of 20 and 40 are the
-    # newest.
-    assert ends(chart, "level") == [
-        (0, 25),
-        (10, None),
-        (20, 50),
-        (30, None),
-        (40, None),
-        (50, None),
-    ]
-    assert [job.release_ns for job in chart.late("level")] == [0, 10, 20, 30, 40, 50]
-
-
-def test_a_late_plan_is_followed_at_once_by_the_one_whose_slice_has_begun() -> None:
-    chart = simulate(FIG_3, 60)
-    assert ends(chart, "level.planner") == [(0, 23), (18, 42), (36, None)]
-
-
-def test_the_plan_update_blocks_its_executor_but_no_task_above_it() -> None:
-    tasks = executor("R1 X1", 4), planner("P2 U3", 4, 3)
-    assert row(simulate(tasks, 12)) == "RXPPRXUUURX-"
-    above = TimedTask("clock", "clock", "clock", 1, 90, 8, parts("X1"))
-    assert row(simulate((*tasks, above), 13)) == "XRXPRXPUXUURX"
-
-
 def test_every_job_costs_two_context_switches() -> None:
     chart = simulate(FIG_2, 16, context_switch_ns=1)
     # in, R X W, out; in, P; in, R X W, out; P: the rest of two cycles is six units, one of them a
@@ -117,12 +86,6 @@ def test_every_job_costs_two_context_switches() -> None:
     assert row(chart) == "-RXXW--P-RXXW-PP"
     assert ends(chart, "level") == [(0, 5), (8, 13)]
     assert [job.end_ns for job in chart.late("level.planner")] == [None]
-
-
-def test_what_is_not_done_when_the_schedule_ends_has_no_end() -> None:
-    chart = simulate([executor("X3", 10), executor("X9", 30, priority=5, name="slow")], 8)
-    assert ends(chart, "level") == [(0, 3)]
-    assert ends(chart, "slow") == [(0, None)]
 
 
 def random_tasks(seed: int) -> list[TimedTask]:
@@ -192,7 +155,7 @@ def place(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(10))
 def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
     for number in range(10):
         tasks, until = random_tasks(1000 * seed + number), 300
@@ -208,29 +171,3 @@ def test_a_schedule_is_what_computing_unit_by_unit_gives(seed: int) -> None:
         assert {
             (job.task, job.release_ns): job.end_ns for job in chart.jobs if job.end_ns is not None
         } == ended
-
-
-SPANS = (
-    Span("a", 0, Unit.PROCESS, 0, 10, 0),
-    Span("a", 0, Unit.WRITE, 10, 14, 0),
-    Span("a", 0, Unit.PROCESS, 20, 26, 20),
-)
-JOBS = (Job("a", 0, 20, 14), Job("a", 20, 40, 45), Job("b", 0, 30, None), Job("b", 40, 70, None))
-CHART = Chart(0, 60, SPANS, JOBS)
-
-
-def test_a_job_is_late_if_it_ended_after_its_deadline_or_did_not_end_by_then() -> None:
-    assert CHART.late("a") == [JOBS[1]]
-    # The second one still has time when the chart ends.
-    assert CHART.late("b") == [JOBS[2]]
-    # In a window too, a job that is not due within it is not late.
-    assert [CHART.window(0, end).late("b") for end in (25, 30)] == [[], [JOBS[2]]]
-
-
-def test_a_window_cuts_spans_and_keeps_jobs_whole() -> None:
-    window = CHART.window(4, 12)
-    spans = [(span.unit, span.start_ns, span.end_ns) for span in window.spans]
-    assert spans == [("X", 4, 10), ("W", 10, 12)]
-    assert (window.start_ns, window.end_ns) == (4, 12)
-    assert CHART.window(42, 50).jobs == (JOBS[1], JOBS[3])
-    assert CHART.window(20, 25).jobs == (JOBS[1], JOBS[2])

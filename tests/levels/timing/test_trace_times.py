@@ -13,9 +13,7 @@ def test_a_plan_ages_until_the_next_one_can_be_read() -> None:
     executor, made, visible_at = np.arange(20), np.array([0, 8]), np.array([4, 12])
     # Plan 0 is read in ticks 4 to 11, plan 8 in 12 to 19.
     assert plan_ages(executor, made, visible_at).tolist() == [*range(4, 12), *range(4, 12)]
-
-
-def test_a_late_plan_is_not_visible_before_its_own_tick() -> None:
+    # A late plan is not visible before its own tick.
     made, visible_at = np.array([0, 4, 8]), np.array([4, 15, 12])
     assert plan_ages(np.array([3, 11, 12, 14, 15]), made, visible_at).tolist() == [11, 12, 14, 7]
 
@@ -79,18 +77,15 @@ def test_a_distribution_has_the_percentiles_of_its_values() -> None:
     assert thirds == dict.fromkeys(expected, 0.333333)
 
 
-def test_intervals_that_touch_or_overlap_are_one() -> None:
-    union = Occupation(np.array([20, 0, 5, 12]), np.array([22, 5, 9, 10]))
-    assert union.starts.tolist() == [0, 12, 20]
-    assert union.ends.tolist() == [9, 12, 22]
-
-
 def test_a_union_of_occupations_counts_no_time_twice() -> None:
     first = Occupation(np.array([0]), np.array([10]))
     second = Occupation(np.array([5, 30]), np.array([20, 31]))
     whole = np.array([0]), np.array([100])
     assert Occupation.union([first, second]).within(*whole).tolist() == [21]
     assert Occupation.union([]).within(*whole).tolist() == [0]
+    # Those that touch or overlap are one.
+    union = Occupation(np.array([20, 0, 5, 12]), np.array([22, 5, 9, 10]))
+    assert (union.starts.tolist(), union.ends.tolist()) == ([0, 12, 20], [9, 12, 22])
 
 
 def test_a_task_needs_its_core_from_waking_up_to_closing_the_cycle() -> None:
@@ -117,12 +112,6 @@ def test_the_overhead_is_the_median_of_the_cycles_that_nobody_disturbed() -> Non
 NOBODY = Occupation.union([])
 
 
-def test_the_parts_of_a_cycle_that_nobody_disturbed_are_as_stamped() -> None:
-    parts = [(0, 0, 1000, 0), USUAL, (1, 2, 3, 4)]
-    rows = records(*(cycle(2000 * n, part, sum(part) + 4) for n, part in enumerate(parts)))
-    assert trace_times.unit_times(rows, NOBODY).tolist() == [list(part) for part in parts]
-
-
 def test_what_a_higher_task_took_is_taken_off_the_part_in_which_it_ran() -> None:
     rows = records(cycle(0, (10, 20, 90, 30), 104))
     above = Occupation(np.array([45]), np.array([95]))
@@ -137,18 +126,3 @@ def test_a_disturbance_is_taken_off_the_part_that_is_longer_than_usual() -> None
     times = trace_times.unit_times(records(*usual, disturbed, own), NOBODY)
     assert times[:-1].tolist() == [list(USUAL)] * 5
     assert times[-1].tolist() == [10, 20, 45, 30]
-
-
-def test_what_is_disturbed_in_every_cycle_is_the_longest_part() -> None:
-    # A host that takes the machine away for 50, 80 or 110 ns of each cycle.
-    often = [(10, 20, 40 + stolen, 30) for stolen in (50, 80, 110) * 10]
-    rare = (10, 70, 90, 30)
-    rows = records(*(cycle(1000 * n, parts, 100) for n, parts in enumerate([*often, rare])))
-    times = trace_times.unit_times(rows, NOBODY)
-    assert times.tolist() == [list(USUAL)] * 31
-
-
-def test_without_a_longer_part_a_disturbance_is_taken_off_all_in_proportion() -> None:
-    assert trace_times.unit_times(records(cycle(0, USUAL, 50)), NOBODY).tolist() == [
-        [5, 10, 20, 15]
-    ]

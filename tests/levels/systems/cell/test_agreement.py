@@ -230,18 +230,6 @@ def test_arm_that_fails_ends_the_program_and_leaves_no_arm_moving(
     assert ("holds nothing" in play.agreement.reason) == ("k1607" in STEPS[step])
 
 
-@given(STEADY, st.floats(2.0, 12.0))
-@settings(max_examples=40, deadline=None)
-def test_promise_that_expires_is_asked_for_again_before_anything_begins(
-    events: list[frozenset[str] | str], keeps_s: float
-) -> None:
-    play = Play(puma=PlayedArm(keeps_s=keeps_s), third=PlayedArm(keeps_s=keeps_s))
-    disturb(play, events)
-    play.finish()
-    assert not any(arm.stopped for arm in play.arms.values())
-    assert play.agreement.error in (Error.NONE, Error.TOO_LATE)
-
-
 @given(STEADY, st.sampled_from(ARMS), st.integers(0, 40))
 @settings(max_examples=40, deadline=None)
 def test_arm_launched_anew_ends_the_program_or_has_lost_nothing(

@@ -59,18 +59,6 @@ def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
     return str(caught.value)
 
 
-def test_rack_of_a_coordinator_has_a_mailbox_for_each_arm(tmp_path: Path) -> None:
-    (tmp_path / "cell.toml").write_text(RACK)
-    names = {box.name for box in resolve(load(tmp_path / "cell.toml")).layout.mailboxes}
-    assert {
-        "task.order_puma",
-        "task.order_k1607",
-        "task.progress",
-        "lan.puma",
-        "lan.k1607",
-    } <= names
-
-
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
@@ -119,14 +107,3 @@ def test_each_mistake_in_a_coordinators_config_is_one_line(
 ) -> None:
     (found,) = mistakes(tmp_path, (old, new)).splitlines()
     assert line in found
-
-
-def test_arm_needs_the_rack_that_orders_it_about() -> None:
-    settings = (
-        "board.task.executor=rack.levels.systems.cell:OrderedTaskExecutor",
-        "board.task.planner=rack.levels.systems.cell:OrderedTaskPlanner",
-        "board.task.params.coordinator=cell",
-    )
-    with pytest.raises(ConfigError) as caught:
-        resolve(load("nasrem", settings))
-    assert all(mailbox in str(caught.value) for mailbox in ("lan.orders", "lan.peer_cell"))

@@ -81,7 +81,6 @@ class Hoist(ServoRig):
         self.begun = 0
 
     def grip(self, opening: float) -> None:
-        """Open or close the hand."""
         self.command.opening = opening
 
     def go(self, height: float) -> None:
@@ -92,7 +91,6 @@ class Hoist(ServoRig):
         )
 
     def tick(self) -> None:
-        """Run one tick along the course."""
         began = self.begun * 2.5e-3
         self.run(1, lambda time_s: self.course.at(time_s - began))
 
@@ -197,15 +195,6 @@ def test_of_two_arms_that_take_the_part_at_once_the_name_decides(pair: Pair) -> 
     assert pair.alpha.claim == pair.beta.claim == Claim(1, b"beta")
 
 
-def test_a_copy_stays_in_the_air_when_the_other_rack_is_lost(pair: Pair) -> None:
-    pair.lift(pair.alpha)
-    pair.apart = True
-    before = pair.beta.part
-    pair.run(0.5)
-    np.testing.assert_array_equal(pair.beta.part, before)
-    assert pair.beta.claim == Claim(1, b"alpha")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"]
@@ -217,6 +206,8 @@ def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
     hoist = restarted(pair)
     before = hoist.part
     pair.apart = hoist is pair.beta  # without the other's word it has to remember by itself
+    pair.run(0.1)
+    np.testing.assert_allclose(hoist.part, before, atol=1e-3 if hoist is pair.alpha else 1e-12)
     hoist.rack.lose("servo", 12)
     pair.run(0.3)
     assert hoist.claim == Claim(1, b"alpha")
@@ -225,32 +216,6 @@ def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
     pair.put_down(pair.alpha)
     pair.lift(pair.beta)
     assert pair.alpha.claim == pair.beta.claim == Claim(2, b"beta")
-
-
-@pytest.mark.slow
-def test_a_rack_launched_anew_gets_its_part_back_where_the_other_saw_it(pair: Pair) -> None:
-    pair.lift(pair.alpha)
-    pair.put_down(pair.alpha)
-    moved = pair.alpha.part
-    moved[0] += 0.05
-    cast(SharingArm, pair.alpha.servo.arm).place(0, moved)
-    pair.run(0.1)
-    pair.alpha = Hoist(pair.folder, "alpha")
-    pair.run(0.2)
-    assert pair.alpha.claim == pair.beta.claim == Claim(1, b"alpha")
-    np.testing.assert_allclose(pair.alpha.part, moved, atol=1e-4)
-
-
-@pytest.mark.thorough
-@pytest.mark.slow
-def test_two_runs_say_the_same_bit_for_bit(tmp_path: Path) -> None:
-    runs = [Pair(tmp_path), Pair(tmp_path)]
-    for pair in runs:
-        pair.lift(pair.alpha)
-        pair.put_down(pair.alpha)
-        pair.lift(pair.beta)
-    one, other = ((bytes(pair.alpha.said.raw), bytes(pair.beta.said.raw)) for pair in runs)
-    assert one == other
 
 
 def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
@@ -271,38 +236,3 @@ def test_only_the_owner_says_where_its_body_is() -> None:
     told = body.hear(word(b"beta", owned, 3.0))
     assert told is not None
     assert told[0] == 3.0
-
-
-@pytest.mark.parametrize(
-    "message",
-    [word(b"beta", Claim(2, b"beta"), 1.0), word(b"beta", Claim(9, b"beta"), 1.0, b"peg")],
-)
-def test_a_smaller_claim_and_another_body_change_nothing(message: Message) -> None:
-    body = SharedBody(b"part", b"alpha", Claim(3, b"alpha"))
-    assert body.hear(message) is None
-    assert body.claim == Claim(3, b"alpha")
-
-
-def test_an_arm_that_still_touches_a_body_does_not_claim_it_back() -> None:
-    body = SharedBody(b"part", b"alpha")
-    body.touch(True)
-    body.hear(word(b"beta", Claim(2, b"beta"), 1.0))
-    body.touch(True)
-    assert body.is_elsewhere
-    body.touch(False)
-    body.touch(True)
-    assert body.claim == Claim(3, b"alpha")
-
-
-def test_a_claim_after_the_greatest_number_is_that_number_again() -> None:
-    message, body = Message(SHARED_BODIES.dtype({})), SharedBody(b"part", b"one")
-    greatest = (1 << 32) - 1
-    message.bodies[0]["name"], message.bodies[0]["owner"], message.bodies[0]["claim"] = (
-        b"part",
-        b"two",
-        greatest,
-    )
-    body.hear(message)
-    body.touch(True)
-    body.show(message.bodies[0], np.zeros(7))
-    assert (message.bodies[0]["claim"], message.bodies[0]["owner"]) == (greatest, b"one")

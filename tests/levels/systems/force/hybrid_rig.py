@@ -94,7 +94,6 @@ class HybridRig:
         return int(command.id)
 
     def run(self, seconds: float) -> None:
-        """Run for simulated `seconds`."""
         arm = self.rack.tasks["arm"]
         for _ in range(round(seconds * 1e9 / CLOCK_NS)):
             self.rack.step()
@@ -107,12 +106,10 @@ class HybridRig:
         return self.ik.tool_at(self.output("arm", "status").position).position
 
     def output(self, board: str, port: str) -> Message:
-        """Return what a board wrote last."""
         return cast(Message, getattr(self.rack.tasks[board].write, port))
 
     @property
     def force(self) -> Message:
-        """The status of hybrid control."""
         return self.output("hybrid", "force")
 
     @property

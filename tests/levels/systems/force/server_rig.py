@@ -46,12 +46,10 @@ class ServerRig(TrajectoryRig):
 
     @property
     def status(self) -> Message:
-        """The server's."""
         return self.write.status
 
     @property
     def mode(self) -> Mode:
-        """The server's."""
         return Mode(self.status.mode)
 
     def comply(self, force: float = 15.0, **fields: Any) -> int:
@@ -72,11 +70,9 @@ class ServerRig(TrajectoryRig):
         return self.request(MotionKind.POSE, position=position, quaternion=DOWN, segment=seconds)
 
     def others(self) -> dict[str, Reading]:
-        """Return the contact."""
         return {"force": Reading(self.force, Verdict.NEW)}
 
     def obey(self) -> None:
-        """Follow set points and forces, or hold."""
         command, wanted, force, status = (
             self.write.command,
             self.write.compliance,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -16,7 +15,6 @@ from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.force.client import ForceMotions, ForceProgram
 from rack.levels.systems.force.messages import SERVER_STATUS, Mode
-from rack.levels.systems.force.server import ForceServer
 from rack.levels.systems.trajectory.messages import MotionKind
 from tests.levels.arms import config
 
@@ -97,14 +95,14 @@ def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
     assert guard["guard"].tolist() == [8, 0, 0, 0, 0.5, 0]
     assert np.allclose(comply["frame"], guard["frame"])
     assert "selected" not in free
-
-
-def test_the_frame_of_a_request_has_the_axes_of_the_config(bus: Bus, arm: ForceMotions) -> None:
-    arm.guard("wall")
+    # The frame has the axes of the config.
     axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, bus.requests[0]["frame"])
+    mujoco.mju_quat2Mat(axes, guard["frame"])
     assert np.allclose(axes.reshape(3, 3)[:, 0], (0, 1, 0))
     assert np.allclose(axes.reshape(3, 3)[:, 2], (0, 0, -1))
+    bus.status.wrench, bus.status.mode = (0, 0, 14.5, 0, 0, 0), Mode.FORCE
+    bus.status.place = (0.5, 0.1, 0.4)
+    assert (arm.wrench()["z"], arm.mode(), arm.where()) == (14.5, Mode.FORCE, [0.5, 0.1, 0.4])
 
 
 def test_a_wait_gives_signs_of_life(bus: Bus, arm: ForceMotions) -> None:
@@ -112,17 +110,6 @@ def test_a_wait_gives_signs_of_life(bus: Bus, arm: ForceMotions) -> None:
     assert not arm.wait(request, until=lambda: bus.tick >= 1000)
     signs = [fields for fields in bus.requests if fields["id"] == 0]
     assert len(signs) == 9
-
-
-def test_what_the_server_says_is_read(bus: Bus, arm: ForceMotions) -> None:
-    bus.status.wrench, bus.status.mode, bus.status.place = (
-        (0, 0, 14.5, 0, 0, 0),
-        Mode.FORCE,
-        (0.5, 0.1, 0.4),
-    )
-    assert arm.wrench()["z"] == 14.5
-    assert arm.mode() is Mode.FORCE
-    assert arm.where() == [0.5, 0.1, 0.4]
 
 
 @pytest.mark.parametrize(
@@ -192,11 +179,3 @@ def test_a_program_that_is_impossible_is_found_before_the_launch(
 ) -> None:
     found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))
     assert [(place, why) for place, _, why in found] == [(key, reason)]
-
-
-def test_an_arm_without_a_sensor_has_no_contacts_and_no_server() -> None:
-    bare = ROBOT.model_copy(update={"wrist": None})
-    reasons = [reason for _, _, reason in ForceProgram.model_validate(TASK).misfits(bare, SCENE)]
-    assert reasons == ["the arm has no wrist sensor"] * 2
-    ((key, server, _),) = ForceServer.misfits(replace(CONTEXT, robot=bare), (), ())
-    assert (key, server) == ("executor", "ForceServer")

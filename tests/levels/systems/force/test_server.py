@@ -9,7 +9,7 @@ from rack.backplane.message import State
 from rack.levels.messages import Error
 from rack.levels.systems.force.messages import Mode
 from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
-from tests.levels.systems.force.server_rig import DOWN, EDGE, HEIGHT, PERIOD_S, ServerRig
+from tests.levels.systems.force.server_rig import EDGE, HEIGHT, PERIOD_S, ServerRig
 
 X, Y = 0.499, -0.15
 
@@ -25,20 +25,6 @@ def pressing(**params: float) -> ServerRig:
     return rig
 
 
-def test_a_guard_ends_its_segment_where_the_arm_is_and_ends_with_it() -> None:
-    rig = ServerRig()
-    rig.guard(4.0)
-    down = rig.line((X, Y, HEIGHT - 0.02), 1.5)
-    rig.run(3.0)
-    assert rig.ends()[down] == RequestEnd.GUARDED
-    assert (rig.status.guarded, rig.status.axis) == (down, 2)
-    assert 4.0 < max(rig.pressed) < 8.0
-    up = rig.line((X, Y, HEIGHT + 0.03), 1.0)
-    rig.run(2.5)
-    assert rig.ends()[up] == RequestEnd.DONE
-    assert np.allclose(rig.places[-1], (X, Y, HEIGHT + 0.03), atol=1e-4)
-
-
 def test_compliance_is_done_when_the_force_is_as_wanted_and_keeps_it_over_an_edge() -> None:
     rig = pressing()
     assert rig.mode is Mode.FORCE
@@ -49,19 +35,14 @@ def test_compliance_is_done_when_the_force_is_as_wanted_and_keeps_it_over_an_edg
     assert abs(rig.places[-1][1] - EDGE - 0.05) < 1e-3
     assert rig.places[-1][2] < HEIGHT - 0.012
     assert abs(rig.pressed[-1] - 15.0) < 0.5
-
-
-def test_motion_after_compliance_begins_where_the_arm_is_without_a_step() -> None:
-    rig = pressing()
-    rig.line((X, EDGE + 0.05, HEIGHT), 1.0)
+    # Motion after it begins where the arm is, without a step.
     rig.free()
     up = rig.line((X, EDGE + 0.05, HEIGHT + 0.05), 1.0)
-    rig.run(5.0)
+    rig.run(3.0)
     assert rig.ends()[up] == RequestEnd.DONE
     assert rig.mode is Mode.MOTION
     assert np.allclose(rig.places[-1], (X, EDGE + 0.05, HEIGHT + 0.05), atol=1e-4)
-    steps = np.abs(np.diff(rig.places, axis=0)).max()
-    assert steps < 0.15 * PERIOD_S
+    assert np.abs(np.diff(rig.places, axis=0)).max() < 0.15 * PERIOD_S
 
 
 def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_released() -> None:
@@ -78,7 +59,11 @@ def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_release
     assert rig.status.reason == (
         "no sign of life from the client for 0.5 s: forces are held for 1 s; cancel, then go on"
     )
-    rig.run(2.5)
+    # A restarted server goes on with that.
+    rig.restart()
+    rig.run(0.3)
+    assert rig.mode is Mode.HELD
+    rig.run(3.5)
     assert rig.mode is Mode.RELEASED
     assert rig.pressed[-1] < 2.0
     assert "the position is held" in rig.status.reason
@@ -95,28 +80,6 @@ def test_a_client_that_falls_silent_leaves_a_force_that_is_held_and_then_release
     assert (rig.mode, rig.status.reason) == (Mode.MOTION, "")
 
 
-def test_a_client_that_is_back_in_time_goes_on_with_the_force_as_it_is() -> None:
-    rig = pressing(silence=0.5, hold=3.0)
-    rig.alive = False
-    rig.run(1.0)
-    assert rig.mode is Mode.HELD
-    rig.alive = True
-    rig.request(MotionKind.CANCEL)
-    along = rig.line((X, -0.12, HEIGHT), 1.0)
-    rig.run(2.0)
-    assert (rig.mode, rig.ends()[along]) == (Mode.FORCE, RequestEnd.DONE)
-    assert abs(rig.pressed[-1] - 15.0) < 1.0
-
-
-def test_a_silent_client_that_wants_nothing_is_not_missed() -> None:
-    rig = ServerRig(silence=0.5)
-    rig.line((X, Y, HEIGHT + 0.02), 1.0)
-    rig.run(2.5)
-    rig.alive = False
-    rig.run(2.0)
-    assert (rig.status.state, rig.mode) == (State.DONE, Mode.MOTION)
-
-
 def test_a_surface_that_is_not_there_ends_compliance_with_a_reason() -> None:
     rig = ServerRig(reach=1.0)
     rig.floor = 0.0
@@ -127,18 +90,6 @@ def test_a_surface_that_is_not_there_ends_compliance_with_a_reason() -> None:
     assert rig.status.reason == f"request {press}: axis z has not settled at 15 N for 1 s: 0 now"
     assert (rig.status.error, rig.mode) == (Error.CONTACT, Mode.MOTION)
     assert rig.places[0][2] - rig.places[-1][2] < 0.03
-
-
-def test_a_force_that_swings_about_the_wanted_one_has_not_settled() -> None:
-    rig = ServerRig(reach=1.0)
-    rig.floor = HEIGHT + 0.0355  # at home the pad presses there
-    press = rig.comply(20.0)
-    for cycle in range(100):
-        rig.floor += 0.003 if cycle % 12 == 0 else -0.003 if cycle % 12 == 6 else 0.0
-        rig.cycle()
-    assert sum(abs(force - 20.0) < 5.0 for force in rig.pressed) > 10
-    assert rig.ends() == {press: RequestEnd.FAILED}
-    assert rig.mode is Mode.MOTION
 
 
 @pytest.mark.parametrize(
@@ -160,14 +111,6 @@ def test_an_impossible_contact_is_refused(fields: dict[str, object], why: str) -
     assert rig.mode is Mode.MOTION
 
 
-def test_a_guard_in_another_frame_is_refused_while_axes_are_of_force() -> None:
-    rig = pressing()
-    other = rig.request(MotionKind.GUARD, frame=(1, 0, 0, 0), guard=(5, 0, 0, 0, 0, 0))
-    rig.run(0.3)
-    assert rig.ends()[other] == RequestEnd.REFUSED
-    assert rig.mode is Mode.FORCE
-
-
 def test_a_restarted_server_goes_on_with_the_same_contact() -> None:
     rig = pressing()
     along = rig.line((X, EDGE + 0.05, HEIGHT), 2.0)
@@ -179,26 +122,3 @@ def test_a_restarted_server_goes_on_with_the_same_contact() -> None:
     assert (rig.write.compliance.id, rig.mode) == (before, Mode.FORCE)
     assert abs(rig.pressed[-1] - 15.0) < 1.0
     assert rig.places[-1][1] == pytest.approx(EDGE + 0.05, abs=1e-3)
-
-
-def test_a_restarted_server_outlives_a_client_that_was_lost_before() -> None:
-    rig = pressing(silence=0.5, hold=1.0)
-    rig.alive = False
-    rig.run(1.0)
-    rig.restart()
-    rig.run(0.3)
-    assert rig.mode is Mode.HELD
-    rig.run(3.5)
-    assert rig.mode is Mode.RELEASED
-    assert rig.pressed[-1] < 2.0
-
-
-def test_a_joint_motion_is_a_request_of_a_server_too() -> None:
-    rig = ServerRig()
-    rig.joints([0.1, 0, 0, 0, 0, 0])
-    rig.line((X, Y, HEIGHT + 0.03))
-    rig.run(3.0)
-    assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE}
-    assert np.allclose(rig.status.quaternion, DOWN, atol=1e-3) or np.allclose(
-        -rig.status.quaternion, DOWN, atol=1e-3
-    )

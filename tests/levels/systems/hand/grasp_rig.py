@@ -42,7 +42,6 @@ class SceneWorld(WorldModel):
 
 
 def program(*steps: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a `[task]` of these steps."""
     return {"posture": {"open": OPEN, "around": AROUND}, "step": list(steps)}
 
 
@@ -84,7 +83,6 @@ class GraspRig(Lockstep):
 
     @property
     def grasp(self) -> Message:
-        """The newest status of the grasp loop."""
         return self.read("grasp.status")
 
     def go(self, seconds: float, steps: int | None = None) -> bool:

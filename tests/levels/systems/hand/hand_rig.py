@@ -86,13 +86,11 @@ class HandRig(Lockstep):
 
     @property
     def executor(self) -> HandExecutor:
-        """The board of the hand."""
         level = self.tasks["hand"].level
         assert isinstance(level, HandExecutor)
         return level
 
     def swing(self, board: str = "all") -> Swing:
-        """Return a board above."""
         level = self.tasks[board].level
         assert isinstance(level, Swing)
         return level
@@ -103,5 +101,4 @@ class HandRig(Lockstep):
         return self.read("hand.status")
 
     def cycles(self, count: int) -> None:
-        """Run `count` cycles of the hand."""
         self.run(count * EVERY * CLOCK_NS * 1e-9)

@@ -73,20 +73,12 @@ def test_a_tip_comes_to_its_point_evenly_and_other_fingers_keep_their_posture() 
     assert speeds[-1] < 0.2
     others = np.delete(np.arange(16), the_kinematics().joints[FINGER])
     assert tips.target.position[others] == pytest.approx(BENT[others])
-
-
-def test_a_point_out_of_reach_keeps_the_joints_within_their_limits() -> None:
-    tips = Tips()
-    start = tips.run(1)
-    tips.grasp.mode[FINGER], tips.grasp.tip[FINGER] = (
-        FingerMode.POINT,
-        start[FINGER] + (0.3, 0.0, -0.3),
-    )
+    # A point out of reach keeps the joints within their limits.
+    tips.grasp.tip[FINGER] = start[FINGER] + (0.3, 0.0, -0.3)
     tips.run(200)
     low, high = HAND.limits.position.T
     assert (tips.target.position >= low).all()
     assert (tips.target.position <= high).all()
-    assert np.isfinite(tips.target.position).all()
 
 
 def test_torques_of_a_force_do_its_work() -> None:

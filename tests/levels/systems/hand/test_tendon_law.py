@@ -118,29 +118,6 @@ def test_lasting_errors_of_valves_are_learned_and_the_least_tension_is_kept(
     assert valves.torque == pytest.approx(-2.0 * torque, rel=1e-3)
 
 
-def test_a_sensor_that_gives_no_number_teaches_nothing() -> None:
-    valves = Valves(gains=TendonGains())
-    valves.status.tension[0, 0] = math.nan
-    valves.status.tick += EVERY
-    valves.law.tensions(valves.status, np.zeros(16), valves.wanted)
-    assert np.isfinite(valves.wanted).all()
-    valves.run(0.1 * valves.hand.torque, 2.0)
-    assert np.isfinite(valves.tension[:, 1:]).all()
-
-
-def test_tendons_of_other_boards_get_no_tension() -> None:
-    hand = the_hand()
-    law = TendonLaw(hand, hand.fingers[3], TendonGains(), CONTEXT)
-    status = Message(HAND_STATUS.dtype({"joints": 16, "fingers": 4}))
-    status.tension = status.wanted = hand.rest
-    law.start(status)
-    tension = np.zeros((2, 16))
-    status.tick += EVERY
-    law.tensions(status, 0.1 * hand.torque, tension)
-    assert (tension[:, ~hand.fingers[3]] == 0.0).all()
-    assert (tension[:, hand.fingers[3]] >= hand.least).all()
-
-
 def test_valves_that_are_closed_teach_nothing() -> None:
     valves = Valves(gains=TendonGains())
     torque = 0.1 * valves.hand.torque
@@ -152,3 +129,8 @@ def test_valves_that_are_closed_teach_nothing() -> None:
         valves.status.tension += 0.1
         valves.law.tensions(valves.status, torque, valves.wanted)
     assert valves.wanted == pytest.approx(before)
+    # Nor does a sensor that gives no number.
+    valves.status.holding, valves.status.tension[0, 0] = 0, math.nan
+    valves.status.tick += EVERY
+    valves.law.tensions(valves.status, np.zeros(16), valves.wanted)
+    assert np.isfinite(valves.wanted).all()

@@ -9,7 +9,6 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
-from rack.backplane.words import Block
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.hand.messages import GraspKind
@@ -19,7 +18,6 @@ from tests.levels.arms import cell, config
 HAND = cell("utah_mit")
 START = HAND.start()
 SIZES = {"joints": 16, "fingers": 4, "bodies": 1, "state": 1}
-CYCLES = 17
 
 
 class Crate:
@@ -58,13 +56,6 @@ class Crate:
         assert port == "plan"
         self.sends.append(fields)
         return True
-
-    def address(self, name: str) -> int:
-        assert name == "coordinator"
-        return 4096
-
-    def words(self, address: int, count: int = 1) -> list[int]:
-        return [CYCLES if address == 4096 + 8 * Block.CYCLES else 0] * count
 
 
 def workstation(**params: Any) -> Workstation:
@@ -114,18 +105,11 @@ def test_it_plans_once_and_anew_when_the_object_moves_before_it_is_held() -> Non
 
 
 def test_it_waits_until_it_knows_object_and_coordinator() -> None:
+    with pytest.raises(LevelError, match="object = cup: not in the scene; objects: can"):
+        workstation(object="cup")
+    with pytest.raises(LevelError, match="opposing = little: the hand has no such finger"):
+        workstation(opposing="little")
     crate, host = Crate(), workstation()
     crate.read = lambda port: Reading(crate.messages[port], Verdict.NONE)  # type: ignore[method-assign]
     host.run(crate)  # type: ignore[arg-type]
     assert not crate.sends
-
-
-def test_a_prompt_reads_the_counts_of_the_boards() -> None:
-    crate = Crate()
-    names = workstation().names(crate)  # type: ignore[arg-type]
-    assert names["boards"]() == {"coordinator": {"cycles": CYCLES, "missed": 0, "skipped": 0}}
-
-
-def test_an_object_that_is_not_in_the_scene_is_refused() -> None:
-    with pytest.raises(LevelError, match="object = cup: not in the scene; objects: can"):
-        workstation(object="cup")

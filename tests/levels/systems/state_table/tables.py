@@ -96,7 +96,6 @@ def table(folder: Path, text: str = DOOR) -> StateTable:
 
 
 def written(folder: Path, text: str) -> Path:
-    """Write a text to a file."""
     path = folder / "door.toml"
     path.write_text(text)
     return path

@@ -3,8 +3,6 @@ points, without a rack."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -12,13 +10,9 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType
 from rack.boards.config import load
 from rack.boards.config.resolved import resolve
-from rack.levels.errors import RobotError
 from rack.levels.level import LevelContext, Ports
 from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
-from rack.levels.systems.state_table.elemental_move import MOVE_TABLE_STATUS
-from rack.levels.systems.state_table.level import TABLE_STATUS, WORD_COMMAND
 from rack.levels.systems.state_table.primitive import (
-    GRIP_CYCLES,
     JOINT_MOVE,
     JOINT_MOVE_STATUS,
     PrimitiveTable,
@@ -54,7 +48,6 @@ class Bench:
         self.tick = 10 * context.every
 
     def message(self, kind: MessageType) -> Message:
-        """Return an empty message."""
         return Message(kind.dtype(dict(self.context.sizes)))
 
     def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
@@ -66,7 +59,6 @@ class Bench:
         self.above = {"move": Reading(command, Verdict.NEW)}
 
     def look(self) -> dict[str, str]:
-        """Return the conditions of this cycle."""
         read = Ports(
             command=self.above,
             statuses=dict(zip(BOARDS, self.readings, strict=True)),
@@ -97,6 +89,11 @@ def bench(context: LevelContext) -> Bench:
 
 def test_a_motion_leads_straight_from_rest_to_rest(bench: Bench) -> None:
     bench.follow()
+    # One to where the arm is never begins.
+    bench.command(bench.home)
+    bench.look()
+    bench.level.do_begin()
+    assert bench.level._curve is None
     goal = bench.home + 0.1
     bench.command(goal, speed=0.5)
     assert bench.look()["arm"] == "arrived"
@@ -133,23 +130,12 @@ def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: Ben
         assert bench.level._curve is not None
         ends[speed] = bench.level._curve.ends_s
     assert ends[0.0] == ends[0.01] > ends[0.5] > ends[1.0] == ends[3.0]
-
-
-def test_a_goal_beyond_a_joints_limits_is_cut(bench: Bench) -> None:
-    bench.follow()
+    # A goal beyond a joint's limits is cut.
+    bench.level._curve = None
     bench.command(np.full(len(bench.home), 100.0))
     bench.look()
     bench.level.do_begin()
     np.testing.assert_array_equal(bench.level._end, bench.level._limits.position[:, 1])
-
-
-def test_a_motion_to_where_the_arm_is_never_begins(bench: Bench) -> None:
-    bench.follow()
-    bench.command(bench.home)
-    bench.look()
-    bench.level.do_begin()
-    assert bench.level._curve is None
-    assert bench.look()["arm"] == "arrived"
 
 
 @pytest.mark.parametrize("action", ["do_halt", "do_begin"])
@@ -177,19 +163,6 @@ def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: s
     assert bench.level._curve is None
 
 
-@pytest.mark.parametrize(
-    ("off", "arm"), [(0.009, "arrived"), (-0.009, "arrived"), (0.011, "moving")]
-)
-def test_a_joint_that_is_not_where_it_is_commanded_moves(
-    bench: Bench, off: float, arm: str
-) -> None:
-    bench.follow()
-    position = bench.home.copy()
-    position[2] += off
-    bench.below[0].position = position
-    assert bench.look()["arm"] == arm
-
-
 def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) -> None:
     bench.follow()
     bench.below[1].stopped = 1
@@ -210,30 +183,6 @@ def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) ->
         assert bench.level.detail == "its board is lost"
         bench.readings[0] = good
         assert bench.look()["arm"] != "away"
-
-
-def test_boards_that_hold_have_four_cycles_to_take_over(bench: Bench) -> None:
-    bench.below[0].holding = 1
-    arms = []
-    for _ in range(6):
-        arms.append(bench.look()["arm"])
-        bench.give()
-    assert arms == ["arrived"] * 6
-    # In the sixth the set points began anew.
-    assert bench.level._follows == 1
-
-
-def test_a_gripper_counts_as_moving_until_its_motion_must_show(bench: Bench) -> None:
-    gripper = bench.level._gripper
-    assert bench.look()["gripper"] == "open"
-    bench.command(bench.home, row=1)
-    bench.look()
-    bench.level.do_close()
-    bench.arm.opening = gripper.closed
-    assert [bench.look()["gripper"] for _ in range(GRIP_CYCLES)] == ["moving"] * 5 + ["empty"]
-    bench.level.do_open()
-    bench.arm.opening = gripper.open
-    assert [bench.look()["gripper"] for _ in range(GRIP_CYCLES)] == ["moving"] * 5 + ["open"]
 
 
 @pytest.mark.parametrize(
@@ -258,43 +207,6 @@ def test_a_gripper_holds_what_keeps_it_from_closing(
     assert bench.look()["gripper"] == expected
 
 
-@pytest.mark.parametrize("row", [0, 1])
-def test_what_the_gripper_holds_is_carried_and_reported(bench: Bench, row: int) -> None:
-    level = bench.level
-    bench.command(bench.home, row=row)
-    bench.follow()
-    free = bench.write.command.load.copy()
-    assert (bench.write.command.opening, bench.write.command.payload_mass) == (
-        level._gripper.open,
-        0.0,
-    )
-    level.do_close()
-    bench.arm.opening = level._gripper.closed + 0.02
-    for _ in range(GRIP_CYCLES):
-        bench.follow()
-    command, status = bench.write.command, bench.write.status
-    assert (status.closed, status.held, status.object) == (1, 1, row)
-    assert command.payload_mass == level._masses[row] > 0
-    assert (command.opening, command.force) == (level._gripper.closed, level._gripper.force)
-    assert not np.allclose(command.load, free)
-    level.do_open()
-    bench.arm.opening = level._gripper.open
-    for _ in range(GRIP_CYCLES):
-        bench.follow()
-    assert (status.closed, status.held, status.object) == (0, 0, -1)
-    assert command.payload_mass == 0
-    np.testing.assert_allclose(command.load, free)
-
-
-def test_it_holds_something_that_it_does_not_know(bench: Bench) -> None:
-    bench.level.do_close()
-    bench.arm.opening = bench.level._gripper.closed + 0.02
-    for _ in range(GRIP_CYCLES):
-        bench.follow()
-    assert (bench.write.status.held, bench.write.status.object) == (1, -1)
-    assert bench.write.command.payload_mass == 0
-
-
 def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -> None:
     last = bench.message(JOINT_MOVE_STATUS)
     last.closed = 1
@@ -314,48 +226,3 @@ def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -
     np.testing.assert_allclose(level._point[0], bench.home + 0.1)
     np.testing.assert_allclose(level._end, bench.home + 0.2)
     assert fresh.command.id == 77
-
-
-def test_an_arm_without_a_gripper_is_refused(context: LevelContext) -> None:
-    robot = context.robot.model_copy(update={"gripper": None})
-    with pytest.raises(RobotError, match="has none"):
-        PrimitiveTable(replace(context, robot=robot))
-
-
-def test_whoever_changes_the_bytes_of_a_message_changes_its_version(context: LevelContext) -> None:
-    kinds = (WORD_COMMAND, TABLE_STATUS, JOINT_MOVE, JOINT_MOVE_STATUS, MOVE_TABLE_STATUS)
-    sizes = dict(context.sizes)
-    bytes_of = {kind.name: (kind.version, kind.dtype(sizes).itemsize) for kind in kinds}
-    assert bytes_of == {
-        "word_command": (1, 76),
-        "table_status": (1, 436),
-        "joint_move": (1, 176),
-        "joint_move_status": (1, 544),
-        "move_table_status": (1, 448),
-    }
-
-
-def test_a_set_point_is_due_two_cycles_after_its_release_and_carries_the_load_there(
-    bench: Bench,
-) -> None:
-    level = bench.level
-    every = level.context.every
-    bench.follow()
-    bench.command(bench.home + 0.3)
-    bench.look()
-    assert level._due == bench.tick + 2 * every
-    released = bench.tick
-    level.do_begin()
-    # A new curve begins where the set point before ends.
-    assert level._from == bench.tick + every
-    command = bench.give()
-    assert (command.id, command.due) == (released // every + 1, released + 2 * every)
-    for _ in range(12):
-        bench.follow()
-    assert np.abs(command.velocity).max() > 0.0
-    inertia, bias = level._dynamics.terms(command.position, command.velocity)
-    np.testing.assert_allclose(command.load, bias)
-    np.testing.assert_allclose(command.inertia, np.diagonal(inertia))
-    bench.below[1].stopped = 1
-    bench.look()
-    assert bench.give().due == 0

@@ -5,18 +5,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.message import State
 from rack.boards import Rack
-from rack.boards.config import CONFIGS, load, loads
+from rack.boards.config import CONFIGS, load
 from rack.boards.config.resolved import resolve
 from rack.boards.errors import ConfigError
+from rack.levels.systems.state_table.task import TaskPlanConfig, TaskTable
+from rack.levels.tables import SceneConfig
 
 FOLDER = CONFIGS / "nist-state-table"
-TASKLESS = 'command=[{ level = "elemental_move", what = "do", name = "pick block1", tick = 100 }]'
 KILLED = 'fault=[{ kind = "kill", board = "primitive", at = 0.3 }]'
 
 
@@ -41,17 +40,6 @@ def test_it_picks_up_a_block_though_a_board_dies_on_the_way(rack_name: str) -> N
     assert heights[-1] > heights[0] + 0.01
 
 
-@pytest.mark.slow
-def test_without_a_task_level_the_operator_commands_the_elemental_moves(rack_name: str) -> None:
-    config = load(FOLDER / "direct.toml", [f"name={rack_name}", "clock.mode=lockstep", TASKLESS])
-    with Rack(config) as rack:
-        rack.run(0.8)
-        statuses = MailboxRing(rack.segment, "elemental_move.status").drain().rows["message"]
-    assert statuses["words"][-1] == b"pick block1"
-    assert set(statuses["state"][12:].tolist()) == {State.EXECUTING}
-    assert np.unique(statuses["in_state"]).tolist() == [b"idle", b"reaching"]
-
-
 def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "task.toml"
     path.write_text(
@@ -66,6 +54,14 @@ def test_a_place_that_the_level_below_does_not_know_is_refused(tmp_path: Path) -
     assert expected in str(caught.value)
 
 
+def test_objects_that_the_scene_lacks_are_named() -> None:
+    plan = TaskPlanConfig.model_validate(
+        {"step": [{"object": "a", "place": "x"}, {"object": "b", "place": "x"}]}
+    )
+    scene = SceneConfig(objects=("a", "c"))
+    assert TaskTable.plan_flaws(scene, plan) == ["plan.step[1].object: unknown 'b'; objects: a, c"]
+
+
 def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "careful.toml"
     lines = (FOLDER / "tables" / "elemental_move_careful.toml").read_text().splitlines()
@@ -77,10 +73,3 @@ def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: 
         == 'board.elemental_move.params.tables.careful = "careful.toml": does not know \'place'
         " left', as 'normal' does; all tables of a level know the same commands"
     )
-
-
-@pytest.mark.parametrize("variant", [FOLDER / "nist-state-table.toml", FOLDER / "direct.toml"])
-def test_its_configs_are_sound(variant: Path) -> None:
-    config = load(variant)
-    assert resolve(config).layout.tasks
-    assert loads(config.text()) == config

@@ -73,7 +73,6 @@ class TrajectoryRig:
         return self.message(kind.type if isinstance(kind, Output) else kind)
 
     def message(self, kind: Any) -> Message:
-        """Return an empty message."""
         if kind.name not in self._kinds:
             self._kinds[kind.name] = kind.dtype(self.sizes)
         return Message(self._kinds[kind.name])
@@ -98,7 +97,6 @@ class TrajectoryRig:
         return self.request(MotionKind.JOINTS, joints=self.cell.home + np.asarray(change), **fields)
 
     def say(self, what: Operation) -> None:
-        """Give an operator's command."""
         self.order.id, self.order.what, self.ordered = self.order.id + 1, what, True
 
     def restart(self) -> None:
@@ -108,7 +106,6 @@ class TrajectoryRig:
         self.brake()
 
     def brake(self) -> None:
-        """Let the boards hold where they are."""
         for status in self.statuses.values():
             status.holding, status.target_velocity = 1, 0.0
 
@@ -140,7 +137,6 @@ class TrajectoryRig:
         return Ports(requests=requests, boards=boards, world=world, **own, **self.others())
 
     def others(self) -> dict[str, Reading]:
-        """Return what else the level reads."""
         return {}
 
     def _last(self, source: Input) -> Reading:
@@ -152,7 +148,6 @@ class TrajectoryRig:
         return Reading(message, Verdict.OLD if there else Verdict.NONE)
 
     def obey(self) -> None:
-        """Let the boards do what the last cycle commanded."""
         before = self.write.command
         for status in self.statuses.values():
             if before.due and not status.stopped:

@@ -18,7 +18,6 @@ requests = st.lists(
     min_size=2,
     max_size=4,
 )
-DOWN = (0.0, 0.0, 1.0, 0.0)
 WITHIN = (1.0, 1.0, 1.0, 1.0, 0.3, 1.0)  # joint 5 is near a limit at home
 
 
@@ -50,44 +49,14 @@ def test_no_chain_of_requests_exceeds_a_limit(chain: list, at: float, what: str)
 
 
 def act(rig: TrajectoryRig, what: str) -> None:
-    """Do something to the level."""
     if what == "cancel":
         rig.request(MotionKind.CANCEL)
     elif what != "nothing":
         rig.say(Operation[what.upper()])
 
 
-def test_blended_requests_do_not_stop_at_their_goals() -> None:
-    rig = TrajectoryRig()
-    for part in (0.2, 0.4, 0.6):
-        rig.joints([part, 0, 0, 0, 0, 0], acceleration=0.2, segment=0.5)
-    rig.run(0.4)
-    while rig.cycle().current == 2 and not rig.ends():
-        pass
-    rig.run(0.5)
-    assert rig.write.status.current in (2, 3)
-    speeds = np.array(rig.velocities)[:, 0]
-    cruise = speeds[len(speeds) // 2 :]
-    # All three are of one speed and direction: the blends are invisible.
-    assert np.allclose(cruise[cruise > 0.39], 0.4, atol=1e-6)
-    assert (cruise > 0.39).sum() > 10
-    rig.run(2.0)
-    assert np.allclose(rig.positions[-1][0] - rig.cell.home[0], 0.6, atol=1e-9)
-
-
-def test_a_corner_is_rounded_and_the_next_goal_reached() -> None:
-    rig = TrajectoryRig()
-    rig.joints([0.5, 0, 0, 0, 0, 0], acceleration=0.3)
-    rig.joints([0.5, 0, 0.5, 0, 0, 0], acceleration=0.3)
-    rig.run(6.0)
-    q = np.array(rig.positions) - rig.cell.home
-    off = np.min(np.hypot(q[:, 0] - 0.5, q[:, 2]))
-    assert 1e-3 < off < 0.1
-    assert np.allclose(q[-1], [0.5, 0, 0.5, 0, 0, 0], atol=1e-9)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("cycles", range(10, 110, 20))
+@pytest.mark.parametrize("cycles", [10, 50, 90])
 def test_a_cancel_at_any_time_ramps_to_rest_and_drops_the_rest(cycles: int) -> None:
     rig = TrajectoryRig()
     first = [
@@ -107,22 +76,3 @@ def test_a_cancel_at_any_time_ramps_to_rest_and_drops_the_rest(cycles: int) -> N
     assert ends[cancel] == ends[after] == RequestEnd.DONE
     assert all(ends[r] == before.get(r, RequestEnd.CANCELLED) for r in first)
     assert np.allclose(rig.positions[-1] - rig.cell.home, 0.1, atol=1e-9)
-
-
-def test_a_tool_path_is_straight_and_turns_into_a_joint_motion() -> None:
-    rig = TrajectoryRig()
-    tool = rig.cycle().tool.copy()
-    rig.request(MotionKind.POSE, position=np.add(tool, [0.1, 0.25, -0.1]), quaternion=DOWN)
-    tools = [rig.cycle().tool.copy() for _ in range(300)]
-    way = np.array(tools) - tool
-    along = way @ np.array([0.1, 0.25, -0.1]) / np.linalg.norm([0.1, 0.25, -0.1])
-    off = np.linalg.norm(way, axis=1) ** 2 - along**2
-    assert along.max() > 0.2
-    assert np.sqrt(np.maximum(off, 0.0)).max() < 1e-4
-    rig.request(MotionKind.POSE, position=tool, quaternion=DOWN)
-    rig.joints([0.4, 0, 0, 0, 0, 0])
-    rig.run(5.0)
-    speed, acceleration = rig.excess()
-    assert speed <= 1.0
-    assert acceleration <= 1.0
-    assert np.allclose(rig.positions[-1][0] - rig.cell.home[0], 0.4, atol=1e-9)

@@ -4,8 +4,6 @@ done."""
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,8 +11,7 @@ import pytest
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext
-from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
+from rack.levels.systems.trajectory.commands import Motions
 from rack.levels.systems.trajectory.messages import MOTION_STATUS, MotionKind, RequestEnd
 from tests.levels.arms import config
 
@@ -52,12 +49,10 @@ class Level:
         return True
 
     def read(self, port: str) -> Reading:
-        """Return the status."""
         assert port == "motion"
         return Reading(self.status, Verdict.NEW)
 
     def send(self, port: str, **fields: Any) -> bool:
-        """Queue a request."""
         assert port == "requests"
         if len(self.queue) >= self.room:
             return False
@@ -66,7 +61,6 @@ class Level:
         return True
 
     def sent(self, port: str) -> int:
-        """Return the number of messages."""
         return self.serial
 
     def finish(self) -> None:
@@ -92,6 +86,14 @@ def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> N
     assert (level.done[1]["body"], level.done[1]["segment"]) == (SCENE.bodies.index("block2"), 2.0)
     assert level.done[3]["joints"] == PUMA.home
     assert arm.end_of(last) is RequestEnd.DONE
+    first, last = arm.stay(0.1), arm.stay(0.1)
+    # A wait ends when its condition holds.
+    assert not arm.wait(until=lambda: arm.done(first))
+    assert not arm.done(last)
+    with pytest.raises(
+        LevelError, match=r"line: body = block9: not in the scene; permitted: block1, "
+    ):
+        arm.line((0.0, 0.0, 0.1), body="block9")
 
 
 @pytest.mark.parametrize(("room", "loses"), [(2, ()), (100, (2,))], ids=["full", "lost"])
@@ -115,53 +117,3 @@ def test_a_process_that_is_restarted_cancels_first_and_numbers_beyond_all_before
         (8, MotionKind.CANCEL),
         (9, MotionKind.STAY),
     ]
-
-
-def test_a_wait_ends_when_its_condition_holds() -> None:
-    level = Level()
-    arm = motions(level)
-    first = arm.stay(0.1)
-    last = arm.stay(0.1)
-    assert not arm.wait(until=lambda: arm.done(first))
-    assert not arm.done(last)
-
-
-def test_an_unknown_body_is_refused() -> None:
-    with pytest.raises(
-        LevelError, match=r"line: body = block9: not in the scene; permitted: block1, "
-    ):
-        motions(Level()).line((0.0, 0.0, 0.1), body="block9")
-
-
-@pytest.fixture
-def environment(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> Callable[[str], CommandEnvironment]:
-    """Make a command environment that runs a script of this text."""
-    monkeypatch.syspath_prepend(str(tmp_path))
-
-    def make(text: str) -> CommandEnvironment:
-        (tmp_path / "moves.py").write_text(text)
-        params = {"script": "moves.py"}
-        return CommandEnvironment(
-            LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params)
-        )
-
-    return make
-
-
-def test_a_script_finds_the_calls_by_name(environment: Callable[[str], CommandEnvironment]) -> None:
-    level = Level()
-    environment("move()\nstay(0.5)\nwait()\n").run(level)
-    assert [request["kind"] for request in level.done] == [MotionKind.JOINTS, MotionKind.STAY]
-
-
-def test_a_script_that_is_not_there_is_one_line() -> None:
-    params = {"script": "nowhere.py"}
-    program = CommandEnvironment(
-        LevelContext("command", 1, 1, 2_000_000, 0, PUMA, SCENE, {}, SIZES, params=params)
-    )
-    with pytest.raises(
-        LevelError, match=r"params.script = nowhere.py: not in a folder of python_path"
-    ):
-        program.run(Level())

@@ -88,16 +88,11 @@ def test_a_change_that_is_no_touch(
     assert end(rig) == RequestEnd.NONE
 
 
-def test_a_touch_after_all_that_is_found(rig: TrajectoryRig) -> None:
-    rig.brake()
-    rig.tick += 2 * EVERY
-    rig.run(1.5)
-    press(rig, TOUCH)
-    assert end(rig) == RequestEnd.GUARDED
-
-
 def test_the_guard_outlives_the_level(rig: TrajectoryRig) -> None:
     rig.restart()
+    rig.run(1.5)
+    rig.brake()
+    rig.tick += 2 * EVERY
     rig.run(1.5)
     assert rig.write.status.current == 1
     press(rig, TOUCH)

@@ -7,13 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rack.levels.systems.trajectory.legs import JointLeg, Settling, TimeLaw, Times
+from rack.levels.systems.trajectory.legs import Settling, TimeLaw
 from tests.levels.arms import cell
 
 CELL = cell("puma560")
 H = 1e-3
-
-times = st.floats(0.05, 1.0)
 parts = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6)
 
 
@@ -31,33 +29,6 @@ def test_a_leg_is_smooth_and_passes_its_goal_in_the_middle_of_its_blend() -> Non
     # At full speed it would be at its goal after the nominal time.
     at = law.ends_s / 2.0
     assert abs(law.part(at) + (law.nominal_s - at) / law.segment_s - 1.0) < 1e-12
-
-
-def test_two_legs_begun_half_a_blend_apart_are_one_straight_motion() -> None:
-    law = TimeLaw(segment_s=1.0, half_blend_s=0.2)
-    second = law.nominal_s - law.half_blend_s
-    way = [law.part(t) + law.part(t - second) for t in np.arange(0.4, second + 0.9, 0.01)]
-    assert np.abs(np.diff(way, 2)).max() < 1e-12
-
-
-@pytest.mark.slow
-@given(parts, times, st.floats(0.0, 2.0))
-@settings(max_examples=25, deadline=None)
-def test_a_leg_takes_half_the_acceleration_at_most(
-    change: list[float], half: float, segment: float
-) -> None:
-    limits = CELL.limits
-    leg = JointLeg(CELL.home, CELL.home + np.array(change), Times(segment, half), limits)
-    assert leg.law.segment_s >= max(segment, 2.0 * half)
-    t = np.linspace(0.0, leg.law.ends_s, 400)
-    q = np.array([leg.at(time) for time in t])
-    speed = np.diff(q, axis=0) / t[1]
-    bend = np.diff(speed, axis=0) / t[1]
-    assert (np.abs(speed) <= limits.velocity * (1 + 1e-9)).all()
-    assert (np.abs(bend) <= 0.5 * limits.acceleration * (1 + 1e-6) + 1e-6).all()
-    assert np.allclose(
-        leg.at(leg.law.ends_s + 1.0), CELL.home + np.array(change), rtol=0.0, atol=1e-12
-    )
 
 
 @pytest.mark.slow

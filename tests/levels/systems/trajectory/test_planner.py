@@ -51,7 +51,6 @@ class PlanningRig:
         self.start()
 
     def start(self) -> None:
-        """Begin anew, as after a restart."""
         self.planner = RequestPlanner(self.context)
 
     def run(self, cycles: int = 1) -> list[int]:
@@ -101,13 +100,6 @@ def test_requests_are_queued_a_few_ahead_of_the_arm() -> None:
     )
 
 
-def test_a_full_queue_is_tried_again_later() -> None:
-    rig = PlanningRig(MOVES, places=1, ahead=4)
-    assert rig.run(3) == [1]
-    rig.below.taken = 1
-    assert rig.run(3) == [2]
-
-
 def test_a_restarted_planner_goes_on_after_the_newest_request_taken() -> None:
     rig = PlanningRig(MOVES, ahead=3)
     rig.run(3)
@@ -125,17 +117,6 @@ def test_a_request_that_is_not_taken_is_sent_again() -> None:
     assert rig.run(5) == [2, 3]
 
 
-def test_a_cancel_waits_for_its_time() -> None:
-    rig = PlanningRig([*MOVES[:2], {"do": "cancel", "after": 1.0}, MOVES[0]])
-    rig.run(1)
-    rig.below.taken, rig.below.current = 2, 1
-    assert rig.run(20) == []
-    rig.below.current = 2
-    assert rig.run(10) == []
-    assert rig.run(4) == [3, 4]
-    assert [record["kind"] for record in rig.sent[2:]] == [MotionKind.CANCEL, MotionKind.JOINTS]
-
-
 def test_tool_goals_become_joint_positions_near_those_before() -> None:
     place = [0.45, 0.30, 0.75]
     rig = PlanningRig(
@@ -143,7 +124,10 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
             {"do": "move", "position": place},
             {"do": "line", "position": [0.6, 0.1, 0.65]},
             {"do": "home"},
-        ]
+            {"do": "line", "position": [0.0, 0.0, 0.1], "body": "post", "live": True},
+            {"do": "move", "position": [3.0, 0.0, 0.5]},
+        ],
+        ahead=5,
     )
     rig.run(3)
     ik = InverseKinematics(CELL, 1)
@@ -152,23 +136,14 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
         MotionKind.JOINTS,
         MotionKind.POSE,
         MotionKind.JOINTS,
+        MotionKind.POSE,
+        MotionKind.POSE,
     ]
+    assert (rig.sent[3]["body"], rig.sent[3]["live"]) == (SCENE.bodies.index("post"), 1)
+    assert rig.sent[4]["position"].tolist() == [3.0, 0.0, 0.5]
     assert np.array_equal(rig.sent[2]["joints"], CELL.home)
     assert rig.sent[1]["body"] == -1
     assert np.allclose(rig.sent[1]["quaternion"], ik.tool_at(CELL.home).quaternion)
-
-
-def test_a_goal_out_of_reach_is_queued_as_it_stands() -> None:
-    rig = PlanningRig([{"do": "move", "position": [3.0, 0.0, 0.5]}])
-    rig.run(1)
-    assert rig.sent[0]["kind"] == MotionKind.POSE
-    assert rig.sent[0]["position"].tolist() == [3.0, 0.0, 0.5]
-
-
-def test_live_goals_name_their_body() -> None:
-    rig = PlanningRig([{"do": "line", "position": [0.0, 0.0, 0.1], "body": "post", "live": True}])
-    rig.run(1)
-    assert (rig.sent[0]["body"], rig.sent[0]["live"]) == (SCENE.bodies.index("post"), 1)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.levels.algebra import Array
 from rack.levels.operator import Answer, Operation
-from rack.levels.planning.pose import Pose
-from rack.levels.systems.trajectory.messages import HELD, MotionKind, RequestEnd
+from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
 from tests.levels.systems.trajectory.rig import EVERY, PERIOD_S, TrajectoryRig
 
 DOWN = (0.0, 0.0, 1.0, 0.0)
@@ -58,47 +56,6 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     assert speed <= 1.0
     assert acceleration <= 1.0
     assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE, 3: RequestEnd.DONE}
-
-
-def test_a_live_goal_is_evaluated_once_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = TrackingRig()
-    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
-    rig.follow(1.0)
-    goal = rig.level._work.goal
-    assert goal is not None
-    evaluate = goal._followed
-    evaluations: list[Pose] = []
-
-    def evaluated(frame: Pose, seen: Pose, velocity: Array, passed_s: float) -> Pose:
-        evaluations.append(evaluate(frame, seen, velocity, passed_s))
-        return evaluations[-1]
-
-    monkeypatch.setattr(goal, "_followed", evaluated)
-    rig.follow(1.0)
-    assert len(evaluations) == round(1.0 / PERIOD_S)
-
-
-def test_a_copied_goal_stays_where_the_body_was() -> None:
-    rig = TrackingRig()
-    rig.request(MotionKind.POSE, position=(0.05, 0, 0.1), quaternion=DOWN, body=POST, live=0)
-    rig.follow(5.0)
-    assert np.allclose(rig.write.status.tool - rig.tool, [0.05, 0, 0], atol=1e-4)
-
-
-def test_a_body_that_outruns_the_arm_fails_the_request_and_the_arm_ramps_to_rest() -> None:
-    rig = TrackingRig(speed=1.2)
-    rig.at = 3.0
-    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
-    rig.request(MotionKind.STAY, segment=9.0)
-    rig.follow(6.0)
-    status = rig.write.status
-    assert status.state == State.ERROR
-    assert rig.ends()[2] == RequestEnd.FAILED
-    assert "request 2: " in status.reason
-    assert status.resting
-    speed, acceleration = rig.excess()
-    assert speed <= 1.05
-    assert acceleration <= 1.1
 
 
 def test_an_error_refuses_what_comes_until_a_cancel() -> None:
@@ -174,15 +131,6 @@ def test_a_restarted_level_neither_repeats_nor_loses_a_request() -> None:
     assert np.allclose(rig.positions[-1] - rig.cell.home, [0.2, 0, 0, 0, 0, 0], atol=1e-9)
 
 
-def test_a_request_sent_twice_is_done_once() -> None:
-    rig = TrajectoryRig()
-    rig.joints([0.3, 0, 0, 0, 0, 0])
-    rig.queue.append(rig.queue[0])
-    rig.run(4.0)
-    assert rig.ends() == {1: RequestEnd.DONE}
-    assert rig.write.status.taken == 1
-
-
 def test_a_request_that_was_lost_is_missed_until_it_is_sent_again() -> None:
     rig = TrajectoryRig()
     for part in (0.1, 0.2, 0.3):
@@ -192,28 +140,22 @@ def test_a_request_that_was_lost_is_missed_until_it_is_sent_again() -> None:
     status = rig.run(3.0)
     assert (status.taken, status.done, status.state) == (1, 1, State.HOLDING)
     assert status.reason == "request 2 is missing: send all again from there, or a cancel"
-    rig.queue += [lost, later]
+    # Those that were sent twice are done once.
+    rig.queue += [lost, lost, later]
     status = rig.run(4.0)
     assert (status.taken, status.done, status.state) == (3, 3, State.DONE)
-
-
-def test_more_than_the_level_holds_waits_in_the_queue() -> None:
-    rig = TrajectoryRig()
-    for k in range(HELD + 4):
-        rig.joints([0.01 * k, 0, 0, 0, 0, 0])
-    rig.cycle()  # it takes none before it has recalled what it holds
-    assert rig.write.status.taken == 0
-    rig.cycle()
-    assert len(rig.queue) == 4
-    assert rig.write.status.taken == HELD
-    rig.run(20.0)
-    assert not rig.queue
-    assert rig.write.status.done == HELD + 4
 
 
 def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -> None:
     rig = TrajectoryRig()
     rig.joints([0.5, 0, 0, 0, 0, 0])
+    rig.run(1.0)
+    rig.lost.add("joints1")
+    status = rig.run(0.2)
+    assert (rig.write.command.due, status.state) == (0, State.HOLDING)
+    assert status.reason.startswith("waiting for joints1: no status for")
+    rig.lost.clear()
+    rig.brake()
     rig.run(1.0)
     name, stopped = next(iter(rig.statuses.items()))
     stopped.stopped, stopped.reason = 1, "brakes engaged"
@@ -223,26 +165,13 @@ def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -
     assert status.reason == f"waiting for {name}: brakes engaged"
     stopped.target[0] += 0.02  # it sagged meanwhile
     stopped.stopped, stopped.reason = 0, ""
+
     rig.cycle()
     rig.cycle()
     assert abs(rig.write.command.position[0] - stopped.target[0]) < 1e-3
     status = rig.run(4.0)
     assert status.state == State.DONE
     assert np.allclose(rig.positions[-1][0] - rig.cell.home[0], 0.5, atol=1e-9)
-
-
-def test_a_lost_board_holds_all_joints() -> None:
-    rig = TrajectoryRig()
-    rig.joints([0.5] * 6)
-    rig.run(1.0)
-    rig.lost.add("joints1")
-    status = rig.run(0.2)
-    assert rig.write.command.due == 0
-    assert status.state == State.HOLDING
-    assert status.reason.startswith("waiting for joints1: no status for")
-    rig.lost.clear()
-    rig.brake()
-    assert rig.run(6.0).state == State.DONE
 
 
 def test_an_operator_holds_and_resumes() -> None:
@@ -267,20 +196,6 @@ def test_an_operator_holds_and_resumes() -> None:
     assert acceleration <= 1.0
 
 
-def test_the_gripper_keeps_the_last_grip_and_the_arm_waits_for_it() -> None:
-    rig = TrajectoryRig()
-    rig.request(MotionKind.GRIP, opening=0.012, force=9.0, segment=0.4)
-    rig.joints([0.2, 0, 0, 0, 0, 0])
-    status = rig.run(0.3)
-    assert status.current == 1
-    assert status.resting
-    assert (rig.write.command.opening, rig.write.command.force) == (0.012, 9.0)
-    rig.restart()
-    rig.run(4.0)
-    assert (rig.write.command.opening, rig.write.command.force) == (0.012, 9.0)
-    assert rig.ends() == {1: RequestEnd.DONE, 2: RequestEnd.DONE}
-
-
 def test_set_points_are_due_two_cycles_later_with_the_load_of_the_motion() -> None:
     rig = TrajectoryRig()
     rig.joints([0.5, 0.5, 0, 0, 0, 0])
@@ -291,3 +206,19 @@ def test_set_points_are_due_two_cycles_later_with_the_load_of_the_motion() -> No
     assert np.array_equal(command.load, terms.bias)
     assert np.array_equal(command.inertia, terms.inertia.diagonal())
     assert np.abs(command.velocity).max() > 0.1
+
+
+def test_a_body_that_outruns_the_arm_fails_the_request_and_the_arm_ramps_to_rest() -> None:
+    rig = TrackingRig(speed=1.2)
+    rig.at = 3.0
+    rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
+    rig.request(MotionKind.STAY, segment=9.0)
+    rig.follow(6.0)
+    status = rig.write.status
+    assert status.state == State.ERROR
+    assert rig.ends()[2] == RequestEnd.FAILED
+    assert "request 2: " in status.reason
+    assert status.resting
+    speed, acceleration = rig.excess()
+    assert speed <= 1.05
+    assert acceleration <= 1.1
