@@ -18,6 +18,7 @@ import pytest
 
 from rack.tools.lab.reproduction.experiments import (
     figures,
+    partition,
     response,
     sharing,
     switch,
