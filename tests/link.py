@@ -84,9 +84,9 @@ class ReadingTask:
         """Read once."""
         self.ports.read(tick)
         reading: Reading = self.ports.values.point
-        row = reading.value.row
-        assert (row == reading.value.id).all(), "half a message, or a forged one"
-        released = reading.value.id if reading.is_there else -1
+        row = reading.message.row
+        assert (row == reading.message.id).all(), "half a message, or a forged one"
+        released = reading.message.id if reading.is_there else -1
         self.seen.append(Seen(tick, released, reading.verdict.name, reading.is_lost))
         return reading
 

@@ -27,12 +27,12 @@ def test_an_order_of_the_workstation_comes_to_the_fingers_as_interrupts() -> Non
 
         def status() -> Message:
             rack.watch(0.02)
-            return grasp.peek().value
+            return grasp.peek().message
 
         wait_until(lambda: status().kind == GraspKind.CLOSE)
         assert status().plan == 1
         rack.stop("seen enough")
-        plan = open_observer(rack.segment, "adapter.plan").peek().value
+        plan = open_observer(rack.segment, "adapter.plan").peek().message
         tensions = [
             MailboxRing(rack.segment, f"{finger}.command").drain().rows
             for finger in ("index", "thumb")

@@ -28,7 +28,7 @@ def ran(seconds: float, *settings: str) -> tuple[Outcome, list[Event], Message]:
     config = load(EXAMPLE, [f"name={NAME}", "clock.mode=lockstep", AWAY, *settings])
     with Rack(config) as rack:
         outcome = rack.run(seconds)
-        return outcome, rack.events, open_observer(rack.segment, "servo.status").peek().value
+        return outcome, rack.events, open_observer(rack.segment, "servo.status").peek().message
 
 
 @pytest.mark.slow

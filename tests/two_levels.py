@@ -5,51 +5,66 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pydantic
 
-from rack.backplane.message import Field, Message, MessageType, State, command, status
-from rack.levels.level import Executor, Input, Planner, Ports, Program
+from rack.backplane.message import Command, Field, Message, MessageType, State, Status, field
+from rack.levels.level import Executor, Input, Output, Planner, Program
 from rack.levels.tables import RobotConfig, SceneConfig
 
-COUNT_COMMAND = command("count_command", 1, Field("goal", "i8", "1", "count to reach"))
-COUNT_STATUS = status("count_status", 1, Field("count", "i8", "1", "count reached"))
-COUNT_PLAN = MessageType(
-    "count_plan", 1, (Field("steps", "i8", "1", "counts to go, by joint", ("joints",)),)
-)
-SMALL_PLAN = MessageType("small_plan", 1, (Field("steps", "i8", "1", "counts to go"),))
+
+class CountCommand(Command, version=1):
+    """Count command."""
+
+    goal: int = field(unit="1", doc="count to reach")
+
+
+class CountStatus(Status, version=1):
+    """Count status."""
+
+    count: int = field(unit="1", doc="count reached")
+
+
+class CountPlan(Message, version=1):
+    """Count plan."""
+
+    steps: np.ndarray = field("i8", unit="1", doc="counts to go, by joint", shape="joints")
+
+
+class SmallPlan(Message, version=1):
+    """Small plan."""
+
+    steps: int = field(unit="1", doc="counts to go")
 
 
 class Upper(Executor):
     """Commands a goal, reads how far it is."""
 
-    inputs = {"status": Input(COUNT_STATUS, "below.status")}
-    outputs = {"command": COUNT_COMMAND, "status": COUNT_STATUS}
+    below = Input(CountStatus, "below.status")
+    command = Output(CountCommand)
+    status = Output(CountStatus, rests_on=below)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Ask for one more."""
-        write.command.goal = read.status.value.count + 1
+        self.command.goal = self.below.message.count + 1
 
 
 class Stateless(Upper):
     """Has a status of its own, without a state or a reason."""
 
-    outputs = {
-        "command": COUNT_COMMAND,
-        "status": MessageType("bare", 1, (Field("fired", "u1", "1", "1: it has"),)),
-    }
+    command = Output(CountCommand)
+    status = MessageType("bare", 1, (Field("fired", "u1", "1", "1: it has"),))
 
 
 class Reasonless(Upper):
     """Holds, and has no field for the reason."""
 
-    outputs = {
-        "command": COUNT_COMMAND,
-        "status": MessageType("terse", 1, (Field("state", "u1", State, "of the level"),)),
-    }
+    command = Output(CountCommand)
+    status = MessageType("terse", 1, (Field("state", "u1", State, "of the level"),))
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Hold."""
-        write.status.state = State.HOLDING
+        self.status.state = State.HOLDING
 
 
 class CountProgram(Program):
@@ -79,27 +94,25 @@ class Programmed(Upper):
 class Unfinished(Executor):
     """A level whose author has not written its method."""
 
-    outputs = {"status": COUNT_STATUS}
+    status = Output(CountStatus)
 
 
 class Lower(Executor):
     """Counts towards the goal, by its own plan."""
 
-    inputs = {
-        "command": Input(COUNT_COMMAND, "above.command"),
-        "plan": Input(SMALL_PLAN, "own.plan"),
-    }
-    outputs = {"status": COUNT_STATUS}
+    above = Input(CountCommand, "above.command")
+    plan = Input(SmallPlan, "own.plan")
+    status = Output(CountStatus)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Count to the goal."""
-        write.status.count = read.command.value.goal
+        self.status.count = self.above.message.goal
 
 
 class Crashing(Lower):
     """Fails in its first cycle."""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Fail."""
         raise RuntimeError("no cycle at all")
 
@@ -107,21 +120,22 @@ class Crashing(Lower):
 class LowerPlanner(Planner):
     """Plans the way to the goal."""
 
-    inputs = {"command": Input(COUNT_COMMAND, "above.command")}
-    output = SMALL_PLAN
+    above = Input(CountCommand, "above.command")
+    output = Output(SmallPlan)
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Plan one step."""
-        write.steps = 1
+        self.output.steps = 1
 
 
 class SizedPlanner(LowerPlanner):
     """Writes a plan whose size only a rack with an arm knows."""
 
-    output = COUNT_PLAN
+    output = Output(CountPlan)
 
 
 class PlanWriter(Lower):
     """Writes the mailbox of its own planner."""
 
-    outputs = {"status": COUNT_STATUS, "plan": SMALL_PLAN}
+    status = Output(CountStatus)
+    plan = Output(SmallPlan)

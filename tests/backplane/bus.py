@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
 from rack.backplane.layout import InterruptSpec, Layout, MailboxSpec, Protocol, Role, TaskSpec, Wake
-from rack.backplane.mailbox.queue import TAKEN, taken_name
-from rack.backplane.message import Field, MessageType
+from rack.backplane.mailbox.queue import QueueTaken, taken_name
+from rack.backplane.message import Message, field
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 
@@ -17,15 +19,16 @@ SERVICE_NS, SPARE_NS = 60_000, 1_000_000
 shows it."""
 NAME = "writer.point"
 SIZES = {"row": 24}
-POINT = MessageType(
-    "point",
-    3,
-    (
-        Field("id", "u4", "1", "serial of the message"),
-        Field("row", "i8", "1", "the serial again in every place: half a message shows", ("row",)),
-        Field("text", "S8", "ASCII", "a word"),
-    ),
-)
+
+
+class Point(Message, version=3):
+    """Point."""
+
+    id: int = field("u4", unit="1", doc="serial of the message")
+    row: np.ndarray = field(
+        "i8", unit="1", doc="the serial again in every place: half a message shows", shape="row"
+    )
+    text: str = field("S8", doc="a word")
 
 
 def mailbox(
@@ -48,10 +51,10 @@ def mailbox(
         every=every,
         delay=delay,
         depth=depth,
-        message=POINT.name,
-        version=POINT.version,
-        size=POINT.dtype(SIZES).itemsize,
-        fields=field_specs(POINT, SIZES),
+        message=Point.message_type.name,
+        version=Point.message_type.version,
+        size=Point.message_type.dtype(SIZES).itemsize,
+        fields=field_specs(Point.message_type, SIZES),
         capacity=capacity,
         interrupt=interrupt if protocol == "interrupt" else None,
     )
@@ -72,10 +75,10 @@ def queue(
         every=read,
         delay=read,
         depth=64,
-        message=TAKEN.name,
-        version=TAKEN.version,
-        size=TAKEN.dtype({}).itemsize,
-        fields=field_specs(TAKEN, {}),
+        message=QueueTaken.message_type.name,
+        version=QueueTaken.message_type.version,
+        size=QueueTaken.message_type.dtype({}).itemsize,
+        fields=field_specs(QueueTaken.message_type, {}),
     )
     return box, position
 

@@ -13,34 +13,39 @@ from rack.backplane.message import (
     MessageType,
     State,
     command,
+    field,
     fill_counts,
     status,
     text_of,
 )
 
-POSE = MessageType(
-    "pose", 1, (Field("position", "f8", "m", "", (3,)), Field("valid", "u1", "1", ""))
-)
-TRACK = MessageType(
-    "track",
-    2,
-    (
-        Field("count", "u2", "1", "poses"),
-        Field("poses", POSE, "", "way", ("poses",)),
-        Field("angle", "f8", "rad", "joints", ("joints", 2)),
-        Field("word", "S4", "ASCII", ""),
-    ),
-)
+
+class Pose(Message, version=1):
+    """Pose."""
+
+    position: np.ndarray = field(unit="m", doc="", shape=3)
+    valid: int = field("u1", unit="1", doc="")
+
+
+class Track(Message, version=2):
+    """Track."""
+
+    count: int = field("u2", unit="1", doc="poses")
+    poses: np.ndarray = field(Pose, doc="way", shape="poses")
+    angle: np.ndarray = field(unit="rad", doc="joints", shape=("joints", 2))
+    word: str = field("S4", doc="")
+
+
 SIZES = {"poses": 5, "joints": 6}
 
 
 @pytest.fixture
 def track() -> Message:
-    return Message(TRACK.dtype(SIZES))
+    return Track.zeros(SIZES)
 
 
 def test_symbolic_sizes_are_filled_in() -> None:
-    dtype = TRACK.dtype(SIZES)
+    dtype = Track.message_type.dtype(SIZES)
     assert dtype["angle"].shape == (6, 2)
     assert dtype["poses"].shape == (5,)
     assert dtype["poses"].base["position"].shape == (3,)
@@ -52,7 +57,7 @@ def test_an_unknown_size_is_refused_with_the_known_ones() -> None:
     with pytest.raises(
         MailboxError, match=r"'track' field 'poses': size 'poses' is unknown; known sizes: joints"
     ):
-        TRACK.dtype({"joints": 6})
+        Track.message_type.dtype({"joints": 6})
 
 
 @pytest.mark.parametrize("wrong", [["raw"], ["copy_from"], ["_hidden"], ["x", "x"]])
@@ -81,7 +86,9 @@ def test_arrays_are_views_of_the_bytes(track: Message) -> None:
     track.angle = np.arange(12.0).reshape(6, 2)
     angle[0, 1] = -1.0
     assert track.record["angle"][0].tolist() == [0.0, -1.0]
-    assert track.raw[TRACK.dtype(SIZES).fields["angle"][1] :][8:16].cast("d")[0] == -1.0
+    assert (
+        track.raw[Track.message_type.dtype(SIZES).fields["angle"][1] :][8:16].cast("d")[0] == -1.0
+    )
 
 
 def test_a_group_is_filled_field_by_field(track: Message) -> None:
@@ -112,7 +119,7 @@ def test_text_reads_with_escapes_in_place_of_control_characters(track: Message) 
 def test_clear_and_copy_take_every_byte(track: Message) -> None:
     track.count, track.word = 3, "abc"
     track.angle[:] = 2.5
-    other = Message(TRACK.dtype(SIZES))
+    other = Track.zeros(SIZES)
     other.copy_from(track)
     assert bytes(other.raw) == bytes(track.raw)
     track.clear()

@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from rack.levels.arm import SimulatedArm
-from rack.levels.level import Executor, LevelContext, Ports
-from rack.levels.messages import ARM_STATE
+from rack.levels.level import Executor, LevelContext
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import Table, read_params
 
@@ -28,7 +28,7 @@ class CarelessParams(Table):
 class Careless(Executor):
     """Holds the arm where it is, but for what its parameters say."""
 
-    outputs: ClassVar = {"state": ARM_STATE}
+    outputs: ClassVar = {"state": ArmState}
     params = CarelessParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -37,7 +37,7 @@ class Careless(Executor):
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         self._arm = SimulatedArm(cell, context.scene, context.clock_ns, context.every, context.seed)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         arm = self._arm
         if self._params.thrown and tick == 50:
             arm._data.qvel[arm.cell.dof[1]] = 3.0
@@ -51,4 +51,4 @@ class Careless(Executor):
         torque[2] = given.get(tick, torque[2])
         arm.drive(torque, 0.0)
         if self._params.saves:
-            arm.save(write.state)
+            arm.save(self.state)

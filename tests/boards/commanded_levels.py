@@ -8,34 +8,43 @@ from typing import Any
 
 import pydantic
 
-from rack.backplane.message import Field, Message, State, command, status
-from rack.levels.level import Executor, Input, Ports
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Goal, Operation, Orders
+from rack.backplane.message import Command, Message, State, field
+from rack.levels.level import Executor, Input, Output
+from rack.levels.operator import RESTS_ON, AnsweringStatus, Goal, Operation, OperatorCommand, Orders
 from rack.levels.tables import LIVE, Table, read_params, set_live
 
-STEP = command("step", 1, RESTS_ON, Field("hold", "u1", "1", "1: hold"))
-COUNTED = status("counted", 1, *ANSWER, Field("count", "i8", "1", "cycles that were not held"))
+
+class Step(Command, version=1):
+    """Step."""
+
+    operator: int = RESTS_ON
+    hold: bool = field(doc="1: hold")
+
+
+class Counted(AnsweringStatus, version=1):
+    """Counted."""
+
+    count: int = field(unit="1", doc="cycles that were not held")
 
 
 class Upper(Executor):
     """Passes an operator's hold down; refuses to go home."""
 
-    inputs = {
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-        "status": Input(COUNTED, "below.status"),
-    }
-    outputs = {"command": STEP, "status": COUNTED}
+    operator = Input(OperatorCommand, "own.operator")
+    below = Input(Counted, "below.status")
+    command = Output(Step)
+    status = Output(Counted, rests_on=below)
     commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.HOME,)}
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         orders = self.orders
-        orders.take(read.operator, self._judge)
-        write.command.hold = orders.standing is Operation.HOLD
-        write.command.operator = orders.rests_on(0)
-        if read.status.value.operator >= orders.basis:
+        orders.take(self.operator, self._judge)
+        self.command.hold = orders.standing is Operation.HOLD
+        self.command.operator = orders.rests_on(0)
+        if self.below.message.operator >= orders.basis:
             orders.done()
-        orders.report(write.status)
-        write.status.state = State.EXECUTING
+        orders.report(self.status)
+        self.status.state = State.EXECUTING
 
     def _judge(self, command: Message) -> None:
         if self.orders.standing is Operation.GOTO:
@@ -55,11 +64,9 @@ class CountParams(Table):
 class Lower(Executor):
     """Counts, unless it is held from above or here; twice as fast while it is set to `twice`."""
 
-    inputs = {
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-        "command": Input(STEP, "above.command"),
-    }
-    outputs = {"status": COUNTED}
+    operator = Input(OperatorCommand, "own.operator")
+    above = Input(Step, "above.command")
+    status = Output(Counted)
     commands = {
         Operation.HOLD: (),
         Operation.RESUME: (),
@@ -74,14 +81,14 @@ class Lower(Executor):
         """Return the one name."""
         return ("twice",)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        self.orders.take(read.operator, self._set)
-        held = bool(read.command.value.hold) or self.orders.standing is Operation.HOLD
-        write.status.count += 0 if held else self.step * self.given.by
+    def process(self, tick: int) -> None:
+        self.orders.take(self.operator, self._set)
+        held = bool(self.above.message.hold) or self.orders.standing is Operation.HOLD
+        self.status.count += 0 if held else self.step * self.given.by
         if self.is_there:
             self.orders.done()
-        self.orders.report(write.status, read.command.value.operator)
-        write.status.state = State.EXECUTING
+        self.orders.report(self.status, self.above.message.operator)
+        self.status.state = State.EXECUTING
 
     @property
     def is_there(self) -> bool:

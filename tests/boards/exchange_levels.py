@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
-from wave_levels import WAVE
+import numpy as np
+from wave_levels import Wave
 
-from rack.backplane.message import Field, State, status
-from rack.levels.level import Executor, Input, Ports
+from rack.backplane.message import State, Status, field
+from rack.levels.level import Executor, Input, Output
 
 PORTS = ("plain", "sparse", "early")
-NOTES = status(
-    "notes",
-    1,
-    Field("value", "f8", "1", "value that each port showed", (len(PORTS),)),
-    Field("verdict", "u1", "1", "verdict of each port", (len(PORTS),)),
-    Field("lost", "u1", "1", "1: the port said that its writer is lost", (len(PORTS),)),
-)
+
+
+class Notes(Status, version=1):
+    """Notes."""
+
+    value: np.ndarray = field(unit="1", doc="value that each port showed", shape=len(PORTS))
+    verdict: np.ndarray = field("u1", unit="1", doc="verdict of each port", shape=len(PORTS))
+    lost: np.ndarray = field(
+        "u1", unit="1", doc="1: the port said that its writer is lost", shape=len(PORTS)
+    )
 
 
 class Notes(Executor):
     """Reads one status by three ports, and notes what they show."""
 
-    inputs = {port: Input(WAVE, "below.status") for port in PORTS}
-    outputs = {"status": NOTES}
+    inputs = {port: Input(Wave, "below.status") for port in PORTS}
+    status = Output(Notes)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.state = State.EXECUTING
+    def process(self, tick: int) -> None:
+        self.status.state = State.EXECUTING
         for at, port in enumerate(PORTS):
-            reading = getattr(read, port)
-            write.status.value[at] = reading.value.value
-            write.status.verdict[at] = reading.verdict
-            write.status.lost[at] = reading.is_lost
+            reading = getattr(port)
+            self.status.message[at] = reading.message.value
+            self.status.verdict[at] = reading.verdict
+            self.status.lost[at] = reading.is_lost
 
 
 class Exchanging(Notes):
     """A level that has taken the exchange's name."""
 
-    outputs = {"status": NOTES, "exchange": NOTES}
+    status = Output(Notes)
+    exchange = Output(Notes)

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from wave_levels import Watch
 
-from rack.backplane.message import Field, State, status
+from rack.backplane.message import State, Status, field
 from rack.levels.faults import CommandStep, MotorStep, SensorStep, TendonStep
-from rack.levels.level import Executor, LevelContext, Ports
+from rack.levels.level import Executor, LevelContext, Output
 
-PLACE = status(
-    "place",
-    1,
-    Field("position", "f8", "rad", "where it is"),
-    Field("mode", "i2", "1", "how it moves"),
-)
+
+class Place(Status, version=1):
+    """Place."""
+
+    position: float = field(unit="rad", doc="where it is")
+    mode: int = field("i2", unit="1", doc="how it moves")
 
 
 class Driven(Executor):
     """Reports that it stands still."""
 
-    outputs = {"status": PLACE}
+    status = Output(Place)
     faults = (SensorStep, MotorStep, CommandStep, TendonStep)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.position = 0.5
+    def process(self, tick: int) -> None:
+        self.status.position = 0.5
 
 
 class Follower(Watch):
@@ -35,17 +35,15 @@ class Follower(Watch):
         self._since: int | None = None
         self._latched = ""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Follow the wave, wait for it, or give up."""
-        super().process(read, write, tick)
-        self._since = (
-            (self._since or tick) if read.status.is_there and read.status.is_lost else None
-        )
+        super().process(tick)
+        self._since = (self._since or tick) if self.below.is_there and self.below.is_lost else None
         if self._since is not None and tick - self._since > self._patience:
             self._latched = f"nothing heard of the wave for {tick - self._since} ticks"
         waits = f"waiting for the wave; latched at tick {(self._since or 0) + self._patience}"
-        write.status.reason = self._latched or (waits if self._since is not None else "")
-        write.status.state = (
+        self.status.reason = self._latched or (waits if self._since is not None else "")
+        self.status.state = (
             State.ERROR
             if self._latched
             else State.HOLDING

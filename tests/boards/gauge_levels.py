@@ -12,7 +12,7 @@ from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults import drawing as draw
 from rack.boards.faults.bounds import DELIVERY, writes
 from rack.boards.faults.messages import MessageStep, Outgoing
-from rack.levels.level import Executor, Ports
+from rack.levels.level import Executor
 
 OPENS_AT = 40
 
@@ -54,18 +54,16 @@ KINDS.add(
 class Gauge(Executor):
     """Opens its valve at a tick."""
 
-    outputs = {
-        "status": status(
-            "gauge", 1, Field("valve", "u1", Valve, "its valve"), Field("value", "f8", "1", "0")
-        )
-    }
+    status = status(
+        "gauge", 1, Field("valve", "u1", Valve, "its valve"), Field("value", "f8", "1", "0")
+    )
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.state = State.EXECUTING
-        write.status.valve = Valve.OPEN if tick >= OPENS_AT else Valve.SHUT
+    def process(self, tick: int) -> None:
+        self.status.state = State.EXECUTING
+        self.status.valve = Valve.OPEN if tick >= OPENS_AT else Valve.SHUT
 
 
 class GaugeWatch(Watch):
     """Reads the gauge."""
 
-    inputs = {"status": Watch.inputs["status"]._replace(type=Gauge.outputs["status"])}
+    below = Watch.inputs["status"]._replace(type=Gauge.outputs["status"])

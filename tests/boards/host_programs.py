@@ -8,13 +8,13 @@ import signal
 import time
 from enum import IntEnum
 
-from rack.backplane.message import Field, State, command, status
+from rack.backplane.message import Command, State, Status, field
 from rack.backplane.segment import Segment
 from rack.boards.host import bus_adapter
 from rack.boards.host.bus_adapter import BusAdapter
 from rack.boards.wiring import Entries
 from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Executor, Input, Ports
+from rack.levels.level import Executor, Input, Output
 
 
 class Colour(IntEnum):
@@ -24,29 +24,29 @@ class Colour(IntEnum):
     RED = 1
 
 
-NUMBER = command(
-    "number",
-    1,
-    Field("value", "f8", "1", "a number"),
-    Field("colour", "u1", Colour, "its colour"),
-)
-SUM = status(
-    "sum",
-    1,
-    Field("sum", "f8", "1", "of all numbers read"),
-    Field("last", "u4", "1", "newest id read"),
-)
+class Number(Command, version=1):
+    """Number."""
+
+    value: float = field(unit="1", doc="a number")
+    colour: Colour = field(doc="its colour")
+
+
+class Sum(Status, version=1):
+    """Sum."""
+
+    sum: float = field(unit="1", doc="of all numbers read")
+    last: int = field("u4", unit="1", doc="newest id read")
 
 
 class Adder(Executor):
     """Adds what comes through the bridge; done once the sum has reached `goal`."""
 
-    inputs = {"number": Input(NUMBER, "above.numbers")}
-    outputs = {"status": SUM}
+    number = Input(Number, "above.numbers")
+    status = Output(Sum)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Add the numbers that are new, once each."""
-        number, out = read.number, write.status
+        number, out = self.number, self.status
         for value in (*number.earlier, number.value) if number.is_new else ():
             if value.id and value.id != out.last:
                 out.sum += value.value
@@ -58,8 +58,8 @@ class Adder(Executor):
 class Host(HostProgram):
     """A program with both ports."""
 
-    inputs = {"sum": Input(SUM, "below.sum")}
-    outputs = {"numbers": NUMBER}
+    sum = Input(Sum, "below.sum")
+    numbers = Output(Number)
 
 
 class Counting(Host):
@@ -70,7 +70,7 @@ class Counting(Host):
         for value in range(1, count + 1):
             while not bus.send("numbers", value=value, colour=Colour.RED):
                 bus.wait(1.0)
-        while bus.read("sum").value.last < count and not bus.is_over:
+        while bus.read("sum").message.last < count and not bus.is_over:
             bus.wait(1.0)
 
 
@@ -123,16 +123,16 @@ class Waiting(Host):
 class Slow(Host):
     """Sends 40 numbers that hold what it sees, and computes up to `lag` seconds for each."""
 
-    inputs = {**Host.inputs, "again": Input(SUM, "second.sum")}
+    again = Input(Sum, "second.sum")
 
     def run(self, bus: Bus) -> None:
         """Compute, send, wait; end once all were added."""
         while bus.sent("numbers") < 40:
             time.sleep(random.uniform(0.0, self.context.params["lag"]))
-            seen = bus.read("sum").value.sum + bus.read("again").value.last
+            seen = bus.read("sum").message.sum + bus.read("again").message.last
             bus.send("numbers", value=seen % 7.0 + bus.time_s + bus.tick)
             bus.wait(0.03)
-        while bus.read("sum").value.last < bus.sent("numbers") and not bus.is_over:
+        while bus.read("sum").message.last < bus.sent("numbers") and not bus.is_over:
             bus.wait(1.0)
 
 
@@ -178,14 +178,14 @@ class Console(Host):
 class Repeater(Executor):
     """A level that reads what is for host boards."""
 
-    inputs = {"sum": Input(SUM, "below.sum")}
-    outputs = {"status": SUM}
+    sum = Input(Sum, "below.sum")
+    status = Output(Sum)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Repeat it."""
 
 
 class Listener(HostProgram):
     """A program that reads what is for levels."""
 
-    inputs = {"numbers": Input(NUMBER, "below.numbers")}
+    numbers = Input(Number, "below.numbers")

@@ -2,31 +2,43 @@
 
 from __future__ import annotations
 
-from rack.backplane.message import Field, MessageType, State, status
-from rack.levels.level import Executor, Input, Ports
-from rack.levels.systems.figures import FIGURE_STATUS
+import numpy as np
+
+from rack.backplane.message import Message, State, Status, field
+from rack.levels.level import Executor, Inputs, Output
+from rack.levels.systems.figures import FigureStatus
 
 BOARDS = 5
-HEARD = status(
-    "heard",
-    1,
-    Field(
-        "cycle", "i8", "tick", "cycle that each board below reports; -1: none came yet", (BOARDS,)
-    ),
-    Field("lost", "u1", "1", "1: the writer counts as lost", (BOARDS,)),
-)
-ORDER = MessageType("order", 1, (Field("number", "u4", "1", "number of the order"),))
+
+
+class Heard(Status, version=1):
+    """Heard."""
+
+    cycle: np.ndarray = field(
+        "i8",
+        unit="tick",
+        doc="cycle that each board below reports; -1: none came yet",
+        shape=BOARDS,
+    )
+    lost: np.ndarray = field("u1", unit="1", doc="1: the writer counts as lost", shape=BOARDS)
+
+
+class Order(Message, version=1):
+    """Order."""
+
+    number: int = field("u4", unit="1", doc="number of the order")
 
 
 class Hub(Executor):
     """Reads the statuses of all boards below."""
 
-    inputs = {"status": Input(FIGURE_STATUS, "below.status", many=True)}
-    outputs = {"status": HEARD, "command": ORDER}
+    below = Inputs(FigureStatus, "below.status")
+    status = Output(Heard, rests_on=below)
+    command = Output(Order)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.state = State.EXECUTING
-        for at, reading in enumerate(read.status.values()):
-            write.status.cycle[at] = reading.value.cycle if reading.is_there else -1
-            write.status.lost[at] = reading.is_lost
-        write.command.number = tick // self.context.every
+    def process(self, tick: int) -> None:
+        self.status.state = State.EXECUTING
+        for at, reading in enumerate(self.below.values()):
+            self.status.cycle[at] = reading.message.cycle if reading.is_there else -1
+            self.status.lost[at] = reading.is_lost
+        self.command.number = tick // self.context.every

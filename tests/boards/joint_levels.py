@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import State
-from rack.levels.level import Executor, Input, LevelContext, Ports
-from rack.levels.messages import PRIMITIVE_STATUS
+from rack.levels.level import Executor, Inputs, LevelContext, Output
+from rack.levels.messages import PrimitiveStatus
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.servo.control import ArmParams
 from rack.levels.systems.joint_boards import ArmExecutor
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.tables import read_params
 
 AWAY_RAD = 0.15
@@ -25,8 +25,9 @@ class Swing(Executor):
     """Moves all joints away from home and back by minimum-jerk motions; waits while a board below
     is stopped."""
 
-    inputs = {"statuses": Input(JOINT_STATUS, "below.status", many=True)}
-    outputs = {"command": JOINT_REFERENCE, "status": PRIMITIVE_STATUS}
+    statuses = Inputs(JointStatus, "below.status")
+    command = Output(JointReference)
+    status = Output(PrimitiveStatus)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -37,13 +38,13 @@ class Swing(Executor):
         self._begun: int | None = None  # tick; None: waiting
         self.opening = 0.04  # of the gripper, m
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Write the set point due two cycles later."""
-        command, due = write.command, tick + 2 * self.context.every
-        readings = read.statuses.values()
+        command, due = self.command, tick + 2 * self.context.every
+        readings = self.statuses.values()
         held = any(not one.is_there or one.is_lost or one.value.stopped for one in readings)
-        write.status.state = State.HOLDING if held else State.EXECUTING
-        write.status.reason = "a board below is stopped" if held else ""
+        self.status.state = State.HOLDING if held else State.EXECUTING
+        self.status.reason = "a board below is stopped" if held else ""
         command.opening, command.force = self.opening, 20.0
         if held:
             self._begun, command.due = None, 0
@@ -78,7 +79,7 @@ class StallingArm(ArmExecutor):
         self._given = read_params(StallingParams, context.params)
         super().__init__(context)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Drive the arm, unless it stalls: its messages are those of the last cycle then."""
         if tick % self._given.period < self._given.period - self._given.stall:
-            super().process(read, write, tick)
+            super().process(tick)

@@ -6,24 +6,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rack.backplane.message import Field, Message, command, status
-from rack.levels.level import Executor, Input, LevelContext, Output, Planner, Ports, Reading
+from rack.backplane.message import Command, Message, Status, field
+from rack.levels.level import Executor, Input, LevelContext, Output, Planner, QueuedOutput, Reading
 
-REQUEST = command("request", 1, Field("made_at", "i8", "tick", "release of the cycle that sent it"))
-SENT = status(
-    "sent",
-    1,
-    Field("sent", "i8", "1", "requests sent"),
-    Field("refused", "i8", "1", "refused: queue full"),
-)
-TAKEN = status(
-    "taken",
-    1,
-    Field("taken", "i8", "1", "requests taken"),
-    Field("newest", "u4", "1", "id of the newest request taken"),
-    Field("repeated", "i8", "1", "requests not newer than the one before"),
-    Field("missing", "i8", "1", "ids between requests taken one after the other"),
-)
+
+class Request(Command, version=1):
+    """Request."""
+
+    made_at: int = field(unit="tick", doc="release of the cycle that sent it")
+
+
+class Sent(Status, version=1):
+    """Sent."""
+
+    sent: int = field(unit="1", doc="requests sent")
+    refused: int = field(unit="1", doc="refused: queue full")
+
+
+class Taken(Status, version=1):
+    """Taken."""
+
+    taken: int = field(unit="1", doc="requests taken")
+    newest: int = field("u4", unit="1", doc="id of the newest request taken")
+    repeated: int = field(unit="1", doc="requests not newer than the one before")
+    missing: int = field(unit="1", doc="ids between requests taken one after the other")
 
 
 def request_id(context: LevelContext, tick: int, number: int) -> int:
@@ -45,25 +51,27 @@ def count(requests: Reading, status: Message) -> None:
 class Asking(Executor):
     """Sends `burst` requests in every cycle before tick `until`."""
 
-    outputs = {"status": SENT, "requests": Output(REQUEST, queued=True)}
+    status = Output(Sent)
+    requests = QueuedOutput(Request)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Send the cycle's requests, and count those refused."""
         params: Mapping[str, Any] = self.context.params
         for number in range(params["burst"] if tick < params.get("until", 1 << 60) else 0):
-            write.requests.id = request_id(self.context, tick, number)
-            write.requests.made_at = tick
-            if write.requests.send():
-                write.status.sent += 1
+            self.requests.id = request_id(self.context, tick, number)
+            self.requests.made_at = tick
+            if self.requests.send():
+                self.status.sent += 1
             else:
-                write.status.refused += 1
+                self.status.refused += 1
 
 
 class Answering(Executor):
     """Takes at most `most` requests a cycle, and counts what is repeated or missing."""
 
-    inputs = {"requests": Input(REQUEST, "above.requests"), "own": Input(TAKEN, "own.status")}
-    outputs = {"status": TAKEN}
+    requests = Input(Request, "above.requests")
+    own = Input(Taken, "own.status")
+    status = Output(Taken)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -72,60 +80,60 @@ class Answering(Executor):
     def room(self, port: str) -> int:
         return int(self.context.params.get("most", 1 << 30))
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         if not self._has_begun:
             self._has_begun = True
-            if read.own.is_there:
-                write.status.copy_from(read.own.value)
-        count(read.requests, write.status)
+            if self.own.is_there:
+                self.status.copy_from(self.own.message)
+        count(self.requests, self.status)
 
 
 class Steady(Executor):
     """Follows the plan of its planner, a queue, as a level that reads requests does."""
 
-    inputs = {"plan": Input(REQUEST, "own.plan")}
-    outputs = {"status": TAKEN}
+    plan = Input(Request, "own.plan")
+    status = Output(Taken)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        if read.plan.is_new:
-            write.status.taken += 1 + len(read.plan.earlier)
-            write.status.newest = read.plan.value.id
+    def process(self, tick: int) -> None:
+        if self.plan.is_new:
+            self.status.taken += 1 + len(self.plan.earlier)
+            self.status.newest = self.plan.message.id
 
 
 class Stepping(Planner):
     """Plans `burst` steps at a time, each a message of its own."""
 
-    output = Output(REQUEST, queued=True)
+    output = QueuedOutput(Request)
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         return True
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         """Queue the steps as far as there is room."""
-        for _ in range(min(int(self.context.params["burst"]), write.room())):
-            write.id += 1
-            write.made_at = tick
-            assert write.send(), "there was room"
+        for _ in range(min(int(self.context.params["burst"]), self.output.room())):
+            self.output.id += 1
+            self.output.made_at = tick
+            assert self.output.send(), "there was room"
 
 
 class Filing(Planner):
     """Plans what it has taken: its slice is several cycles, in which requests wait."""
 
-    inputs = {"requests": Input(REQUEST, "above.requests")}
-    output = TAKEN
+    requests = Input(Request, "above.requests")
+    output = Output(Taken)
 
-    def wanted(self, read: Ports, tick: int) -> bool:
-        return bool(read.requests.is_new)
+    def wanted(self, tick: int) -> bool:
+        return bool(self.requests.is_new)
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
-        count(read.requests, write)
+    def plan(self, tick: int) -> None:
+        count(self.requests)
 
 
 class Filed(Executor):
     """Shows its planner's counts."""
 
-    inputs = {"plan": Input(TAKEN, "own.plan")}
-    outputs = {"status": TAKEN}
+    plan = Input(Taken, "own.plan")
+    status = Output(Taken)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.copy_from(read.plan.value)
+    def process(self, tick: int) -> None:
+        self.status.copy_from(self.plan.message)

@@ -9,8 +9,8 @@ from itertools import count
 import numpy as np
 
 from rack.backplane.message import State
-from rack.levels.level import Executor, LevelContext, Ports
-from tests.boards.wave_levels import WAVE
+from rack.levels.level import Executor, LevelContext, Output
+from tests.boards.wave_levels import Wave
 
 
 class Turn:
@@ -43,7 +43,7 @@ def counter() -> Callable[[], int]:
 class Rememberer(Executor):
     """Writes a number into which all of its past goes."""
 
-    outputs = {"status": WAVE}
+    status = Output(Wave)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -60,7 +60,7 @@ class Rememberer(Executor):
         self._turn: Turn | None = None
         self._next: Callable[[], float] | None = None
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Remember more, and write what comes of it."""
         self._recent.append(tick % 7)
         self._list.append(0.25 * tick)
@@ -72,8 +72,8 @@ class Rememberer(Executor):
             self._turn = Turn(self._row[1:], 0.125)
             self._next = self._turn.taken
         turned = 0.0 if self._next is None else self._next()
-        write.status.state = State.EXECUTING
-        write.status.value = self._factor * (
+        self.status.state = State.EXECUTING
+        self.status.message = self._factor * (
             self._half
             + self._call()
             + self._table.sum()
@@ -89,15 +89,15 @@ class Rememberer(Executor):
 class Generator(Executor):
     """Remembers in something that nobody can copy."""
 
-    outputs = {"status": WAVE}
+    status = Output(Wave)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._count = count()
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Write the next number."""
-        write.status.value = float(next(self._count))
+        self.status.message = float(next(self._count))
 
 
 class LateGenerator(Generator):
@@ -107,8 +107,8 @@ class LateGenerator(Generator):
         super().__init__(context)
         del self._count
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Write the next number."""
         if tick == 10:
             self._count = (number for number in range(1 << 40))  # type: ignore[assignment]
-        write.status.value = float(tick)
+        self.status.message = float(tick)

@@ -73,7 +73,7 @@ def test_killed_board_of_a_joint_brakes_the_arm_within_bound_and_the_run_repeats
                 if event.code == "brakes_opened" and event.tick > KILLED_AT
             ]
             rejoined = [event.tick for event in rack.events if event.code == "rejoined"]
-            arm = open_observer(rack.segment, "arm.status").peek().value
+            arm = open_observer(rack.segment, "arm.status").peek().message
     assert digests[0] == digests[1]
     assert [KILLED_AT < tick <= KILLED_AT + DEATH_BOUND for tick in braked] == [True]
     assert [rejoined[0] < tick <= rejoined[0] + DEATH_BOUND for tick in released] == [True]

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.message import Field, MessageType, State, status
+from rack.backplane.message import Field, Message, MessageType, State, Status, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.config.layout import field_specs
@@ -29,10 +30,32 @@ from tests.backplane.bus import CLOCK_NS, task
 from tests.backplane.conftest import MakeBus
 
 SILENT = 40
-STATUS = status("level_status", 1, Field("moves", "u2", "1", "of its program"))
-BRAKED = status("arm_status", 1, Field("braked", "u1", "1", "1: brakes are engaged"))
-SCENE = MessageType("scene", 1, (Field("position", "f8", "m", "of each body", (2, 3)),))
-ORDER = MessageType("order", 1, (Field("id", "u4", "1", "serial"),))
+
+
+class LevelStatus(Status, version=1):
+    """Level status."""
+
+    moves: int = field("u2", unit="1", doc="of its program")
+
+
+class Braked(Status, version=1, message="arm_status"):
+    """Braked."""
+
+    braked: bool = field(doc="1: brakes are engaged")
+
+
+class Scene(Message, version=1):
+    """Bodies and tool as sensed."""
+
+    position: np.ndarray = field(unit="m", doc="of each body", shape=(2, 3))
+
+
+class Order(Message, version=1):
+    """Order."""
+
+    id: int = field("u4", unit="1", doc="serial")
+
+
 TICK_MS = CLOCK_NS * 1e-6
 
 
@@ -58,9 +81,9 @@ def bus(make_bus: MakeBus) -> Segment:
     return make_bus(
         task("upper"),
         task("lower"),
-        box("upper.status", STATUS, "upper"),
-        box("lower.status", BRAKED, "lower"),
-        box("lower.scene", SCENE, "lower"),
+        box("upper.status", LevelStatus, "upper"),
+        box("lower.status", Braked, "lower"),
+        box("lower.scene", Scene, "lower"),
         box(
             "lower.command", MessageType("command", 1, (Field("id", "u4", "1", "serial"),)), "lower"
         ),
@@ -69,8 +92,8 @@ def bus(make_bus: MakeBus) -> Segment:
 
 def write(segment: Segment, name: str, tick: int = 0, **fields: Any) -> None:
     writer = open_writer(segment, name)
-    for field, value in fields.items():
-        setattr(writer.message, field, value)
+    for key, value in fields.items():
+        setattr(writer.message, key, value)
     writer.write(tick)
     writer.close()
 

@@ -224,7 +224,7 @@ def await_giving(rack: Rack, entry: RequestEntry) -> None:
 
 
 def answered(reading: Reading, serial: int) -> bool:
-    return reading.is_there and reading.value.order == serial
+    return reading.is_there and reading.message.order == serial
 
 
 def watch(rack: Rack, condition: Callable[[], bool]) -> None:

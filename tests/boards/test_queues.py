@@ -52,7 +52,7 @@ params = {{ burst = 5 }}
 
 def counts(rack: Rack, board: str) -> dict[str, int]:
     """Return the counts in the newest status of a board."""
-    status = open_observer(rack.segment, f"{board}.status").peek().value
+    status = open_observer(rack.segment, f"{board}.status").peek().message
     names = status.record.dtype.names
     return {
         name: int(status.record[name]) for name in names if status.record[name].dtype.kind != "S"

@@ -7,55 +7,62 @@ the parts up.
 
 from __future__ import annotations
 
+import numpy as np
 from pydantic import Field as Key
 
-from rack.backplane.message import Field, State, command, status
-from rack.levels.level import Executor, Input, LevelContext, Output, Ports
-from rack.levels.operator import ANSWER, OPERATOR_COMMAND, RESTS_ON, Operation, Orders
+from rack.backplane.message import Command, State, command, field
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Output
+from rack.levels.operator import RESTS_ON, AnsweringStatus, Operation, OperatorCommand, Orders
 from rack.levels.tables import Table, read_params
 
 JOINTS = 3
-PATH = command("test_path", 1, RESTS_ON, Field("position", "f8", "1", "of every joint", (JOINTS,)))
-PART = command(
-    "test_part",
-    1,
-    RESTS_ON,
-    Field("position", "f8", "1", "of this board's joint; others 0", (JOINTS,)),
-)
-SEEN = status(
-    "test_seen",
-    1,
-    *ANSWER,
-    Field("position", "f8", "1", "", (JOINTS,)),
-    Field("lost", "u1", "1", "", (JOINTS,)),
-)
+
+
+class TestPath(Command, version=1):
+    """Test path."""
+
+    operator: int = RESTS_ON
+    position: np.ndarray = field(unit="1", doc="of every joint", shape=JOINTS)
+
+
+class TestPart(Command, version=1):
+    """Test part."""
+
+    operator: int = RESTS_ON
+    position: np.ndarray = field(unit="1", doc="of this board's joint; others 0", shape=JOINTS)
+
+
+class TestSeen(AnsweringStatus, version=1):
+    """Test seen."""
+
+    position: np.ndarray = field(unit="1", doc="", shape=JOINTS)
+    lost: np.ndarray = field("u1", unit="1", doc="", shape=JOINTS)
 
 
 class PathLevel(Executor):
     """Commands all joints at once; reads a status of each."""
 
-    inputs = {
-        "operator": Input(OPERATOR_COMMAND, "own.operator"),
-        "joints": Input(SEEN, "below.status", many=True),
-    }
-    outputs = {"command": PATH, "status": Output(SEEN, rests_on="joints")}
+    operator = Input(OperatorCommand, "own.operator")
+    joints = Inputs(TestSeen, "below.status")
+    command = Output(TestPath)
+    status = Output(TestSeen, rests_on=joints)
     commands = {Operation.HOLD: (), Operation.RESUME: ()}
 
     def self_test(self) -> None:
         self.orders = Orders(self.commands)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Move on, unless held; show what the joints report, and which of them are lost."""
-        self.orders.take(read.operator)
+        self.orders.take(self.operator)
         if self.orders.standing is not Operation.HOLD:
-            write.command.position[:] = [tick, 2 * tick, 3 * tick]
-        write.command.operator = self.orders.rests_on(0)
-        for at, joint in enumerate(read.joints.values()):
-            write.status.position[at] = joint.value.position[at]
-            write.status.lost[at] = joint.is_lost
+            self.command.position[:] = [tick, 2 * tick, 3 * tick]
+        self.command.operator = self.orders.rests_on(0)
+        for at, joint in enumerate(self.joints.values()):
+            self.status.position[at] = joint.value.position[at]
+            self.status.lost[at] = joint.is_lost
         self.orders.done()
-        self.orders.report(write.status)
-        write.status.state = State.EXECUTING
+        self.orders.report(self.status)
+        self.status.state = State.EXECUTING
 
 
 class JointParams(Table):
@@ -67,48 +74,50 @@ class JointParams(Table):
 class JointLevel(Executor):
     """Takes its joint's part of the command; shows what the level below has made of it."""
 
-    inputs = {"command": Input(PATH, "above.command"), "below": Input(SEEN, "below.status")}
-    outputs = {"part": Output(PART, rests_on="command"), "status": Output(SEEN, rests_on="below")}
+    above = Input(TestPath, "above.command")
+    below = Input(TestSeen, "below.status")
+    part = Output(TestPart, rests_on=command)
+    status = Output(TestSeen, rests_on=below)
     params = JointParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._joint = read_params(JointParams, context.params).joint
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Pass the part on, and the status back."""
-        write.part.position[self._joint] = read.command.value.position[self._joint]
-        write.part.operator = read.command.value.operator
-        write.status.position[:] = read.below.value.position
-        write.status.operator = read.below.value.operator
-        write.status.state = State.EXECUTING
+        self.part.position[self._joint] = self.above.message.position[self._joint]
+        self.part.operator = self.above.message.operator
+        self.status.position[:] = self.below.message.position
+        self.status.operator = self.below.message.operator
+        self.status.state = State.EXECUTING
 
 
 class ArmLevel(Executor):
     """Adds the parts of all joints up."""
 
-    inputs = {"parts": Input(PART, "above.part", many=True)}
-    outputs = {"status": SEEN}
+    parts = Inputs(TestPart, "above.part")
+    status = Output(TestSeen)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Show the whole vector, and which of its boards are lost."""
-        parts = list(read.parts.values())
-        write.status.position[:] = sum(part.value.position for part in parts)
-        write.status.lost[:] = [part.is_lost for part in parts]
-        write.status.operator = min(part.value.operator for part in parts)
-        write.status.state = State.EXECUTING
+        parts = list(self.parts.values())
+        self.status.position[:] = sum(part.message.position for part in parts)
+        self.status.lost[:] = [part.is_lost for part in parts]
+        self.status.operator = min(part.message.operator for part in parts)
+        self.status.state = State.EXECUTING
 
 
 class Misled(JointLevel):
     """Names an input that it does not have."""
 
-    outputs = {**JointLevel.outputs, "part": Output(PART, rests_on="comand")}
+    part = Output(TestPart, rests_on=ArmLevel.parts)
 
 
 class Lone(Executor):
     """A board without neighbours."""
 
-    outputs = {"status": SEEN}
+    status = Output(TestSeen)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Report nothing."""

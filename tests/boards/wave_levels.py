@@ -12,14 +12,22 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from rack.backplane.message import Field, Message, MessageType, State, status
+from rack.backplane.message import Message, State, Status, field
 from rack.levels.errors import LevelError
-from rack.levels.level import Executor, Input, LevelContext, Planner, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output, Planner
 
-WAVE = status("wave", 1, Field("value", "f8", "1", "height of the wave"))
-GAIN = MessageType(
-    "gain", 1, (Field("gain", "f8", "1", "factor"), Field("made_at", "i8", "tick", "release"))
-)
+
+class Wave(Status, version=1):
+    """Wave."""
+
+    value: float = field(unit="1", doc="height of the wave")
+
+
+class Gain(Message, version=1):
+    """Gain."""
+
+    gain: float = field(unit="1", doc="factor")
+    made_at: int = field(unit="tick", doc="release")
 
 
 class Trouble:
@@ -57,7 +65,7 @@ class Trouble:
 class Wave(Executor):
     """Writes a value that grows with time; done at tick `done_at`."""
 
-    outputs = {"status": WAVE}
+    status = Output(Wave)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -68,54 +76,54 @@ class Wave(Executor):
     def self_test(self) -> None:
         self.trouble.self_test()
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         self.trouble.at(tick)
-        write.status.state = self._final if tick >= self._done_at else State.EXECUTING
-        write.status.reason = (
+        self.status.state = self._final if tick >= self._done_at else State.EXECUTING
+        self.status.reason = (
             "the tide" if self._final is State.ERROR and tick >= self._done_at else ""
         )
-        write.status.value = 0.5 * tick * self.gain(read)
+        self.status.message = 0.5 * tick * self.gain()
 
-    def gain(self, read: Ports) -> float:
+    def gain(self) -> float:
         return 1.0
 
 
 class PlannedWave(Wave):
     """A wave scaled by its planner's newest gain."""
 
-    inputs = {"plan": Input(GAIN, "own.plan")}
+    plan = Input(Gain, "own.plan")
 
-    def gain(self, read: Ports) -> float:
+    def gain(self) -> float:
         """Return the planned factor; 1 before the first plan."""
-        return float(read.plan.value.gain) if read.plan.is_there else 1.0
+        return float(self.plan.message.gain) if self.plan.is_there else 1.0
 
 
 class Steady(PlannedWave):
     """A planned wave that leaves trouble to its planner."""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.state = State.EXECUTING
-        write.status.value = 0.5 * tick * self.gain(read)
+    def process(self, tick: int) -> None:
+        self.status.state = State.EXECUTING
+        self.status.message = 0.5 * tick * self.gain()
 
 
 class GainPlanner(Planner):
     """Plans the gain from the wave's status, every `plan_every` ticks."""
 
-    inputs = {"status": Input(WAVE, "own.status")}
-    output = GAIN
+    status = Input(Wave, "own.status")
+    output = Output(Gain)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.trouble = Trouble(context)
         self._every = context.params.get("plan_every", 1)
 
-    def wanted(self, read: Ports, tick: int) -> bool:
+    def wanted(self, tick: int) -> bool:
         return tick % self._every == 0
 
-    def plan(self, read: Ports, write: Message, tick: int) -> None:
+    def plan(self, tick: int) -> None:
         self.trouble.at(tick)
-        write.gain = 1.0 + 1.0 / (1.0 + abs(read.status.value.value))
-        write.made_at = tick
+        self.output.gain = 1.0 + 1.0 / (1.0 + abs(self.status.message.message))
+        self.output.made_at = tick
 
 
 class BadPlanner(GainPlanner):
@@ -128,13 +136,13 @@ class BadPlanner(GainPlanner):
 class Watch(Executor):
     """Repeats the wave's status."""
 
-    inputs = {"status": Input(WAVE, "below.status")}
-    outputs = {"status": WAVE}
+    below = Input(Wave, "below.status")
+    status = Output(Wave, rests_on=below)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.state = read.status.value.state
-        write.status.reason = read.status.value.reason
-        write.status.value = read.status.value.value
+    def process(self, tick: int) -> None:
+        self.status.state = self.below.message.state
+        self.status.reason = self.below.message.reason
+        self.status.message = self.below.message.message
 
 
 class Endless(Watch):

@@ -52,7 +52,7 @@ def test_killed_drive_board_and_launcher_leave_an_arm_that_is_braked(
     command = [*RACK, "run", str(EXAMPLE / "can-arm.toml"), "--no-record", "--share", *words]
 
     def servo() -> Message:
-        return open_observer(Segment.attach(rack_name), "servo.status").peek().value
+        return open_observer(Segment.attach(rack_name), "servo.status").peek().message
 
     launcher = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:

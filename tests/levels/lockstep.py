@@ -25,7 +25,7 @@ from rack.levels.level import (
     Planner,
     Ports,
 )
-from rack.levels.operator import OPERATOR_COMMAND, Goal, Operation
+from rack.levels.operator import Goal, Operation, OperatorCommand
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.box import Box, Disturbance
@@ -156,7 +156,7 @@ class Lockstep:
                 )
             if board.planner is not None:
                 self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
-            self.boxes[f"{board.name}.operator"] = Box(OPERATOR_COMMAND, self.sizes)
+            self.boxes[f"{board.name}.operator"] = Box(OperatorCommand, self.sizes)
         self._contexts = {
             b.name: LevelContext(
                 board=b.name,

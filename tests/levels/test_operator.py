@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, State, status
+from rack.backplane.message import Message, State
 from rack.levels.operator import (
-    ANSWER,
-    OPERATOR_COMMAND,
     Answer,
+    AnsweringStatus,
     Goal,
     Operation,
+    OperatorCommand,
     Orders,
     answered,
     joints_of,
@@ -26,21 +26,26 @@ from tests.levels.whole_rack import WholeRack
 pytestmark = pytest.mark.thorough
 
 TAKES = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.JOINTS, Goal.HOME)}
-STATUS = status("answering", 1, *ANSWER)
+
+
+class Answering(AnsweringStatus, version=1):
+    """Answering."""
+
+
 RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])
 
 
 def said(
     serial: int, what: Operation, goal: Goal = Goal.NONE, verdict: Verdict = Verdict.NEW
 ) -> Reading:
-    message = Message(OPERATOR_COMMAND.dtype({}))
+    message = OperatorCommand.zeros({})
     message.id, message.what, message.goal = serial, what, goal
     return Reading(message, verdict)
 
 
 def report(orders: Orders, above: int = 0, message: Message | None = None) -> Message:
     """Return the status; `message` is that of the last cycle, whose values stay."""
-    message = Message(STATUS.dtype({})) if message is None else message
+    message = Answering.zeros({}) if message is None else message
     orders.report(message, above)
     return message
 

@@ -11,7 +11,7 @@ import pytest
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.messages import SCENE
+from rack.levels.messages import Scene
 from rack.levels.world import WorldModel
 from tests.levels.arms import config
 from tests.levels.box import lose_some
@@ -29,7 +29,7 @@ class WorldRig:
 
     def __init__(self) -> None:
         board = BoardSpec("world", PERIOD, WorldModel)
-        self.rack = Lockstep([board], *config("puma560"), outside={"servo.scene": SCENE})
+        self.rack = Lockstep([board], *config("puma560"), outside={"servo.scene": Scene})
 
     @property
     def model(self) -> Message:

@@ -11,7 +11,7 @@ from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
-from tests.boards.host_programs import NUMBER
+from tests.boards.host_programs import Number
 
 CAPACITY = 5
 
@@ -90,9 +90,9 @@ def test_a_writer_that_keeps_to_no_bound_overwrites_what_waits_and_is_counted(
 def test_lengths_beyond_those_declared_and_text_beyond_ascii_are_improper_empty_groups_not() -> (
     None
 ):
-    fields, message = field_specs(NUMBER, {}), Message(NUMBER.dtype({}))
+    fields, message = field_specs(Number.message_type, {}), Number.zeros({})
     for value, colour, permitted in ((0.0, 0, True), (0.0, 2, False), (np.nan, 1, False)):
-        message.value, message.colour = value, colour
+        message.message, message.colour = value, colour
         assert is_proper(message.record, fields) is permitted
     turn = Field("turn", "f8", "1", "unit", (2,), (0.9, 1.1))
     one = MessageType("one", 1, (Field("name", "S4", "ASCII", "its name"), turn))

@@ -77,7 +77,7 @@ class Board:
     def read(self, tick: int) -> dict[str, int]:
         """Read every mailbox; return the ids of the new messages by sender."""
         found = {name: reader.read(tick) for name, reader in self.readers.items()}
-        return {name: int(reading.value.id) for name, reading in found.items() if reading.is_new}
+        return {name: int(reading.message.id) for name, reading in found.items() if reading.is_new}
 
 
 def boxes(**how: int) -> list[MailboxSpec]:
@@ -133,7 +133,7 @@ def test_a_full_inbox_loses_what_comes_last_at_this_board_only(make_bus: MakeBus
         "third": 0,
     }
     # An observer of the host side reads by ticks, without the inbox.
-    assert Reader(board.segment, "first.point").read(5).value.id == 4
+    assert Reader(board.segment, "first.point").read(5).message.id == 4
 
 
 @pytest.mark.parametrize("idle", [0, 3, 40])
@@ -155,7 +155,7 @@ def test_a_restarted_reader_continues_as_the_one_before_it(make_bus: MakeBus, id
         kept = {r.spec.writer: r.read(tick) for r in readers}
         if tick > 40 + idle:
             assert found == {
-                name: reading.value.id for name, reading in kept.items() if reading.is_new
+                name: reading.message.id for name, reading in kept.items() if reading.is_new
             }
         assert {name: r.serial for name, r in board.readers.items()} == {
             r.spec.writer: r.serial for r in readers

@@ -33,7 +33,7 @@ def write(writer: Writer, tick: int, now: int | None = None) -> bool:
 def seen(reader: Reader, tick: int) -> tuple[int, Verdict]:
     """Return the serial that a read at `tick` gives, and its verdict."""
     reading = reader.read(tick)
-    return reading.value.id, reading.verdict
+    return reading.message.id, reading.verdict
 
 
 def test_a_message_becomes_visible_at_the_end_of_its_slice(make_bus: MakeBus) -> None:
@@ -81,7 +81,7 @@ def test_the_host_peeks_at_the_newest_at_once(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox(every=8, delay=8))
     writer, host, board = *ends(segment), open_reader(segment, NAME)
     write(writer, 0)
-    assert (host.peek().value.id, host.serial) == (1, 1)
+    assert (host.peek().message.id, host.serial) == (1, 1)
     assert host.peek().verdict is OLD
     assert seen(board, 0) == (0, NONE)
 

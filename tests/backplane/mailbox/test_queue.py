@@ -45,7 +45,7 @@ def ids(reading: Reading) -> list[int]:
     if not reading.is_new:
         assert not reading.earlier
         return []
-    found = [*reading.earlier, reading.value]
+    found = [*reading.earlier, reading.message]
     assert all((message.row == message.id).all() for message in found)
     return [message.id for message in found]
 
@@ -127,7 +127,7 @@ def test_an_observer_takes_nothing(make_bus: MakeBus) -> None:
     writer, reader = ends(segment)
     send(writer, 0, 1, 2)
     observer = open_observer(segment, NAME)
-    assert (observer.peek().value.id, observer.read(1).value.id) == (2, 2)
+    assert (observer.peek().message.id, observer.read(1).message.id) == (2, 2)
     assert ids(reader.read(1)) == [1, 2]
     send(writer, 1, 3, 4, 5)
     send(writer, 2, 6)
@@ -139,7 +139,7 @@ def test_an_observer_takes_nothing(make_bus: MakeBus) -> None:
     again = reader.take(3, 0)
     assert (again.verdict, again.value.id) == (Verdict.OLD, 3)
     # Its position counts the messages left.
-    position = open_observer(segment, taken_name(NAME)).peek().value
+    position = open_observer(segment, taken_name(NAME)).peek().message
     assert (position.taken, position.unread) == (3, 3)
 
 

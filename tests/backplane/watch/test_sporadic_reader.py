@@ -61,13 +61,13 @@ def test_a_damaged_message_is_rejected_and_reported(segment: Segment, writer: Wr
         writer.message.id = number
         writer.write(10 * number)
     segment.bytes[message_address(segment, 2, BOX)] ^= 1
-    assert reader.read(30).value.id == 1
+    assert reader.read(30).message.id == 1
     assert rung(segment) == [Alarm.DAMAGED]
     assert task.troubles == 1
     # The next good one is no trouble.
     writer.message.id = 3
     writer.write(40)
-    assert reader.read(50).value.id == 3
+    assert reader.read(50).message.id == 3
     assert (task.troubles, rung(segment)) == (1, [Alarm.DAMAGED])
 
 
@@ -75,10 +75,10 @@ def test_a_forged_message_is_rejected_and_reported(segment: Segment, writer: Wri
     reader = open_reader(segment)
     writer.message.id = 1
     writer.write(10)
-    assert reader.read(11).value.id == 1
+    assert reader.read(11).message.id == 1
     # A process without the claim signs as another process.
     writer._slots.words[Slot.EPOCH] = claim(1, os.getpid() + 1)
     writer.message.id = 2
     writer.write(20)
-    assert reader.read(21).value.id == 1
+    assert reader.read(21).message.id == 1
     assert rung(segment) == [Alarm.MASQUERADE]

@@ -47,7 +47,7 @@ class Site:
     def read(self, tick: int) -> list[int]:
         """Read at a tick; return the numbers of what was taken."""
         reading = self.reader.read(tick)
-        messages = [*reading.earlier, reading.value] if reading.is_new else []
+        messages = [*reading.earlier, reading.message] if reading.is_new else []
         return [message.id for message in messages]
 
     def alarms(self) -> list[tuple[int, int, float]]:

@@ -38,7 +38,7 @@ class Grid:
     def read(self, tick: int) -> tuple[str, bool, int]:
         """Return verdict, loss, and what the message holds."""
         reading = self.reader.read(tick)
-        return reading.verdict.name, reading.is_lost, reading.value.id
+        return reading.verdict.name, reading.is_lost, reading.message.id
 
 
 def test_between_its_ticks_the_last_reading_stands(link: MakeLink) -> None:

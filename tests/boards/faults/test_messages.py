@@ -206,7 +206,7 @@ def test_a_forged_message_is_never_delivered(link: MakeLink, protocol: Protocol)
     rack.run(0, 8)
     forge(rack, 8)
     reading = rack.reader.cycle(8)
-    assert (reading.value.id, reading.verdict) == (7, Verdict.NEW)
+    assert (reading.message.id, reading.verdict) == (7, Verdict.NEW)
     assert rack.alarms() == [(8, Alarm.MASQUERADE)]
     # The true writer takes its mailbox back, and reports it.
     rack.writer.cycle(8)
@@ -238,7 +238,7 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
         reading = rack.reader.cycle(5)
         # The lock of a dead process goes to the waiter; a stopped process keeps it.
         assert reading.verdict is (Verdict.OLD if is_killed else Verdict.BUS_ERROR)
-        assert reading.value.id == 3
+        assert reading.message.id == 3
         assert rack.alarms() == [(5, Alarm.LOCKED)]
         if not is_killed:
             os.kill(pid, signal.SIGCONT)

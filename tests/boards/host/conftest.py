@@ -63,7 +63,7 @@ class Site:
 
     @property
     def status(self) -> Any:
-        return open_observer(self.segment, "bridge.status").peek().value
+        return open_observer(self.segment, "bridge.status").peek().message
 
     def count(self, port: str) -> dict[str, int]:
         """Return what the newest status counts of an entry, but for what is zero."""
@@ -73,8 +73,8 @@ class Site:
     def crossed(self) -> list[float]:
         """Return the numbers that are in the bridge's own mailbox, oldest first."""
         reading = open_observer(self.segment, "bridge.numbers").peek()
-        values = [*reading.earlier, reading.value] if reading.is_there else []
-        return [message.value for message in values]
+        values = [*reading.earlier, reading.message] if reading.is_there else []
+        return [message.message for message in values]
 
 
 MakeSite = Callable[..., Site]

@@ -74,7 +74,7 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 
 
 def status(segment: Segment, board: str = "bridge") -> object:
-    return open_observer(segment, f"{board}.status").peek().value
+    return open_observer(segment, f"{board}.status").peek().message
 
 
 def codes(rack: Rack, board: str) -> list[str]:
@@ -189,8 +189,8 @@ def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConf
         first.close()
         second = HostBus(rack.segment, wiring)
         assert second.send("numbers", value=3.0)
-        wait_until(lambda: rack.watch(0.01) and second.read("sum").value.last == 2)
-        assert (second.read("sum").value.sum, second.sent("numbers")) == (5.0, 2)
+        wait_until(lambda: rack.watch(0.01) and second.read("sum").message.last == 2)
+        assert (second.read("sum").message.sum, second.sent("numbers")) == (5.0, 2)
         with pytest.raises(AttributeError, match="no field 'valu'; fields: id, value, colour"):
             second.send("numbers", valu=1)
         second.finish()

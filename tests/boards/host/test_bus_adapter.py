@@ -137,7 +137,7 @@ def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: Op
     # A sample crosses in each cycle; it was written at tick 1.
     assert site.count("sum") == {"passed": 2, "arrived": 8, "age": 7}
     assert bus.wait(0.0)
-    assert bus.read("sum").value.sum == 2.5
+    assert bus.read("sum").message.sum == 2.5
     assert not bus.wait(0.0)
 
 

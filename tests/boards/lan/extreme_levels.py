@@ -12,7 +12,7 @@ import numpy as np
 
 from rack.backplane.message import Field, Message, MessageType
 from rack.boards.lan.config import ImportConfig
-from rack.levels.level import Executor, LevelContext, MadePorts, Output, Ports
+from rack.levels.level import Executor, LevelContext, MadePorts, Output
 
 Case = tuple[str, bytes, bool]
 """What is extreme, the message, and whether its type permits it."""
@@ -33,10 +33,10 @@ class Extremes(Executor):
         """Return the port that sends."""
         return MadePorts(outputs={params["port"]: Output(message_type(params["type"]))})
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Write the next one."""
         at = min(tick // self.context.every, len(self._rows) - 1)
-        getattr(write, self.context.params["port"]).raw[:] = self._rows[at]
+        getattr(self.context.params["port"]).raw[:] = self._rows[at]
 
 
 def message_type(name: str) -> MessageType:

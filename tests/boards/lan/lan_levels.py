@@ -3,42 +3,45 @@ export."""
 
 from __future__ import annotations
 
-from rack.backplane.message import Field, status
-from rack.levels.level import Executor, Input, Ports
+from rack.backplane.message import Status, field
+from rack.levels.level import Executor, Input, Output
 
-PULSE = status("pulse", 1, Field("count", "i8", "1", "cycles so far"))
-HEARD = status(
-    "heard",
-    1,
-    Field("count", "i8", "1", "count last heard"),
-    Field("total", "i8", "1", "sum of all counts heard"),
-    Field("lost", "i8", "1", "cycles in which the other rack's writer was lost"),
-    Field("backward", "i8", "1", "how often a new count was not above the one before it"),
-)
+
+class Pulse(Status, version=1):
+    """Pulse."""
+
+    count: int = field(unit="1", doc="cycles so far")
+
+
+class Heard(Status, version=1):
+    """Heard."""
+
+    count: int = field(unit="1", doc="count last heard")
+    total: int = field(unit="1", doc="sum of all counts heard")
+    lost: int = field(unit="1", doc="cycles in which the other rack's writer was lost")
+    backward: int = field(unit="1", doc="how often a new count was not above the one before it")
 
 
 class Pulse(Executor):
     """Counts its cycles."""
 
-    outputs = {"status": PULSE}
+    status = Output(Pulse)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.count = tick // self.context.every
+    def process(self, tick: int) -> None:
+        self.status.count = tick // self.context.every
 
 
 class Echo(Executor):
     """Adds up what it hears of another rack, `lan.other`."""
 
-    inputs = {"other": Input(PULSE, "lan.other")}
-    outputs = {"status": HEARD}
+    other = Input(Pulse, "lan.other")
+    status = Output(Heard)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Add what is new, and count the cycles in which the writer is lost."""
-        other = read.other
+        other = self.other
         if other.is_new:
-            write.status.backward += (
-                other.value.count <= write.status.count and write.status.total > 0
-            )
-            write.status.count = other.value.count
-            write.status.total += other.value.count
-        write.status.lost += other.is_lost
+            self.status.backward += other.value.count <= self.status.count and self.status.total > 0
+            self.status.count = other.value.count
+            self.status.total += other.value.count
+        self.status.lost += other.is_lost

@@ -175,7 +175,7 @@ def ended(rack: Rack) -> Ended:
     """Return how a rack has ended, which is not closed yet."""
     assert rack.outcome is not None
     seen = {
-        box.name: open_observer(rack.segment, box.name).peek().value
+        box.name: open_observer(rack.segment, box.name).peek().message
         for box in rack.segment.layout.mailboxes
     }
     last = {

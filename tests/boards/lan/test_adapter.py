@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.message import Field, Message, MessageType, State
+from rack.backplane.message import Message, State, field
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System, is_on
 from rack.boards.classes import find_class
@@ -18,7 +18,7 @@ from rack.boards.lan.adapter import LanAdapter, status_of
 from rack.boards.lan.clocks import UNKNOWN_NS
 from rack.boards.lan.envelope import Flaw, Sealer
 from rack.levels.level import Ports
-from rack.levels.peer import PEER
+from rack.levels.peer import PeerPresence
 from tests.boards.lan.racks import configs, rack_text
 
 EVERY = 8
@@ -115,7 +115,12 @@ def test_a_rack_that_comes_is_sent_everything_anew(make: MakeAdapter) -> None:
     assert export.is_asked
 
 
-SENT = MessageType("sent", 1, (Field("value", "f8", "1", "a number"),))
+class Sent(Message, version=1):
+    """Sent."""
+
+    value: float = field(unit="1", doc="a number")
+
+
 IMPORTED = {"from": "b/pulse.status", "type": "lan_levels:PULSE", "rate_hz": 50, "max_age_ms": 100}
 
 
@@ -158,7 +163,7 @@ def test_in_real_time_the_status_counts_what_the_seals_refused(make: MakeAdapter
 
     Link.sealer.resume([3] * len(Flaw))
     out = Message(status_of(adapter._table.exports, adapter._table.imports).dtype({}))
-    peer = Message(PEER.dtype({}))
+    peer = PeerPresence.zeros({})
     write = Ports(status=out, peer_b=peer)
     adapter._report(write, 8)
     assert out.flaws.tolist() == (0,) * len(Flaw)

@@ -95,7 +95,7 @@ class LabRack:
         return self.segment.words[System.TICK]
 
     def _peek(self, mailbox: str) -> Any:
-        return open_observer(self.segment, mailbox).peek().value
+        return open_observer(self.segment, mailbox).peek().message
 
     def counts(self) -> Counts:
         """Return what it has counted so far."""

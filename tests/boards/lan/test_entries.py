@@ -98,7 +98,7 @@ class Importing:
         """Return verdict, count and loss, as a level reads them at `tick`."""
         self.task.reads(tick)
         reading = self.reader.read(tick)
-        return reading.verdict, reading.value.count, reading.is_lost
+        return reading.verdict, reading.message.count, reading.is_lost
 
     def counts(self) -> dict[str, int]:
         return {name: number for name, number in vars(self.entry.count).items() if number}

@@ -45,7 +45,7 @@ GENTLE = ("adapter.lan.lease_ms=1000",)
 
 def newest(segment: Segment, mailbox: str) -> Any:
     """Return the newest message of a mailbox."""
-    return open_observer(segment, mailbox).peek().value
+    return open_observer(segment, mailbox).peek().message
 
 
 def attached(name: str) -> Segment:

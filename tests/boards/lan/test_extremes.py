@@ -22,13 +22,13 @@ from rack.levels.operator import Goal
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.cell.coordinator import CellProgram
 from rack.levels.systems.cell.messages import (
-    CELL_ORDER,
-    CELL_REPORT,
+    CellOrder,
+    CellReport,
     OrderAction,
     OrderVerb,
     Response,
 )
-from rack.levels.systems.cell.shared_bodies import SHARED_BODIES
+from rack.levels.systems.cell.shared_bodies import SharedBodies
 from rack.tools.viewer.window import free_port
 from tests.boards.lan.extreme_levels import Case, cases, message_type
 from tests.boards.lan.racks import Ended, run_together
@@ -195,7 +195,7 @@ def orders_and_bodies(
     name: str, orders: Sequence[tuple[int, Case]], bodies: Sequence[tuple[int, Case]]
 ) -> list[Sender]:
     """Return the racks that stand in for those from which the PUMA imports."""
-    plain = [(1, next(cases(CELL_ORDER, {})))], [(1, next(cases(SHARED_BODIES, {})))]
+    plain = [(1, next(cases(CellOrder, {})))], [(1, next(cases(SharedBodies, {})))]
     return [
         Sender(name, [Stream("task.order_puma", ORDER, 10, orders or plain[0])]),
         Sender(f"{name}-k1607", [Stream("servo.shared", BODIES, 50, bodies or plain[1])]),
@@ -208,7 +208,7 @@ def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
     action: Mapping[str, Any], rack_name: str, tmp_path: Path
 ) -> None:
     orders = []
-    for case in cases(CELL_ORDER, {"id": 1, "program": 7, "what": OrderVerb.ASK, **action}):
+    for case in cases(CellOrder, {"id": 1, "program": 7, "what": OrderVerb.ASK, **action}):
         is_of_action = case[0].split()[0] in action
         if is_of_action or action is POSE:
             orders.append((PLANNED if is_of_action and case[2] else 1, case))
@@ -226,7 +226,7 @@ def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_
         "position": (0.6, 0.1, 0.475),
         "quaternion": (1, 0, 0, 0),
     }
-    found = cases(SHARED_BODIES, {"rack": b"other", "bodies": body})
+    found = cases(SharedBodies, {"rack": b"other", "bodies": body})
     first = ("plain", "bodies.position", "bodies.quaternion")
     # At 0 the part is in the pedestal, an unintended contact. Last: greater claims, after which
     # this one is not heard.
@@ -246,12 +246,12 @@ def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Pat
     checksum = CellProgram.model_validate(resolve(cell).config.task).checksum
     answer = {"program": checksum, "echo": 1000}
     rows = [
-        *cases(CELL_REPORT, answer),
-        *cases(CELL_REPORT, {**answer, "response": Response.DOING, "moves": 2}),
+        *cases(CellReport, answer),
+        *cases(CellReport, {**answer, "response": Response.DOING, "moves": 2}),
     ]
     # Last: a refusal that is permitted ends the program.
     refusal = {**answer, "response": Response.REFUSED, "error": Error.NO_PATH, "reason": b"no"}
-    rows += sorted(cases(CELL_REPORT, refusal), key=lambda case: case[0] != "error = 65535")
+    rows += sorted(cases(CellReport, refusal), key=lambda case: case[0] != "error = 65535")
     senders = [
         Sender(f"{rack_name}-{arm}", [Stream("task.report", REPORT, 10, [(2, c) for c in rows])])
         for arm in ("puma", "k1607")

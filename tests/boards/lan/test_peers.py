@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.lan.peers import REMEMBERED, PeerRack, Peers
-from rack.levels.peer import PEER, Presence
+from rack.levels.peer import PeerPresence, Presence
 
 OLD, NEW = 11, 22
 
@@ -54,7 +53,7 @@ def taken(changes: list[tuple[str, int, bool]]) -> Iterator[tuple[str, int, bool
 
 def restarted(peer: PeerRack, confirm_by: int) -> PeerRack:
     """Return the rack as a restarted adapter finds it in its mailbox."""
-    message, after = Message(PEER.dtype({})), PeerRack("b")
+    message, after = PeerPresence.zeros({}), PeerRack("b")
     peer.fill(message, is_lockstep=False)
     after.resume(message, confirm_by)
     return after
@@ -84,7 +83,7 @@ def test_a_rack_that_ended_while_the_adapter_was_away_is_lost_in_time() -> None:
     peers = Peers(["b"])
     there = PeerRack("b")
     there.comes(OLD, 5)
-    message = Message(PEER.dtype({}))
+    message = PeerPresence.zeros({})
     there.fill(message, is_lockstep=False)
     peers["b"].resume(message, 100)
     assert peers.look(99) == []
@@ -104,7 +103,7 @@ def test_alarms_name_the_rack_by_its_number_and_strangers_are_no_peers() -> None
 
 
 def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_alone_also_after_a_restart() -> None:
-    message = Message(PEER.dtype({}))
+    message = PeerPresence.zeros({})
     written = []
     for launch, restarted_at in ((OLD, 400), (NEW, 160)):
         rows = []

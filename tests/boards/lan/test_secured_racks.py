@@ -26,7 +26,7 @@ def taken(rack: str) -> int:
         segment = Segment.attach(rack)
         try:
             status = open_observer(segment, "lan.status").peek()
-            return int(status.value.import_other["taken"]) if status.is_there else 0
+            return int(status.message.import_other["taken"]) if status.is_there else 0
         finally:
             segment.close()
     return 0
@@ -57,13 +57,13 @@ def test_a_rack_that_speaks_in_the_name_of_another_is_refused(
         status, echo = (open_observer(segment, name) for name in ("lan.status", "echo.status"))
 
         def imported(count: str) -> int:
-            return int(status.peek().value.import_other[count])
+            return int(status.peek().message.import_other[count])
 
         before = taken(names[1])
         wait_until(lambda: taken(names[1]) > before + ROUNDS)
         wait_until(lambda: imported("repeated") > ROUNDS)
-        did, heard = forger.state(), echo.peek().value
-        wait_until(lambda: int(status.peek().value.flaws["unsigned"]) >= did["forged"])
+        did, heard = forger.state(), echo.peek().message
+        wait_until(lambda: int(status.peek().message.flaws["unsigned"]) >= did["forged"])
         assert did["opened"] == did["heard"]
         assert imported("refused") >= did["forged"]
         # A message that was forged and taken would make all up to it missing. Some may be: of 32

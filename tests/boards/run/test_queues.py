@@ -74,7 +74,7 @@ class QueueLink:
         self.reads.read(tick)
         reading: Reading = self.reads.values.point
         if reading.is_new:
-            self.taken += [message.id for message in (*reading.earlier, reading.value)]
+            self.taken += [message.id for message in (*reading.earlier, reading.message)]
         return reading
 
     def run(
@@ -198,7 +198,7 @@ def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) 
             rack.read(tick)
     assert rack.taken == [1, 2]
     assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
-    assert [rack.read(9).value.id, rack.taken] == [6, [1, 2, 5, 6]]
+    assert [rack.read(9).message.id, rack.taken] == [6, [1, 2, 5, 6]]
 
 
 FOUND = {

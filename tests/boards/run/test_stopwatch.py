@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.message import Field, State, status
+from rack.backplane.message import State, Status, field
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import done_semaphore
 from rack.backplane.trace import SKIPPED_SHIFT, Flag, trace_ring
@@ -20,7 +20,12 @@ from tests.backplane.conftest import MakeBus
 from tests.boards.test_events import box
 
 PERIOD_NS = 2_500_000
-STATUS = status("level_status", 1, Field("value", "f8", "1", "a number"))
+
+
+class LevelStatus(Status, version=1):
+    """Level status."""
+
+    value: float = field(unit="1", doc="a number")
 
 
 class Site:
@@ -58,7 +63,7 @@ class Site:
 @pytest.fixture
 def site(make_bus: MakeBus) -> Site:
     segment = make_bus(
-        task("level"), task("writer"), mailbox(), box("level.status", STATUS, "level")
+        task("level"), task("writer"), mailbox(), box("level.status", LevelStatus, "level")
     )
     segment.words[System.PERIOD_NS] = PERIOD_NS
     segment.words[System.EPOCH_NS] = time.monotonic_ns()

@@ -23,8 +23,8 @@ from rack.boards.config.layout import field_specs
 from rack.boards.operator import hold
 from rack.boards.run.system_controller import EndOfRun, SystemController
 from rack.boards.wiring import ClockWiring
-from rack.levels.messages import TASK_STATUS
-from rack.levels.operator import OPERATOR_COMMAND, Operation
+from rack.levels.messages import TaskStatus
+from rack.levels.operator import Operation, OperatorCommand
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.tools.faults.test_ending import box
@@ -129,8 +129,8 @@ def test_a_command_whose_client_has_died_is_not_issued_and_says_so(make_bus: Mak
 def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     make_bus: MakeBus, is_released: bool, is_restarted: bool
 ) -> None:
-    fields = field_specs(OPERATOR_COMMAND, {})
-    size = OPERATOR_COMMAND.dtype({}).itemsize
+    fields = field_specs(OperatorCommand.message_type, {})
+    size = OperatorCommand.message_type.dtype({}).itemsize
     box = replace(mailbox(name="left.operator", writer="clock"), fields=fields, size=size)
     segment = make_bus(box, *BOARDS)
     rack, table = Controlled(segment), OperatorTable(segment)
@@ -140,7 +140,7 @@ def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     claim = table.enter(Request(0, bytes(goto.raw)), Client.LEASES)
     for tick in (1, 2, 3):
         rack.controller.begin(tick)
-    assert operator.peek().value.what == Operation.GOTO
+    assert operator.peek().message.what == Operation.GOTO
     if is_restarted:
         for writer in rack.controller._desk._writers.values():
             writer.close()
@@ -153,7 +153,7 @@ def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     codes = rack.alarms.drain().rows["code"].tolist()
     assert codes.count(Alarm.OPERATOR_GONE) == (not is_released)
     last = Operation.GOTO if is_released else Operation.HOLD
-    assert operator.peek().value.what == last
+    assert operator.peek().message.what == last
     assert not table.leased()
 
 
@@ -173,7 +173,7 @@ def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come
 
 
 def test_the_controller_rests_until_the_run_may_end_unless_it_has_work(make_bus: MakeBus) -> None:
-    status = replace(box(TASK_STATUS, "task.status"), every=8, delay=8)
+    status = replace(box(TaskStatus, "task.status"), every=8, delay=8)
     bus = make_bus(*BOARDS, task("task", every=8, slot=4), status)
     rack = Controlled(bus, ends_run="task.status")
     assert rack.controller.rests_until(0) == 1
@@ -206,19 +206,19 @@ def ends_at(
 
 @pytest.mark.parametrize("state", [State.DONE, State.ERROR])
 def test_a_run_lingers_after_its_task_has_ended(make_bus: MakeBus, state: State) -> None:
-    found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), state, 5, 12)
+    found = ends_at(make_bus(box(TaskStatus, "task.status"), task("task")), state, 5, 12)
     # Visible at 6, seen at 7 as of the tick before; ten ticks of rest.
     assert found == [None] * 7 + [16] * 5
 
 
 def test_a_run_whose_task_goes_on_ends_once_its_level_is_silent(make_bus: MakeBus) -> None:
-    found = ends_at(make_bus(box(TASK_STATUS, "task.status"), task("task")), State.EXECUTING, 5, 60)
+    found = ends_at(make_bus(box(TaskStatus, "task.status"), task("task")), State.EXECUTING, 5, 60)
     # Heard as of tick 6; silent for 40 ticks as of 46, which is seen at 47.
     assert found == [None] * 47 + [56] * 13
 
 
 def test_a_run_of_given_length_ends_there_whatever_its_task_does(make_bus: MakeBus) -> None:
     found = ends_at(
-        make_bus(box(TASK_STATUS, "task.status"), task("task")), State.DONE, 5, 12, stop_tick=99
+        make_bus(box(TaskStatus, "task.status"), task("task")), State.DONE, 5, 12, stop_tick=99
     )
     assert found == [99] * 12

@@ -15,7 +15,7 @@ from rack.levels import arm as arm_package
 from rack.levels.algebra import Array, cholesky_solve
 from rack.levels.arm import SimulatedArm, drives, sensors, substeps
 from rack.levels.compiled import compiled
-from rack.levels.messages import ARM_STATE, SCENE
+from rack.levels.messages import ArmState, Scene
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.robot.dynamics import Dynamics, Payload
@@ -33,13 +33,13 @@ def driven(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
         bias = arm.dynamics.terms(sensed.position, sensed.velocity).bias
         arm.drive(bias + 0.3 * made.bounds.torque * np.sin(0.1 * tick + np.arange(len(bias))), 10.0)
         arm.step(1)
-    state = Message(ARM_STATE.dtype(sizes(made)))
+    state = ArmState.zeros(sizes(made))
     arm.save(state)
     return state
 
 
 def scene(arm: SimulatedArm, made: Cell) -> Message:
-    seen = Message(SCENE.dtype(sizes(made)))
+    seen = Scene.zeros(sizes(made))
     arm.look(seen)
     return seen
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.simulation import push_force
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.tables import PushConfig
 from tests.levels.arms import CLOCK_NS, config
@@ -33,7 +32,7 @@ def test_a_push_rises_lasts_and_falls(time_s: float, part: float) -> None:
 
 
 def test_an_arm_restored_during_a_push_continues_bit_for_bit() -> None:
-    states = [Message(ARM_STATE.dtype(sizes(pushed_arm().cell))) for _ in range(3)]
+    states = [ArmState.zeros(sizes(pushed_arm().cell)) for _ in range(3)]
     arm = pushed_arm(
         PushConfig(body="block2", at=0.02, seconds=0.2, force=(1.5, 0.5, 0.3), rise=0.1)
     )

@@ -18,7 +18,7 @@ from rack.levels.arm import simulated as simulated_arm
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.simulated import CascadedDrives
 from rack.levels.level import Finding
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.tables import Interface, SceneConfig
 from tests.levels.arm.test_own_arm import SUBSTEPS, IdealArm
@@ -112,7 +112,7 @@ def load(cell: Cell) -> Array:
 
 
 def saved(arm: SimulatedArm) -> Message:
-    state = Message(ARM_STATE.dtype(sizes(arm.cell)))
+    state = ArmState.zeros(sizes(arm.cell))
     arm.save(state)
     return state
 

@@ -14,7 +14,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm, substeps
 from rack.levels.arm.simulation import ObstacleMotion
-from rack.levels.messages import ARM_STATE, SCENE
+from rack.levels.messages import ArmState, Scene
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import Cell, sizes
 from rack.levels.robot.dynamics import Dynamics
@@ -31,7 +31,7 @@ def arm_of(name: str) -> tuple[SimulatedArm, Cell]:
 
 
 def saved(arm: SimulatedArm, made: Cell) -> Message:
-    state = Message(ARM_STATE.dtype(sizes(made)))
+    state = ArmState.zeros(sizes(made))
     arm.save(state)
     return state
 
@@ -97,7 +97,7 @@ def test_simulated_time_is_the_tick_times_the_period_exactly() -> None:
 
 def test_a_restored_arm_continues_bit_for_bit() -> None:
     arm, made = arm_of("puma560")
-    torque, middle = wobble(made), Message(ARM_STATE.dtype(sizes(made)))
+    torque, middle = wobble(made), ArmState.zeros(sizes(made))
     for tick in range(200):
         if tick == 120:
             arm.save(middle)
@@ -194,7 +194,7 @@ def test_the_scene_shows_moving_obstacles_objects_and_the_tool_where_they_are() 
     )
     arm = SimulatedArm(made, soon, CLOCK_NS)
     arm.step(240)
-    seen = Message(SCENE.dtype(sizes(made)))
+    seen = Scene.zeros(sizes(made))
     arm.look(seen)
     post = len(scene.objects)
     assert seen.position[post] == pytest.approx([0.62, 0.85 - 0.25 * (239 * TICK_S - 0.1), 0.9])

@@ -8,10 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.systems.force.contact_wrench import ContactWrench
 from tests.levels.systems.force.pad import pad
@@ -76,7 +75,7 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
 
 def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     arms = [arm_of(tmp_path, noise=0.2) for _ in range(2)]
-    state = Message(ARM_STATE.dtype(sizes(arms[0].cell)))
+    state = ArmState.zeros(sizes(arms[0].cell))
     for _ in range(40):
         arms[0].drive(arms[0].dynamics.terms(*arms[0]._state).bias, 0.0)
         arms[0].step(1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rack.backplane.message import Message, State
 from rack.levels.elemental_move import ElementalMoveExecutor
-from rack.levels.messages import MOVE_PLAN, PRIMITIVE_STATUS, TASK_COMMAND, Error, SegmentKind, Verb
+from rack.levels.messages import Error, MovePlan, PrimitiveStatus, SegmentKind, TaskCommand, Verb
 from rack.levels.operator import ABOVE_LOST, BELOW_LOST
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
@@ -30,9 +30,9 @@ class Bench(Lockstep):
         board = BoardSpec("elemental_move", EVERY, ElementalMoveExecutor, **places, params=params)
         robot, scene = config("puma560")
         outside = {
-            "task.command": TASK_COMMAND,
-            "primitive.status": PRIMITIVE_STATUS,
-            "elemental_move.plan": MOVE_PLAN,
+            "task.command": TaskCommand,
+            "primitive.status": PrimitiveStatus,
+            "elemental_move.plan": MovePlan,
         }
         super().__init__([board], robot, scene, outside=outside)
         self.home = np.array(robot.home)

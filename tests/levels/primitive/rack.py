@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rack.levels.messages import MOVE_COMMAND, SegmentKind
+from rack.levels.messages import MoveCommand, SegmentKind
 from rack.levels.primitive import PrimitiveExecutor, PrimitivePlanner
 from rack.levels.servo import ServoExecutor, ServoPlanner
 from rack.levels.tables import MotionConfig
@@ -50,7 +50,7 @@ class PrimitiveRack(Lockstep):
             ),
         ]
         scene = scene.model_copy(update={"motion": tuple(motion)})
-        super().__init__(boards, robot, scene, outside={"em.command": MOVE_COMMAND})
+        super().__init__(boards, robot, scene, outside={"em.command": MoveCommand})
         self.home, self.fastest = np.array(robot.home), np.array(robot.velocity)
         self.seen: list[dict[str, Any]] = []
         self.set_points: list[dict[str, Any]] = []

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message, State
-from rack.levels.messages import WORLD_MODEL, SegmentKind
+from rack.backplane.message import State
+from rack.levels.messages import SegmentKind, WorldState
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import make_trajectory
 from rack.levels.primitive.guard import Guard
@@ -88,7 +88,7 @@ class Watched:
         _, scene = arms.config(CROSSING)
         self.cell: Cell = arms.cell(CROSSING)
         self.guard = Guard(self.cell, scene, lookahead_s=2.0, delay_s=0.0)
-        self.world = Message(WORLD_MODEL.dtype({"bodies": len(self.cell.bodies)}))
+        self.world = WorldState.zeros({"bodies": len(self.cell.bodies)})
         start = self.cell.start()
         for row, body in enumerate(self.cell.bodies):
             self.world.position[row] = start.xpos[body]

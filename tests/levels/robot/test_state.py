@@ -12,7 +12,7 @@ from rack.backplane.message import Message
 from rack.boards.checkpoint.kinds import part_kind
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.simulation import sleeping
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import sizes
 from rack.levels.robot.state import SLEEP
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
@@ -35,7 +35,7 @@ def arm_of(kind: type[SimulatedArm] = SimulatedArm) -> SimulatedArm:
 
 
 def saved(arm: SimulatedArm) -> Message:
-    message = Message(ARM_STATE.dtype(sizes(arm.cell)))
+    message = ArmState.zeros(sizes(arm.cell))
     arm.save(message)
     return message
 

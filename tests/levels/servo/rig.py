@@ -12,7 +12,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS
 from rack.levels.algebra import Array
 from rack.levels.level import Fault, Finding
-from rack.levels.messages import JOINT_SET_POINT
+from rack.levels.messages import JointCommand
 from rack.levels.servo import ServoExecutor, ServoPlanner
 from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
@@ -50,7 +50,7 @@ class ServoRig:
     function of time."""
 
     executor: type[ServoExecutor] = ServoExecutor
-    outside: Mapping[str, MessageType] = {"primitive.command": JOINT_SET_POINT}
+    outside: Mapping[str, MessageType] = {"primitive.command": JointCommand}
     """Mailboxes that the test writes."""
 
     def __init__(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.level import Demand, Ports
+from rack.levels.level import Demand
 from rack.levels.operator import Answer, Operation
 from rack.levels.systems.joint_boards import JointServo
 from tests.levels.box import mute
@@ -134,10 +134,10 @@ def test_arm_is_not_released_towards_where_its_sensors_did_not_see_it() -> None:
 class Nonsense(JointServo):
     """Writes NaN for a while."""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        super().process(read, write, tick)
+    def process(self, tick: int) -> None:
+        super().process(tick)
         if WARM_UP <= tick < WARM_UP + 20:
-            write.command.torque[0] = np.nan
+            self.command.torque[0] = np.nan
 
 
 def test_torque_of_a_board_that_is_nan_never_reaches_the_arm() -> None:

@@ -16,7 +16,7 @@ from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.joint_boards.arm_executor import JointTorques
 from rack.levels.systems.joint_boards.joint_control import AT, DUE, JointLoads
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_TORQUE
+from rack.levels.systems.joint_boards.messages import JointReference, JointTorque
 from tests.levels.arms import cell, config
 from tests.levels.servo.joint_rig import CLOCK_NS, JOINTS
 
@@ -25,13 +25,13 @@ TICK = 100
 
 
 def reference(due: int, inertia: float, load: float) -> Message:
-    message = Message(JOINT_REFERENCE.dtype(SIZES))
+    message = JointReference.zeros(SIZES)
     message.due, message.inertia, message.load = due, np.full(6, inertia), np.full(6, load)
     return message
 
 
 def torque(sampled: int, joint: int, newton_metres: float) -> Message:
-    message = Message(JOINT_TORQUE.dtype(SIZES))
+    message = JointTorque.zeros(SIZES)
     message.sampled = sampled
     message.torque[joint], message.target[joint], message.target_velocity[joint] = (
         newton_metres,

@@ -12,7 +12,7 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext, Ports
-from rack.levels.systems.figures import FIGURE_PLAN, FIGURE_STATUS, FigureExecutor, FigurePlanner
+from rack.levels.systems.figures import FigureExecutor, FigurePlan, FigurePlanner, FigureStatus
 
 MS = 1_000_000
 
@@ -31,14 +31,14 @@ def ports(**inputs: Message | None) -> Ports:
 
 
 def plan_of(tick: int) -> Message:
-    found = Message(FIGURE_PLAN.dtype({}))
+    found = FigurePlan.zeros({})
     found.made_at = tick
     return found
 
 
 def computing_ns(executor: FigureExecutor, tick: int) -> int:
     """Return the processor time of one cycle."""
-    write = Ports(status=Message(FIGURE_STATUS.dtype({})))
+    write = Ports(status=FigureStatus.zeros({}))
     start = process_time_ns()
     executor.process(ports(plan=None), write, tick)
     return process_time_ns() - start
@@ -64,7 +64,7 @@ def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
     planner, write, status = (
         FigurePlanner(context(plan_ms=4.0)),
         plan_of(-1),
-        Message(FIGURE_STATUS.dtype({})),
+        FigureStatus.zeros({}),
     )
     status.cycle = 8
     assert planner.wanted(ports(status=None), 0)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rack.backplane.message import REASON_BYTES, Message, State
+from rack.backplane.message import REASON_BYTES, State
 from rack.levels.errors import Refused
 from rack.levels.level import LevelContext, Pace
-from rack.levels.messages import TASK_PLAN, Error, Verb
+from rack.levels.messages import Error, TaskPlan, Verb
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.pose import Pose
@@ -159,5 +159,5 @@ def test_time_of_another_rack_is_not_refused_for_the_rounding_of_its_offset() ->
     for offset in np.random.default_rng(1).uniform(-20.0, 0.0, 200):
         planner._ahead_s = float(offset)  # the move is slowed down to end just in time
         planner._promise(
-            planner._with_times([Rehearsed(home, 1.0)]), 0.0, Message(TASK_PLAN.dtype(rack.sizes))
+            planner._with_times([Rehearsed(home, 1.0)]), 0.0, TaskPlan.zeros(rack.sizes)
         )

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, Input, Ports
+from rack.levels.level import Executor, Input, Output
 from rack.levels.messages import (
-    MOVE_STATUS,
-    SERVO_STATUS,
-    TASK_COMMAND,
-    TASK_PLAN,
     WINDOW,
-    WORLD_MODEL,
     Error,
+    MoveStatus,
+    ServoStatus,
+    TaskCommand,
+    TaskPlan,
+    WorldState,
 )
 from rack.levels.task import TaskExecutor, TaskPlanner
 from tests.levels.arms import cell, config
@@ -33,7 +33,7 @@ class Bench(Lockstep):
 
     def __init__(self, *actions: Mapping[str, Any], **params: Any) -> None:
         board = BoardSpec("task", 400, TaskExecutor, below="elemental_move", params=params)
-        outside = {"task.plan": TASK_PLAN, "elemental_move.status": MOVE_STATUS}
+        outside = {"task.plan": TaskPlan, "elemental_move.status": MoveStatus}
         super().__init__([board], ROBOT, SCENE, {"action": list(actions)}, outside=outside)
 
     def plan(self, actions: list[int], error: Error = Error.NONE) -> None:
@@ -140,11 +140,11 @@ def test_task_that_stands_still_ends_and_says_why(
 class Obedient(Executor):
     """A level below that does every move as soon as it is shown."""
 
-    inputs = {"command": Input(TASK_COMMAND, "above.command")}
-    outputs = {"status": MOVE_STATUS}
+    above = Input(TaskCommand, "above.command")
+    status = Output(MoveStatus)
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        write.status.done = read.command.value.id
+    def process(self, tick: int) -> None:
+        self.status.done = self.above.message.id
 
 
 class PlannedBench(Lockstep):
@@ -152,7 +152,7 @@ class PlannedBench(Lockstep):
     tick `seen` on."""
 
     def __init__(self, *actions: Mapping[str, Any], seen: int = 4) -> None:
-        outside = {"servo.status": SERVO_STATUS, "world.model": WORLD_MODEL}
+        outside = {"servo.status": ServoStatus, "world.model": WorldState}
         boards = [
             BoardSpec("task", 400, TaskExecutor, TaskPlanner, 2, below="elemental_move"),
             BoardSpec("elemental_move", 100, Obedient, above="task"),

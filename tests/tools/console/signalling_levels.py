@@ -7,7 +7,6 @@ import os
 import sys
 from pathlib import Path
 
-from rack.levels.level import Ports
 from tests.processes import parent_of
 from tests.two_levels import Upper
 
@@ -43,9 +42,9 @@ class Signalling(Upper):
         """Send during the launch, when there is a segment."""
         send("self-test")
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
+    def process(self, tick: int) -> None:
         """Send during the run."""
-        super().process(read, write, tick)
+        super().process(tick)
         if tick == TICK:
             send("cycle")
 

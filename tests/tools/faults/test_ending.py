@@ -12,7 +12,7 @@ from rack.backplane.message import MessageType, State
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 from rack.boards.faults.kind import KINDS
-from rack.levels.messages import ARM_STATE, SERVO_STATUS, TASK_STATUS, Error
+from rack.levels.messages import ArmState, Error, ServoStatus, TaskStatus
 from rack.tools.faults.ending import (
     AT_REST,
     EXTERNAL,
@@ -43,9 +43,9 @@ def box(message: MessageType, name: str) -> MailboxSpec:
 
 
 BOXES = (
-    box(TASK_STATUS, "task.status"),
-    box(SERVO_STATUS, "servo.status"),
-    box(ARM_STATE, "arm.state"),
+    box(TaskStatus, "task.status"),
+    box(ServoStatus, "servo.status"),
+    box(ArmState, "arm.state"),
 )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.message import Field, MessageType
+from rack.backplane.message import Message, field
 from rack.boards.config.layout import field_specs
 from rack.tools.console.answer import Failure
 from rack.tools.recording.signal import Signal, Trigger
@@ -22,18 +22,22 @@ class Gait(IntEnum):
     WALKS = 1
 
 
-LEG = MessageType("leg", 1, (Field("angle", "f8", "rad", "of hip and knee", (2,)),))
-WALKER = MessageType(
-    "walker",
-    1,
-    (
-        Field("gait", "u1", Gait, "what it does"),
-        Field("speed", "f8", "m/s", "forwards"),
-        Field("name", "S8", "ASCII", "its name"),
-        Field("legs", LEG, "", "left and right", (2,)),
-    ),
-)
-DTYPE = WALKER.dtype({})
+class Leg(Message, version=1):
+    """Leg."""
+
+    angle: np.ndarray = field(unit="rad", doc="of hip and knee", shape=2)
+
+
+class Walker(Message, version=1):
+    """Walker."""
+
+    gait: Gait = field(doc="what it does")
+    speed: float = field(unit="m/s", doc="forwards")
+    name: str = field("S8", doc="its name")
+    legs: np.ndarray = field(Leg, doc="left and right", shape=2)
+
+
+DTYPE = Walker.message_type.dtype({})
 BOX = MailboxSpec(
     name="walker.status",
     writer="walker",
@@ -42,10 +46,10 @@ BOX = MailboxSpec(
     every=1,
     delay=1,
     depth=8,
-    message=WALKER.name,
+    message=Walker.message_type.name,
     version=1,
     size=DTYPE.itemsize,
-    fields=field_specs(WALKER, {}),
+    fields=field_specs(Walker.message_type, {}),
 )
 
 

@@ -62,7 +62,7 @@ def test_a_rack_runs_while_its_program_reads_and_commands(own: Rack, live: Attac
     tick = live.wait_until("lower.status.count > 20", BOUND_S)
     assert tick >= 20
     reading = live.read("lower.status")
-    assert live["lower.status.count"] >= reading.value.count > 20
+    assert live["lower.status.count"] >= reading.message.count > 20
     assert live["lower.status.state"] == "executing"
     assert live["lower.status.reason"] == ""
     reply = live.command("upper", "hold", wait_s=BOUND_S)

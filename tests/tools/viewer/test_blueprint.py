@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from rack.backplane.segment import Launch
 from rack.boards.config import load, wire
 from rack.boards.events import Event
-from rack.levels.messages import SERVO_STATUS
+from rack.levels.messages import ServoStatus
 from rack.levels.robot.cell import build_cell, sizes
 from rack.tools.viewer.blueprint import RackViews
 from rack.tools.viewer.cell import Marks
@@ -86,7 +86,11 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
     recording = new_recording("run", "run", tmp_path / "run.rrd", rrb.Blueprint(rrb.TextLogView()))
     stream = Stream(recording, times)
     marks = Marks(stream, cell, config.robot.joints)
-    dtype = [("tick", "i8"), ("stamp_ns", "i8"), ("message", SERVO_STATUS.dtype(sizes(cell)))]
+    dtype = [
+        ("tick", "i8"),
+        ("stamp_ns", "i8"),
+        ("message", ServoStatus.message_type.dtype(sizes(cell))),
+    ]
     rows = np.zeros(9, dtype=dtype)
     rows["tick"] = np.arange(9)
     rows["message"]["braked"][3:6] = 1

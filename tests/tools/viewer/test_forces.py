@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from rack.backplane.message import MessageType
 from rack.backplane.segment import Launch
 from rack.levels.robot.cell import Cell, build_cell, sizes
-from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
+from rack.levels.systems.force.messages import ForceStatus, Wrench
 from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
@@ -50,7 +50,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     force = np.zeros((ROWS, 6))
     force[:, 2] = np.arange(ROWS)
     written = Written(tmp_path)
-    written.write(WRENCH, cell, ContactArrows(written.stream, cell, "wrench").write, wrench=force)
+    written.write(Wrench, cell, ContactArrows(written.stream, cell, "wrench").write, wrench=force)
     arrows = read(written.file, "/cell/forces/tool", "Arrows3D:vectors")
     assert arrows.ticks.tolist() == [0, 20, 40]
     assert arrows.values[:, 0] == pytest.approx(
@@ -65,7 +65,7 @@ def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
     wrench[:, 2], wanted[:, 2], selected[:, 2] = 18.0, -20.0, 1
     written = Written(tmp_path)
     part = TaskForces(written.stream).write
-    written.write(FORCE_STATUS, cell, part, wrench=wrench, wanted=wanted, selected=selected)
+    written.write(ForceStatus, cell, part, wrench=wrench, wanted=wanted, selected=selected)
     assert read(written.file, "/forces/task_frame/z").values[-1].tolist() == [-20.0, -18.0]
     assert np.isnan(read(written.file, "/forces/task_frame/x").values[-1][0])
 
@@ -74,7 +74,7 @@ def test_the_contact_is_shown_against_the_arms_limits(tmp_path: Path, cell: Cell
     assert cell.wrist is not None
     written = Written(tmp_path)
     part = ContactForces(written.stream, cell.wrist.most).write
-    written.write(WRENCH, cell, part, wrench=np.tile([3.0, 0.0, 4.0, 0.0, 0.6, 0.8], (ROWS, 1)))
+    written.write(Wrench, cell, part, wrench=np.tile([3.0, 0.0, 4.0, 0.0, 0.6, 0.8], (ROWS, 1)))
     assert read(written.file, "/forces/contact/force").values[-1].tolist() == [60.0, 5.0]
     assert read(written.file, "/forces/contact/torque").values[-1].tolist() == [8.0, 1.0]
 

@@ -20,11 +20,11 @@ from rack.levels.systems.cell.agreement import (
     Agreement,
     TakenOrder,
 )
-from rack.levels.systems.cell.messages import CELL_PROGRESS, CELL_REPORT, OrderVerb, Phase, Response
+from rack.levels.systems.cell.messages import CellProgress, CellReport, OrderVerb, Phase, Response
 
 PROGRAM, ARMS = 7, ("puma", "k1607", "third")
 STEPS = (("puma", "k1607"), ("third",), ("k1607", "puma", "third"))
-SILENCE = Reading(Message(CELL_REPORT.dtype({})), Verdict.NONE)
+SILENCE = Reading(CellReport.zeros({}), Verdict.NONE)
 FINISH = 400
 """Cycles after which an undisturbed program is over."""
 
@@ -48,7 +48,7 @@ class PlayedArm:
     until: float = 0.0
 
     def __post_init__(self) -> None:
-        self.report = Message(CELL_REPORT.dtype({}))
+        self.report = CellReport.zeros({})
 
     def cycle(self, order: tuple[int, OrderVerb, str], now_s: float) -> Reading:
         """Take up what is said; return the report."""
@@ -106,7 +106,7 @@ class Play:
     def __init__(self, **arms: PlayedArm) -> None:
         self.arms = {name: arms.get(name, PlayedArm()) for name in ARMS}
         self.agreement = Agreement(PROGRAM, STEPS, margin_s=1.0, farewell_s=50.0)
-        self.progress = Message(CELL_PROGRESS.dtype({}))
+        self.progress = CellProgress.zeros({})
         self.orders = dict.fromkeys(ARMS, (0, OrderVerb.NONE, ""))
         self.answers = dict.fromkeys(ARMS, SILENCE)
         self.now_s = 0.0

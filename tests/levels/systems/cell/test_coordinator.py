@@ -8,7 +8,7 @@ from rack.backplane.message import Message, State
 from rack.levels.messages import Error
 from rack.levels.operator import Goal, Operation
 from rack.levels.systems.cell.coordinator import CellProgram, Coordinator
-from rack.levels.systems.cell.messages import CELL_REPORT, OrderAction, OrderVerb, Response
+from rack.levels.systems.cell.messages import CellReport, OrderAction, OrderVerb, Response
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep, Operator
 
@@ -34,7 +34,7 @@ class CellBench(Lockstep):
         board = BoardSpec("cell", EVERY, Coordinator, params={"arms": ARMS, **params})
         task = {"step": [{"do": step} for step in steps]}
         super().__init__(
-            [board], *config("puma560"), task, outside=dict.fromkeys(ARMS.values(), CELL_REPORT)
+            [board], *config("puma560"), task, outside=dict.fromkeys(ARMS.values(), CellReport)
         )
         self.checksum = CellProgram.model_validate(task).checksum
 

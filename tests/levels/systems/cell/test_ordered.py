@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import Message, State
-from rack.levels.level import Executor, Input, Ports
-from rack.levels.messages import MOVE_STATUS, SERVO_STATUS, TASK_COMMAND, WORLD_MODEL, Error, Verb
-from rack.levels.peer import PEER
+from rack.levels.level import Executor, Input, Output
+from rack.levels.messages import Error, MoveStatus, ServoStatus, TaskCommand, Verb, WorldState
+from rack.levels.peer import PeerPresence
 from rack.levels.systems.cell import OrderedTaskExecutor, OrderedTaskPlanner
 from rack.levels.systems.cell.actions import write_action
-from rack.levels.systems.cell.messages import CELL_ORDER, OrderVerb, Response
+from rack.levels.systems.cell.messages import CellOrder, OrderVerb, Response
 from rack.levels.task.program import Goto, Home, Transfer
 from tests.levels.arms import cell, config
 from tests.levels.lockstep import BoardSpec, Lockstep
@@ -30,14 +30,14 @@ HOME = Home()
 class PlayedMoves(Executor):
     """A level below that does every move in `MOVE_CYCLES`, if it is not held."""
 
-    inputs = {"command": Input(TASK_COMMAND, "above.command")}
-    outputs = {"status": MOVE_STATUS}
+    above = Input(TaskCommand, "above.command")
+    status = Output(MoveStatus)
     spent = 0
     stray_rad = 0.0
     """How far the first joint has been moved by somebody else."""
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        command, status = read.command.value, write.status
+    def process(self, tick: int) -> None:
+        command, status = self.above.message, self.status
         ids = [int(serial) for serial in command.moves["id"][: command.count]]
         if ids and ids[0] > status.done + 1:
             status.done, self.spent = ids[0] - 1, 0
@@ -56,7 +56,11 @@ class OrderBench(Lockstep):
     arm's."""
 
     def __init__(self, ahead: float = 0.0, uncertainty: float = 0.0, **params: Any) -> None:
-        outside = {"lan.orders": CELL_ORDER, "lan.peer_cell": PEER, "servo.status": SERVO_STATUS}
+        outside = {
+            "lan.orders": CellOrder,
+            "lan.peer_cell": PeerPresence,
+            "servo.status": ServoStatus,
+        }
         table = {"coordinator": "cell", **params}
         boards = [
             BoardSpec(
@@ -70,7 +74,7 @@ class OrderBench(Lockstep):
             ),
             BoardSpec("elemental_move", MOVE_EVERY, PlayedMoves, above="task"),
         ]
-        super().__init__(boards, ROBOT, SCENE, outside={**outside, "world.model": WORLD_MODEL})
+        super().__init__(boards, ROBOT, SCENE, outside={**outside, "world.model": WorldState})
         servo = self.message("servo.status")
         servo.target = np.array(ROBOT.home)
         self.write("servo.status", servo)

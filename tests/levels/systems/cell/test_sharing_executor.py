@@ -12,9 +12,9 @@ import pytest
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.messages import JOINT_SET_POINT
+from rack.levels.messages import JointCommand
 from rack.levels.systems.cell import SharingServoExecutor
-from rack.levels.systems.cell.shared_bodies import SHARED_BODIES, Claim, SharedBody
+from rack.levels.systems.cell.shared_bodies import Claim, SharedBodies, SharedBody
 from rack.levels.systems.cell.sharing_arm import SharingArm
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from tests.levels.servo.rig import PERIOD, Course, ServoRig
@@ -58,7 +58,7 @@ class Hoist(ServoRig):
     off the middle."""
 
     executor = SharingServoExecutor
-    outside = {"primitive.command": JOINT_SET_POINT, "lan.shared": SHARED_BODIES}
+    outside = {"primitive.command": JointCommand, "lan.shared": SharedBodies}
 
     def __init__(self, folder: Path, name: str) -> None:
         model = folder / "hoist.xml"
@@ -220,7 +220,7 @@ def test_the_part_stays_where_it_is_across_a_restart_of_a_servo_board(
 
 def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
     """Return a message of a rack: the claim that it knows, and where its copy is."""
-    message = Message(SHARED_BODIES.dtype({}))
+    message = SharedBodies.zeros({})
     message.rack = rack
     speaker = SharedBody(name, rack, claim)
     speaker.show(message.bodies[0], np.array([x, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))

@@ -11,16 +11,16 @@ import numpy as np
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.messages import WORLD_MODEL
+from rack.levels.messages import WorldState
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import pose
 from rack.levels.robot.cell import build_cell
 from rack.levels.systems.force.arm_executor import ForceArmExecutor
 from rack.levels.systems.force.hybrid import HybridExecutor
-from rack.levels.systems.force.messages import COMPLIANCE
+from rack.levels.systems.force.messages import Compliance
 from rack.levels.systems.joint_boards import JointServo
 from rack.levels.systems.trajectory import TrajectoryExecutor
-from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MotionKind
+from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest
 from tests.levels.lockstep import BoardSpec, Lockstep
 from tests.levels.systems.force.pad import pad
 
@@ -53,9 +53,9 @@ class HybridRig:
             BoardSpec("trajectory", 20, TrajectoryExecutor, above="client", below="hybrid"),
         ]
         outside = {
-            "client.requests": MOTION_REQUEST,
-            "trajectory.compliance": COMPLIANCE,
-            "world.model": WORLD_MODEL,
+            "client.requests": MotionRequest,
+            "trajectory.compliance": Compliance,
+            "world.model": WorldState,
         }
         self.rack = Lockstep(boards, robot, scene, outside=outside, clock_ns=CLOCK_NS)
         world = self.rack.message("world.model")

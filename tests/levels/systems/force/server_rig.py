@@ -11,7 +11,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pose
-from rack.levels.systems.force.messages import FORCE_STATUS, SERVER_REQUEST, Mode
+from rack.levels.systems.force.messages import ForceStatus, Mode, ServerRequest
 from rack.levels.systems.force.server import ForceServer
 from rack.levels.systems.trajectory.messages import MotionKind
 from tests.levels.systems.trajectory.rig import PERIOD_S, TrajectoryRig
@@ -30,13 +30,13 @@ class ServerRig(TrajectoryRig):
     it."""
 
     level_class = ForceServer
-    request_type = SERVER_REQUEST
+    request_type = ServerRequest
     level: ForceServer
 
     def __init__(self, **params: Any) -> None:
         super().__init__("penn_cell", boards=1, **params)
         self.ik = InverseKinematics(self.cell, 1)
-        self.force = self.message(FORCE_STATUS)
+        self.force = self.message(ForceStatus)
         self.force.sensed = -1
         self.offset = 0.0  # m, along z of the task frame
         self.floor = HEIGHT
@@ -80,7 +80,7 @@ class ServerRig(TrajectoryRig):
             self.statuses["joints0"],
         )
         if self.alive and not self.queue:
-            self.queue.append(self.message(SERVER_REQUEST))
+            self.queue.append(self.message(ServerRequest))
         before = status.target.copy()
         struck = force.struck == wanted.id and force.struck > 0
         follows = bool(command.due) and not struck and not status.stopped

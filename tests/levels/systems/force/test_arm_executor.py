@@ -18,7 +18,7 @@ from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.force.arm_executor import ForceArmExecutor
 from rack.levels.systems.joint_boards import JointServo
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE
+from rack.levels.systems.joint_boards.messages import JointReference
 from tests.levels.lockstep import BoardSpec, Lockstep
 from tests.levels.servo.rig import Found
 from tests.levels.systems.force.pad import pad
@@ -51,7 +51,7 @@ class PressRig:
         robot = robot.model_copy(update={"home": tuple(self._near)})
         cell = build_cell(robot, scene, CLOCK_NS)
         self.rack = Lockstep(
-            boards, robot, scene, outside={"level.command": JOINT_REFERENCE}, clock_ns=CLOCK_NS
+            boards, robot, scene, outside={"level.command": JointReference}, clock_ns=CLOCK_NS
         )
         self._ik, self._dynamics, self.x = ik, Dynamics(cell), FREE_M
         self.command = self.rack.message("level.command")

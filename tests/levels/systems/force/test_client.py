@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.force.client import ForceMotions, ForceProgram
-from rack.levels.systems.force.messages import SERVER_STATUS, Mode
+from rack.levels.systems.force.messages import Mode, ServerStatus
 from rack.levels.systems.trajectory.messages import MotionKind
 from tests.levels.arms import config
 
@@ -45,7 +44,7 @@ class Bus:
     def __init__(self) -> None:
         self.tick, self.is_over = 0, False
         self.requests: list[dict[str, Any]] = []
-        self.status = Message(SERVER_STATUS.dtype({"joints": 6}))
+        self.status = ServerStatus.zeros({"joints": 6})
 
     @property
     def time_s(self) -> float:

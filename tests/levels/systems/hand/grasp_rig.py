@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.backplane.message import Message, State
 from rack.levels.level import Input
-from rack.levels.messages import SCENE
+from rack.levels.messages import Scene
 from rack.levels.systems.hand import (
     FingerExecutor,
     FingertipLoop,
@@ -38,7 +38,7 @@ LIFT = {"do": "shift", "by": [0.0, 0.0, 0.006], "seconds": 0.5}
 class SceneWorld(WorldModel):
     """A world model that reads the scene of the board of the hand."""
 
-    inputs = {**WorldModel.inputs, "scene": Input(SCENE, "hand.scene")}
+    scene = Input(Scene, "hand.scene")
 
 
 def program(*steps: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.message import Message
-from rack.levels.level import Executor, Input, LevelContext, Ports
+from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.robot.cell import build_cell
 from rack.levels.systems.hand.executor import HandExecutor
-from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR, HAND_STATUS, TENSION_COMMAND
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR, HandStatus, TensionCommand
 from rack.levels.tables import PushConfig
 from tests.levels.arms import config
 from tests.levels.lockstep import BoardSpec, Lockstep
@@ -27,11 +27,9 @@ AMPLITUDE_RAD, RATE = 0.15, 6.0
 class Swing(Executor):
     """Swings the joints of the finger `finger`, or of all."""
 
-    inputs = {
-        "status": Input(HAND_STATUS, "below.status"),
-        "before": Input(TENSION_COMMAND, "own.command"),
-    }
-    outputs = {"command": TENSION_COMMAND}
+    below = Input(HandStatus, "below.status")
+    before = Input(TensionCommand, "own.command")
+    command = Output(TensionCommand)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -47,10 +45,10 @@ class Swing(Executor):
         self.is_blind = False  # it takes no new status
         self.override: float | None = None  # N: commanded of all tendons instead
 
-    def process(self, read: Ports, write: Ports, tick: int) -> None:
-        status, command, hand = read.status.value, write.command, self.hand
-        if not read.status.is_there or self.is_blind:
-            command.sampled = -1 if not read.status.is_there else command.sampled
+    def process(self, tick: int) -> None:
+        status, command, hand = self.below.message, self.command, self.hand
+        if not self.below.is_there or self.is_blind:
+            command.sampled = -1 if not self.below.is_there else command.sampled
             return
         wanted = np.array(self.context.robot.home) + AMPLITUDE_RAD * np.sin(
             RATE * tick * self.context.tick_s

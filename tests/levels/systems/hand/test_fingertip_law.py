@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.laws import FingertipGains, FingertipLaw
-from rack.levels.systems.hand.messages import FINGER_TARGET, GRASP_TARGET, FingerMode
+from rack.levels.systems.hand.messages import FingerMode, FingerTarget, GraspTarget
 from tests.levels.arms import cell
 
 HAND = cell("utah_mit")
@@ -32,8 +31,8 @@ class Tips:
         self.law = FingertipLaw(the_kinematics(), range(4), FingertipGains(), PERIOD_S)
         self.law.start(BENT)
         self.grasp, self.target = (
-            Message(GRASP_TARGET.dtype(SIZES)),
-            Message(FINGER_TARGET.dtype(SIZES)),
+            GraspTarget.zeros(SIZES),
+            FingerTarget.zeros(SIZES),
         )
         self.grasp.position = BENT
 

@@ -9,7 +9,7 @@ import pytest
 
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.messages import ARM_STATE
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.systems.hand.simulated import SimulatedHand
@@ -29,7 +29,7 @@ def hand_of(stiff: float | None = None) -> SimulatedHand:
 
 
 def saved(hand: SimulatedHand) -> Message:
-    state = Message(ARM_STATE.dtype(sizes(hand.cell)))
+    state = ArmState.zeros(sizes(hand.cell))
     hand.save(state)
     return state
 
@@ -116,7 +116,7 @@ def test_a_restored_hand_continues_bit_for_bit(closes: bool) -> None:
                 hand.pull(flexed(hand, INDEX1, 40.0 + 20.0 * np.sin(0.3 * cycle)))
             hand.step(EVERY)
 
-    first, again, middle = hand_of(), hand_of(), Message(ARM_STATE.dtype(sizes(hand_of().cell)))
+    first, again, middle = hand_of(), hand_of(), ArmState.zeros(sizes(hand_of().cell))
     run(first, range(60))
     first.save(middle)
     run(first, range(60, 90))

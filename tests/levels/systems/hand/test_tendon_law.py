@@ -8,12 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.level import LevelContext
 from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand.laws import TendonGains, TendonLaw
-from rack.levels.systems.hand.messages import HAND_STATUS
+from rack.levels.systems.hand.messages import HandStatus
 from tests.levels.arms import cell, config
 
 EVERY, TICK_NS, LAG_S, SUBSTEPS = 4, 500_000, 0.008, 8
@@ -35,7 +34,7 @@ class Valves:
     def __init__(self, gain: float = 1.0, offset: float = 0.0, gains: TendonGains = EXACT) -> None:
         self.hand, self._gain, self._offset = the_hand(), gain, offset
         joints = len(self.hand.arms)
-        self.status = Message(HAND_STATUS.dtype({"joints": joints, "fingers": 4}))
+        self.status = HandStatus.zeros({"joints": joints, "fingers": 4})
         self.status.tension = self.status.wanted = self.hand.rest
         self.tension = np.full((2, joints), self.hand.rest)
         self.wanted = self.tension.copy()

@@ -12,7 +12,7 @@ from rack.levels.level import LevelContext, Pace, Ports
 from rack.levels.messages import Error
 from rack.levels.robot.cell import sizes
 from rack.levels.systems.joint_boards.gateway import JointGateway
-from rack.levels.systems.joint_boards.messages import JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from tests.levels.arms import cell, config
 
 TICK_S = 0.001
@@ -43,8 +43,8 @@ class GatewayRig:
             "gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, SIZES, **paces, params=params
         )
         self.gateway = JointGateway(context)
-        self.write = Ports(command=message(JOINT_REFERENCE), status=message(JOINT_STATUS))
-        self.statuses = {name: message(JOINT_STATUS) for name in BOARDS}
+        self.write = Ports(command=message(JointReference), status=message(JointStatus))
+        self.statuses = {name: message(JointStatus) for name in BOARDS}
         for k, status in enumerate(self.statuses.values()):
             status.driven[k::2] = 1
             status.target[k::2] = 1.0 + k
@@ -64,7 +64,7 @@ class GatewayRig:
         meanwhile."""
         for _ in range(ticks // EVERY):
             made = (self.tick - PERIOD - late) // PERIOD * PERIOD
-            reference = message(JOINT_REFERENCE)
+            reference = message(JointReference)
             is_new = made > self.made and made >= 0 and not missing
             if is_new:
                 self.made = made

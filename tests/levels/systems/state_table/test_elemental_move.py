@@ -114,8 +114,8 @@ class Arm:
         self.level = level
         self.values = task.inputs.values
         self.messages = task.outputs.messages
-        self.world = Message(self.values.world.value.record.dtype)
-        self.below = Message(self.values.status.value.record.dtype)
+        self.world = Message(self.values.world.message.record.dtype)
+        self.below = Message(self.values.status.message.record.dtype)
         self.world.revision = 1
         self.place = np.array([0.4, -0.2, 0.1])
         self.world.position[0] = self.place

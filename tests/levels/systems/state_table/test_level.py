@@ -13,11 +13,11 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State
 from rack.levels.level import LevelContext, Ports
 from rack.levels.messages import Error
-from rack.levels.operator import OPERATOR_COMMAND, Answer, Operation
+from rack.levels.operator import Answer, Operation, OperatorCommand
 from rack.levels.systems.state_table.level import (
-    TABLE_STATUS,
-    WORD_COMMAND,
     StateTableExecutor,
+    TableCommand,
+    TableStatus,
     answer_of,
 )
 from rack.levels.systems.state_table.table import Lexicon
@@ -43,7 +43,7 @@ class Door(StateTableExecutor):
     def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
         return LEXICON
 
-    def look(self, read: Ports, tick: int) -> dict[str, str]:
+    def look(self, tick: int) -> dict[str, str]:
         return {"lock": self.lock, "place": self.place}
 
     def do_drive(self, speed: str) -> None:
@@ -71,16 +71,16 @@ class Bench:
             params={"tables": {name: str(path) for name, path in paths.items()}},
         )
         self.context = cast(LevelContext, context)
-        self.status = Message(TABLE_STATUS.dtype({}))
-        self.last = Reading(Message(TABLE_STATUS.dtype({})), Verdict.NONE)
+        self.status = TableStatus.zeros({})
+        self.last = Reading(TableStatus.zeros({}), Verdict.NONE)
         self.above: Reading | None = None
-        self.operator = Reading(Message(OPERATOR_COMMAND.dtype({})), Verdict.NONE)
+        self.operator = Reading(OperatorCommand.zeros({}), Verdict.NONE)
         self.door = Door(self.context)
         self.tick = 100
 
     def command(self, serial: int, words: str, hold: bool = False, operator: int = 0) -> None:
         """Let the level above command this from now on."""
-        message = Message(WORD_COMMAND.dtype({}))
+        message = TableCommand.zeros({})
         message.id = serial
         message.words = words
         message.hold = hold
@@ -89,7 +89,7 @@ class Bench:
 
     def order(self, serial: int, what: Operation, name: str = "") -> Message:
         """Let the operator command this; return the status after the cycle that reads it."""
-        message = Message(OPERATOR_COMMAND.dtype({}))
+        message = OperatorCommand.zeros({})
         message.id = serial
         message.what = what
         message.name = name
@@ -111,13 +111,13 @@ class Bench:
 
     def restart(self) -> None:
         """Start the board again: it finds the last status, and every command of the operator."""
-        last = Message(TABLE_STATUS.dtype({}))
+        last = TableStatus.zeros({})
         last.copy_from(self.status)
         self.last = Reading(last, Verdict.NEW)
         self.operator = Reading(
             self.operator.value, Verdict.NEW if self.operator.is_there else Verdict.NONE
         )
-        self.status = Message(TABLE_STATUS.dtype({}))
+        self.status = TableStatus.zeros({})
         self.door = Door(self.context)
 
 
@@ -274,7 +274,7 @@ def test_a_restarted_board_goes_on_where_its_last_status_was(bench: Bench) -> No
 def test_the_level_below_has_answered_when_it_echoes_the_newest_command(
     state: State, echo: int, serial: int, expected: str
 ) -> None:
-    status = Message(TABLE_STATUS.dtype({}))
+    status = TableStatus.zeros({})
     status.state = state
     status.echo = echo
     assert answer_of(Reading(status, Verdict.OLD), serial) == expected

@@ -11,10 +11,10 @@ from rack.backplane.message import Message, MessageType
 from rack.boards.config import load
 from rack.boards.config.resolved import resolve
 from rack.levels.level import LevelContext, Ports
-from rack.levels.systems.joint_boards.messages import ARM_STATUS, JOINT_REFERENCE, JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import ArmStatus, JointReference, JointStatus
 from rack.levels.systems.state_table.primitive import (
-    JOINT_MOVE,
-    JOINT_MOVE_STATUS,
+    JointMove,
+    JointMoveStatus,
     PrimitiveTable,
 )
 
@@ -35,15 +35,15 @@ class Bench:
         self.context = context
         self.level = PrimitiveTable(context)
         self.home = self.level._point[0].copy()
-        self.arm = self.message(ARM_STATUS)
+        self.arm = self.message(ArmStatus)
         self.arm.opening = self.level._gripper.open
-        self.below = [self.message(JOINT_STATUS) for _ in BOARDS]
+        self.below = [self.message(JointStatus) for _ in BOARDS]
         self.readings = [Reading(below, Verdict.NEW) for below in self.below]
         for below in self.below:
             below.position = self.home
         self.above: dict[str, Reading] = {}
         self.write = Ports(
-            command=self.message(JOINT_REFERENCE), status=self.message(JOINT_MOVE_STATUS)
+            command=self.message(JointReference), status=self.message(JointMoveStatus)
         )
         self.tick = 10 * context.every
 
@@ -52,7 +52,7 @@ class Bench:
 
     def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
         """Let the level above command this from now on."""
-        command = self.message(JOINT_MOVE)
+        command = self.message(JointMove)
         command.joints = joints
         command.speed = speed
         command.object = row
@@ -208,7 +208,7 @@ def test_a_gripper_holds_what_keeps_it_from_closing(
 
 
 def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -> None:
-    last = bench.message(JOINT_MOVE_STATUS)
+    last = bench.message(JointMoveStatus)
     last.closed = 1
     last.held = 1
     last.object = 1
@@ -216,9 +216,9 @@ def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -
     last.in_state = bench.level.state
     last.position = bench.home + 0.1
     last.end = bench.home + 0.2
-    command = bench.message(JOINT_REFERENCE)
+    command = bench.message(JointReference)
     command.id = 77
-    fresh = Ports(command=bench.message(JOINT_REFERENCE), status=bench.message(JOINT_MOVE_STATUS))
+    fresh = Ports(command=bench.message(JointReference), status=bench.message(JointMoveStatus))
     read = Ports(last_status=Reading(last, Verdict.NEW), last_command=Reading(command, Verdict.NEW))
     level = bench.level
     level.recall(read, fresh)

@@ -11,12 +11,12 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.level import Input, LevelContext, Output, Pace, Ports
-from rack.levels.messages import WORLD_MODEL
-from rack.levels.operator import OPERATOR_COMMAND, Operation
+from rack.levels.messages import WorldState
+from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.robot.cell import build_cell, sizes
-from rack.levels.systems.joint_boards.messages import JOINT_STATUS
+from rack.levels.systems.joint_boards.messages import JointStatus
 from rack.levels.systems.trajectory.executor import TrajectoryExecutor
-from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MotionKind
+from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest
 from tests.levels.arms import config
 
 CLOCK_NS, EVERY = 1_000_000, 20
@@ -27,7 +27,7 @@ class TrajectoryRig:
     """Runs the level cycle by cycle. Boards follow its set points exactly, and hold without."""
 
     level_class: type[TrajectoryExecutor] = TrajectoryExecutor
-    request_type = MOTION_REQUEST
+    request_type = MotionRequest
 
     def __init__(self, arm: str = "puma560_crossing", boards: int = 2, **params: Any) -> None:
         robot, scene = config(arm)
@@ -53,18 +53,18 @@ class TrajectoryRig:
         self.write = Ports(
             **{port: self._output(kind) for port, kind in self.level.outputs.items()}
         )
-        self.statuses = {name: self.message(JOINT_STATUS) for name in paces}
+        self.statuses = {name: self.message(JointStatus) for name in paces}
         for k, status in enumerate(self.statuses.values()):
             status.driven[k::boards] = 1
             status.target[:] = self.cell.home
             status.holding = 1
-        self.world = self.message(WORLD_MODEL)
+        self.world = self.message(WorldState)
         self.world.quaternion[:, 0] = 1.0
         self.world.revision = 1
         self.lost: set[str] = set()
         self.queue: list[Message] = []
         self.ids = 0
-        self.order = self.message(OPERATOR_COMMAND)
+        self.order = self.message(OperatorCommand)
         self.ordered = False
         self.positions: list[Array] = []  # those of set points, by cycle
         self.velocities: list[Array] = []

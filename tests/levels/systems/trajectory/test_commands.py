@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.systems.trajectory.commands import Motions
-from rack.levels.systems.trajectory.messages import MOTION_STATUS, MotionKind, RequestEnd
+from rack.levels.systems.trajectory.messages import MotionKind, MotionStatus, RequestEnd
 from tests.levels.arms import config
 
 PUMA, SCENE = config("puma560")
@@ -29,7 +28,7 @@ class Level:
         self.queue: deque[dict[str, Any]] = deque()
         self.done: list[dict[str, Any]] = []
         self.loses: set[int] = set()
-        self.status = Message(MOTION_STATUS.dtype(SIZES))
+        self.status = MotionStatus.zeros(SIZES)
 
     def wait(self, timeout_s: float) -> bool:
         """Do the next request, or lose it."""

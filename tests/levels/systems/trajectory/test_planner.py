@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.errors import ProgramError
 from rack.levels.level import LevelContext, Ports
-from rack.levels.messages import TASK_STATUS, WORLD_MODEL, Error
+from rack.levels.messages import Error, TaskStatus, WorldState
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell, sizes
-from rack.levels.systems.trajectory.messages import MOTION_REQUEST, MOTION_STATUS, MotionKind
+from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, MotionStatus
 from rack.levels.systems.trajectory.planner import MotionProgram, RequestExecutor, RequestPlanner
 from tests.levels.arms import config
 
@@ -44,8 +44,8 @@ class PlanningRig:
             params=params,
         )
         self.tick, self.places = 0, places
-        self.below = Message(MOTION_STATUS.dtype(SIZES))
-        self.world = Message(WORLD_MODEL.dtype(SIZES))
+        self.below = MotionStatus.zeros(SIZES)
+        self.world = WorldState.zeros(SIZES)
         self.world.quaternion[:, 0] = 1.0
         self.sent: list[np.ndarray] = []
         self.start()
@@ -71,7 +71,7 @@ class Outbox:
 
     def __init__(self, rig: PlanningRig) -> None:
         object.__setattr__(self, "rig", rig)
-        object.__setattr__(self, "message", Message(MOTION_REQUEST.dtype(SIZES)))
+        object.__setattr__(self, "message", MotionRequest.zeros(SIZES))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.message, name)
@@ -172,7 +172,7 @@ def test_a_program_that_does_not_fit_is_refused(step: dict[str, Any], why: str) 
 
 def test_the_level_reports_the_program_done_or_failed() -> None:
     rig = PlanningRig(MOVES)
-    level, write = RequestExecutor(rig.context), Ports(status=Message(TASK_STATUS.dtype(SIZES)))
+    level, write = RequestExecutor(rig.context), Ports(status=TaskStatus.zeros(SIZES))
 
     def state(done: int) -> int:
         rig.below.done = done

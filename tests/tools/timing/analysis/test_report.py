@@ -14,8 +14,8 @@ from rich.console import Console
 from rack.backplane.layout import TaskSpec
 from rack.backplane.trace import RECORD
 from rack.boards.config import load
-from rack.levels.systems.force.messages import FORCE_STATUS, WRENCH
-from rack.levels.systems.hand.messages import HAND_STATUS
+from rack.levels.systems.force.messages import ForceStatus, Wrench
+from rack.levels.systems.hand.messages import HandStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.console.tables import show_blocks
 from rack.tools.live.display import Display
@@ -38,7 +38,7 @@ MS = 1_000_000
 
 def test_the_messages_of_other_systems_have_the_names_that_the_report_looks_for() -> None:
     assert arm_outcome.DRIVING == DRIVING
-    for kind in (FORCE_STATUS, WRENCH, HAND_STATUS):
+    for kind in (ForceStatus, Wrench, HandStatus):
         assert getattr(arm_outcome, kind.name.upper()) == kind.name
 
 
