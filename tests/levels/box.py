@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from rack.backplane.message import Message, MessageType
+from rack.backplane.message import Message
 
 SILENT_CYCLES = 4
 """Age of an executor's message, in its writer's cycles, at which the writer is silent: 3, and the
@@ -25,9 +25,9 @@ class Box:
     """
 
     def __init__(
-        self, kind: MessageType, sizes_: Mapping[str, int], every: int | None = None
+        self, kind: type[Message], sizes_: Mapping[str, int], every: int | None = None
     ) -> None:
-        self.kind, self.dtype = kind, kind.dtype(sizes_)
+        self.kind, self.dtype = kind, kind.message_type.dtype(sizes_)
         self.lost = False
         self.disturbance: Disturbance | None = None
         self._every = every

@@ -13,17 +13,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, MessageType
+from rack.backplane.message import AnyMessage, Message
 from rack.levels.level import (
     Demand,
     Executor,
-    Input,
+    InputPort,
     LevelContext,
     MadePorts,
     Output,
     Pace,
     Planner,
-    Ports,
 )
 from rack.levels.operator import Goal, Operation, OperatorCommand
 from rack.levels.robot.cell import build_cell, sizes
@@ -62,33 +61,42 @@ class Task:
         self._inputs: dict[str | tuple[str, str], Box] = {}
         ports = {**level.inputs, **made_ports(spec, level).inputs}
         self._many = [port for port, input_ in ports.items() if input_.many]
+        self._tables = {port: level.input_table(port) for port in ports}
         for port, input_ in ports.items():
             names = sources(input_, spec)
             self._inputs |= {
                 (port, name.partition(".")[0]) if input_.many else port: boxes[name]
                 for name in names
             }
-        self._values = {port: Message(box.dtype) for port, box in self._inputs.items()}
+        self._values = {
+            port: ports[port if isinstance(port, str) else port[0]].message(box.dtype)
+            for port, box in self._inputs.items()
+        }
         self._seen = dict.fromkeys(self._inputs, 0)
         self._has = dict.fromkeys(self._inputs, False)
         self._outputs = outputs
-        self.write = Ports(**{port: Message(box.dtype) for port, box in outputs.items()})
+        kinds = {port: kind.message for port, kind in {**level.outputs, **outputs_of(spec)}.items()}
+        self.written = {port: kinds[port](box.dtype) for port, box in outputs.items()}
+        for port, message in self.written.items():
+            level.place_output(port, message)
 
     def release(self, tick: int, demand: Demand = Demand.NONE) -> None:
         """Run one cycle, under a demand on the arm."""
-        read, span = Ports(**{port: {} for port in self._many}), self.spec.every
+        span = self.spec.every
+        for port in self._many:
+            self._tables[port][port] = {}
         for port in self._inputs:
             if isinstance(port, str):
-                setattr(read, port, self._read(port, tick))
+                self._tables[port][port] = self._read(port, tick)
             else:
-                getattr(read, port[0])[port[1]] = self._read(port, tick)
+                self._tables[port[0]][port[0]][port[1]] = self._read(port, tick)
         if isinstance(self.level, Executor):
             self.level.demand = demand
-            self.level.process(read, self.write, tick)
+            self.level.process(tick)
             self._publish(tick, tick + span)
-        elif self.level.wanted(read, tick):
+        elif self.level.wanted(tick):
             span *= self.spec.within_cycles
-            self.level.plan(read, self.write.plan, tick)
+            self.level.plan(tick)
             self._publish(tick, tick + span)
         self.due = tick + span
 
@@ -121,8 +129,8 @@ class Task:
         kinds = outputs_of(self.spec) if isinstance(self.level, Executor) else {}
         for port, box in self._outputs.items():
             kind = kinds.get(port)
-            if not isinstance(kind, Output) or kind.is_due(tick, self.spec.every, 0):
-                box.publish(getattr(self.write, port), visible_at)
+            if kind is None or kind.is_due(tick, self.spec.every, 0):
+                box.publish(self.written[port], visible_at)
 
 
 class Lockstep:
@@ -136,7 +144,7 @@ class Lockstep:
         scene: SceneConfig,
         task: Mapping[str, Any] | None = None,
         seed: int = 1990,
-        outside: Mapping[str, MessageType] | None = None,
+        outside: Mapping[str, type[Message]] | None = None,
         clock_ns: int = CLOCK_NS,
         name: str = "",
     ) -> None:
@@ -149,13 +157,13 @@ class Lockstep:
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
-            for port, kind in outputs_of(board).items():
-                output = kind if isinstance(kind, Output) else Output(kind)
+            for port, output in outputs_of(board).items():
                 self.boxes[f"{board.name}.{port}"] = Box(
-                    output.type, self.sizes, output.cycles * board.every
+                    output.message, self.sizes, output.cycles * board.every
                 )
             if board.planner is not None:
-                self.boxes[f"{board.name}.plan"] = Box(board.planner.output, self.sizes)
+                plan = board.planner.outputs["plan"].message
+                self.boxes[f"{board.name}.plan"] = Box(plan, self.sizes)
             self.boxes[f"{board.name}.operator"] = Box(OperatorCommand, self.sizes)
         self._contexts = {
             b.name: LevelContext(
@@ -213,14 +221,14 @@ class Lockstep:
         """Do something before the tick that is `ticks` from now."""
         self._coming.setdefault(self.tick + ticks, []).append(do)
 
-    def message(self, mailbox: str) -> Message:
-        return Message(self.boxes[mailbox].dtype)
+    def message(self, mailbox: str) -> AnyMessage:
+        return AnyMessage(self.boxes[mailbox].dtype)
 
     def write(self, mailbox: str, message: Message) -> None:
         """Make `message` visible in `mailbox` from now on."""
         self.boxes[mailbox].publish(message, self.tick)
 
-    def read(self, mailbox: str) -> Message:
+    def read(self, mailbox: str) -> AnyMessage:
         """Return a copy of the newest whole message that is visible now."""
         message = self.message(mailbox)
         message.raw[:] = self.boxes[mailbox].good_at(self.tick)
@@ -261,11 +269,11 @@ def made_ports(board: BoardSpec, level: Executor | Planner) -> MadePorts:
     )
 
 
-def outputs_of(board: BoardSpec) -> dict[str, MessageType | Output]:
+def outputs_of(board: BoardSpec) -> dict[str, Output[Any]]:
     return {**board.executor.outputs, **board.executor.made_ports(board.params, {}).outputs}
 
 
-def sources(port: Input, board: BoardSpec) -> list[str]:
+def sources(port: InputPort[Any], board: BoardSpec) -> list[str]:
     place, _, rest = port.source.partition(".")
     neighbours = {"own": board.name, "above": board.above, "below": board.below}
     return [f"{name}.{rest}" for name in listed(neighbours.get(place, place))]
@@ -309,7 +317,7 @@ class Operator:
         self._rack.write(f"{level}.operator", message)
         return self.serial
 
-    def _message(self, level: str, what: Operation, goal: Goal) -> Message:
+    def _message(self, level: str, what: Operation, goal: Goal) -> AnyMessage:
         self.serial += 1
         message = self._rack.message(f"{level}.operator")
         message.id, message.what, message.goal = self.serial, what, goal

@@ -18,7 +18,6 @@ from rack.boards import checkpoint
 from rack.boards.checkpoint.kinds import KINDS
 from rack.boards.checkpoint.parts import Parts
 from rack.boards.errors import CheckpointError
-from rack.levels.level import Ports
 
 
 class Whole:

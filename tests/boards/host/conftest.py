@@ -58,7 +58,7 @@ class Site:
     def cycle(self) -> None:
         self.tick += EVERY
         self.inputs.read(self.tick)
-        self.adapter.process(self.inputs.values, self.outputs.messages, self.tick)
+        self.adapter.process(self.tick)
         assert self.outputs.write(self.tick, None)
 
     @property

@@ -11,7 +11,6 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.entries import NEVER, EntryConfig, Replayed
 from rack.boards.run.ports import InputPorts, OutputPorts
-from rack.levels.level import Ports
 from tests.boards.host.conftest import EVERY, MakeSite, OpenBus
 
 NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
@@ -177,6 +176,7 @@ class Out:
 
     def __init__(self) -> None:
         self.raw = bytearray(1)
+        self.message = self
         self.sent: list[tuple[int, int]] = []
 
     def send(self, basis: int) -> None:
@@ -199,6 +199,6 @@ def test_a_replay_gives_out_what_was_written_at_its_ticks(
     out = Out()
     seen: list[object] = []
     for tick in (3, 8, 11):
-        replayed.exchange(Ports(), Ports(port=out), tick)
+        replayed.exchange({}, {"port": out}, tick)
         seen.append(list(out.sent) if is_sent else out.raw[0])
     assert seen == expected

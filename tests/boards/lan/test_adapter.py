@@ -17,7 +17,6 @@ from rack.boards.config import resolve
 from rack.boards.lan.adapter import LanAdapter, status_of
 from rack.boards.lan.clocks import UNKNOWN_NS
 from rack.boards.lan.envelope import Flaw, Sealer
-from rack.levels.level import Ports
 from rack.levels.peer import PeerPresence
 from tests.boards.lan.racks import configs, rack_text
 
@@ -162,12 +161,12 @@ def test_in_real_time_the_status_counts_what_the_seals_refused(make: MakeAdapter
         sealer = Sealer()
 
     Link.sealer.resume([3] * len(Flaw))
-    out = Message(status_of(adapter._table.exports, adapter._table.imports).dtype({}))
-    peer = PeerPresence.zeros({})
-    write = Ports(status=out, peer_b=peer)
-    adapter._report(write, 8)
+    out = status_of(adapter._table.exports, adapter._table.imports).zeros({})
+    adapter.place_output("status", out)
+    adapter.place_output("peer_b", PeerPresence.zeros({}))
+    adapter._report(8)
     assert out.flaws.tolist() == (0,) * len(Flaw)
     assert (out.state, out.reason) == (State.HOLDING, "rack 'b' is not there yet")
     adapter._link = Link()  # type: ignore[assignment]
-    adapter._report(write, 8)
+    adapter._report(8)
     assert out.flaws.tolist() == (3,) * len(Flaw)

@@ -11,23 +11,14 @@ import pytest
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext, Ports
+from rack.levels.level import LevelContext
 from rack.levels.systems.figures import FigureExecutor, FigurePlan, FigurePlanner, FigureStatus
 
 MS = 1_000_000
 
 
 def context(**params: Any) -> LevelContext:
-    return cast(LevelContext, SimpleNamespace(every=4, params=params))
-
-
-def ports(**inputs: Message | None) -> Ports:
-    return Ports(
-        **{
-            name: Reading(m, Verdict.NEW if m is not None else Verdict.NONE)
-            for name, m in inputs.items()
-        }
-    )
+    return cast(LevelContext, SimpleNamespace(every=4, params=params, sizes={}))
 
 
 def plan_of(tick: int) -> Message:
@@ -38,9 +29,8 @@ def plan_of(tick: int) -> Message:
 
 def computing_ns(executor: FigureExecutor, tick: int) -> int:
     """Return the processor time of one cycle."""
-    write = Ports(status=FigureStatus.zeros({}))
     start = process_time_ns()
-    executor.process(ports(plan=None), write, tick)
+    executor.process(tick)
     return process_time_ns() - start
 
 
@@ -61,17 +51,14 @@ def test_an_executor_computes_for_its_time_in_every_cycle() -> None:
 
 
 def test_a_planner_computes_for_its_time_and_always_wants_a_plan() -> None:
-    planner, write, status = (
-        FigurePlanner(context(plan_ms=4.0)),
-        plan_of(-1),
-        FigureStatus.zeros({}),
-    )
+    planner, status = FigurePlanner(context(plan_ms=4.0)), FigureStatus.zeros({})
     status.cycle = 8
-    assert planner.wanted(ports(status=None), 0)
+    assert planner.wanted(0)
+    vars(planner).update(status=Reading(status, Verdict.NEW))
     start = process_time_ns()
-    planner.plan(ports(status=status), write, 16)
+    planner.plan(16)
     assert process_time_ns() - start >= 4 * MS
-    assert (write.made_at, write.cycle) == (16, 8)
+    assert (planner.output.made_at, planner.output.cycle) == (16, 8)
 
 
 @pytest.mark.parametrize(

@@ -93,14 +93,14 @@ def test_it_plans_once_and_anew_when_the_object_moves_before_it_is_held() -> Non
         "posture": (16,),
     }
     crate.messages["world"].position[0, 2] += 0.002
-    host.plan(crate)  # type: ignore[arg-type]
+    host.plan_grasp(crate)  # type: ignore[arg-type]
     assert len(crate.sends) == 1
     crate.messages["world"].position[0, 0] += 0.004
-    host.plan(crate)  # type: ignore[arg-type]
+    host.plan_grasp(crate)  # type: ignore[arg-type]
     assert len(crate.sends) == 2
     crate.messages["grasp"].kind = GraspKind.HOLD
     crate.messages["world"].position[0, 0] += 0.01
-    host.plan(crate)  # type: ignore[arg-type]
+    host.plan_grasp(crate)  # type: ignore[arg-type]
     assert len(crate.sends) == 2
 
 

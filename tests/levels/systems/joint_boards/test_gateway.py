@@ -8,7 +8,7 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, MessageType, State
-from rack.levels.level import LevelContext, Pace, Ports
+from rack.levels.level import LevelContext, Pace
 from rack.levels.messages import Error
 from rack.levels.robot.cell import sizes
 from rack.levels.systems.joint_boards.gateway import JointGateway
@@ -43,7 +43,6 @@ class GatewayRig:
             "gateway", EVERY, 1, 1_000_000, 0, robot, scene, {}, SIZES, **paces, params=params
         )
         self.gateway = JointGateway(context)
-        self.write = Ports(command=message(JointReference), status=message(JointStatus))
         self.statuses = {name: message(JointStatus) for name in BOARDS}
         for k, status in enumerate(self.statuses.values()):
             status.driven[k::2] = 1
@@ -56,8 +55,8 @@ class GatewayRig:
         ] = []  # tick, due and position of the references given
 
     @property
-    def status(self) -> Message:
-        return self.write.status
+    def status(self) -> JointStatus:
+        return self.gateway.status
 
     def run(self, ticks: int, late: int = 0, missing: bool = False) -> None:
         """Run up to a tick; references come `late` ticks late, or are `missing`; the motion goes on
@@ -75,11 +74,12 @@ class GatewayRig:
                 name: Reading(status, Verdict.NEW, name in self.lost)
                 for name, status in self.statuses.items()
             }
-            before = self.write.command.due
-            self.gateway.process(Ports(command=command, statuses=statuses), self.write, self.tick)
-            if self.write.command.due != before:
+            before = self.gateway.command.due
+            vars(self.gateway).update(above=command, statuses=statuses)
+            self.gateway.process(self.tick)
+            if self.gateway.command.due != before:
                 self.given.append(
-                    (self.tick, self.write.command.due, float(self.write.command.position[0]))
+                    (self.tick, self.gateway.command.due, float(self.gateway.command.position[0]))
                 )
             self.tick += EVERY
 

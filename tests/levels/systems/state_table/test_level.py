@@ -11,7 +11,7 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State
-from rack.levels.level import LevelContext, Ports
+from rack.levels.level import LevelContext
 from rack.levels.messages import Error
 from rack.levels.operator import Answer, Operation, OperatorCommand
 from rack.levels.systems.state_table.level import (
@@ -100,12 +100,13 @@ class Bench:
 
     def cycle(self) -> Message:
         """Do one cycle; return the status."""
-        read = Ports(
-            command={} if self.above is None else {"task": self.above},
+        vars(self.door).update(
+            above={} if self.above is None else {"task": self.above},
             last_status=self.last,
             operator=self.operator,
+            status=self.status,
         )
-        self.door.process(read, Ports(status=self.status), self.tick)
+        self.door.process(self.tick)
         self.tick += 1
         return self.status
 
@@ -115,7 +116,7 @@ class Bench:
         last.copy_from(self.status)
         self.last = Reading(last, Verdict.NEW)
         self.operator = Reading(
-            self.operator.value, Verdict.NEW if self.operator.is_there else Verdict.NONE
+            self.operator.message, Verdict.NEW if self.operator.is_there else Verdict.NONE
         )
         self.status = TableStatus.zeros({})
         self.door = Door(self.context)

@@ -3,20 +3,24 @@ points, without a rack."""
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, MessageType
+from rack.backplane.message import Message
 from rack.boards.config import load
 from rack.boards.config.resolved import resolve
-from rack.levels.level import LevelContext, Ports
+from rack.levels.level import LevelContext
 from rack.levels.systems.joint_boards.messages import ArmStatus, JointReference, JointStatus
 from rack.levels.systems.state_table.primitive import (
     JointMove,
     JointMoveStatus,
     PrimitiveTable,
 )
+
+M = TypeVar("M", bound=Message)
 
 BOARDS = ("first", "second")
 
@@ -42,13 +46,10 @@ class Bench:
         for below in self.below:
             below.position = self.home
         self.above: dict[str, Reading] = {}
-        self.write = Ports(
-            command=self.message(JointReference), status=self.message(JointMoveStatus)
-        )
         self.tick = 10 * context.every
 
-    def message(self, kind: MessageType) -> Message:
-        return Message(kind.dtype(dict(self.context.sizes)))
+    def message(self, kind: type[M]) -> M:
+        return kind.zeros(self.context.sizes)
 
     def command(self, joints: np.ndarray, speed: float = 1.0, row: int = -1) -> None:
         """Let the level above command this from now on."""
@@ -59,17 +60,17 @@ class Bench:
         self.above = {"move": Reading(command, Verdict.NEW)}
 
     def look(self) -> dict[str, str]:
-        read = Ports(
-            command=self.above,
+        vars(self.level).update(
+            above=self.above,
             statuses=dict(zip(BOARDS, self.readings, strict=True)),
             arm=Reading(self.arm, Verdict.NEW),
         )
-        return self.level.look(read, self.tick)
+        return self.level.look(self.tick)
 
     def give(self) -> Message:
         """Write, and let the arm be there; return the set point."""
-        self.level.give(self.write, self.tick)
-        command = self.write.command
+        self.level.give(self.tick)
+        command = self.level.command
         for below in self.below:
             below.position = command.position
         self.tick += self.context.every
@@ -218,11 +219,12 @@ def test_a_restarted_board_recalls_its_gripper_and_its_set_point(bench: Bench) -
     last.end = bench.home + 0.2
     command = bench.message(JointReference)
     command.id = 77
-    fresh = Ports(command=bench.message(JointReference), status=bench.message(JointMoveStatus))
-    read = Ports(last_status=Reading(last, Verdict.NEW), last_command=Reading(command, Verdict.NEW))
     level = bench.level
-    level.recall(read, fresh)
+    vars(level).update(
+        last_status=Reading(last, Verdict.NEW), last_command=Reading(command, Verdict.NEW)
+    )
+    level.recall()
     assert (level._closed, level._held, level._object) == (True, True, 1)
     np.testing.assert_allclose(level._point[0], bench.home + 0.1)
     np.testing.assert_allclose(level._end, bench.home + 0.2)
-    assert fresh.command.id == 77
+    assert level.command.id == 77

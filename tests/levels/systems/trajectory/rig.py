@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.level import Input, LevelContext, Output, Pace, Ports
+from rack.levels.level import InputPort, LevelContext, Pace
 from rack.levels.messages import WorldState
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.robot.cell import build_cell, sizes
@@ -18,6 +18,8 @@ from rack.levels.systems.joint_boards.messages import JointStatus
 from rack.levels.systems.trajectory.executor import TrajectoryExecutor
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest
 from tests.levels.arms import config
+
+M = TypeVar("M", bound=Message)
 
 CLOCK_NS, EVERY = 1_000_000, 20
 PERIOD_S = EVERY * CLOCK_NS * 1e-9
@@ -33,7 +35,7 @@ class TrajectoryRig:
         robot, scene = config(arm)
         self.cell = build_cell(robot, scene, CLOCK_NS)
         self.sizes = sizes(self.cell)
-        self._kinds: dict[str, np.dtype] = {}
+        self._kinds: dict[type[Message], np.dtype] = {}
         self.tick = 0
         paces = {f"joints{k}": Pace(1, 1) for k in range(boards)}
         self.context = LevelContext(
@@ -50,9 +52,10 @@ class TrajectoryRig:
             params=params,
         )
         self.level = self.level_class(self.context)
-        self.write = Ports(
-            **{port: self._output(kind) for port, kind in self.level.outputs.items()}
-        )
+        self.written = {
+            port: self.message(kind.message) for port, kind in self.level.outputs.items()
+        }
+        self._connect()
         self.statuses = {name: self.message(JointStatus) for name in paces}
         for k, status in enumerate(self.statuses.values()):
             status.driven[k::boards] = 1
@@ -69,13 +72,14 @@ class TrajectoryRig:
         self.positions: list[Array] = []  # those of set points, by cycle
         self.velocities: list[Array] = []
 
-    def _output(self, kind: Any) -> Message:
-        return self.message(kind.type if isinstance(kind, Output) else kind)
+    def _connect(self) -> None:
+        for port, message in self.written.items():
+            self.level.place_output(port, message)
 
-    def message(self, kind: Any) -> Message:
-        if kind.name not in self._kinds:
-            self._kinds[kind.name] = kind.dtype(self.sizes)
-        return Message(self._kinds[kind.name])
+    def message(self, kind: type[M]) -> M:
+        if kind not in self._kinds:
+            self._kinds[kind] = kind.message_type.dtype(self.sizes)
+        return kind(self._kinds[kind])
 
     def request(self, kind: MotionKind, **fields: Any) -> int:
         """Queue a request; return its id."""
@@ -103,13 +107,14 @@ class TrajectoryRig:
         """Replace the level, as after the death of its board: its set points end, and the boards
         hold."""
         self.level = self.level_class(self.context)
+        self._connect()
         self.brake()
 
     def brake(self) -> None:
         for status in self.statuses.values():
             status.holding, status.target_velocity = 1, 0.0
 
-    def _read(self) -> Ports:
+    def read(self) -> None:
         taken, self.queue = (
             self.queue[: self.level.room("requests")],
             self.queue[self.level.room("requests") :],
@@ -134,17 +139,18 @@ class TrajectoryRig:
         }
         own["operator"] = Reading(self.order, Verdict.NEW if ordered else Verdict.OLD)
         world = Reading(self.world, Verdict.NEW)
-        return Ports(requests=requests, boards=boards, world=world, **own, **self.others())
+        given = {"requests": requests, "boards": boards, "world": world, **own, **self.others()}
+        vars(self.level).update(given)
 
     def others(self) -> dict[str, Reading]:
         return {}
 
-    def _last(self, source: Input) -> Reading:
+    def _last(self, source: InputPort[Any]) -> Reading[Any]:
         name = source.source.partition(".")[2]
         there = self.tick > 0 and name in self.level.outputs
-        message = self.message(source.type)
+        message = self.message(source.message)
         if there:
-            message.copy_from(getattr(self.write, name))
+            message.copy_from(self.written[name])
         return Reading(message, Verdict.OLD if there else Verdict.NONE)
 
     def obey(self) -> None:
@@ -162,7 +168,8 @@ class TrajectoryRig:
     def cycle(self) -> Message:
         """Run one cycle; return the status."""
         self.obey()
-        self.level.process(self._read(), self.write, self.tick)
+        self.read()
+        self.level.process(self.tick)
         self.tick += EVERY
         if self.write.command.due:
             self.positions.append(self.write.command.position.copy())

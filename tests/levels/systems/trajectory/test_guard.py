@@ -60,7 +60,8 @@ def at_once(rig: TrajectoryRig) -> float:
 
 def across_a_hold(rig: TrajectoryRig) -> float:
     rig.brake()
-    rig.level.process(rig._read(), rig.write, rig.tick)
+    rig.read()
+    rig.level.process(rig.tick)
     rig.tick += EVERY
     return TOUCH
 

@@ -12,8 +12,8 @@ import pytest
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import State
 from rack.levels.errors import ProgramError
-from rack.levels.level import LevelContext, Ports
-from rack.levels.messages import Error, TaskStatus, WorldState
+from rack.levels.level import LevelContext, Sender
+from rack.levels.messages import Error, WorldState
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell, sizes
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, MotionStatus
@@ -52,40 +52,27 @@ class PlanningRig:
 
     def start(self) -> None:
         self.planner = RequestPlanner(self.context)
+        self.request = MotionRequest.zeros(SIZES)
+        self.planner.place_output("plan", Sender(self.request, self._send, lambda: 1))
+
+    def _send(self) -> bool:
+        """Take a copy, if there is a place."""
+        if len(self.sent) - self.below.taken >= self.places:
+            return False
+        self.sent.append(self.request.record.copy())
+        return True
 
     def run(self, cycles: int = 1) -> list[int]:
         """Plan in some cycles; return the ids sent in them."""
         before = len(self.sent)
         for _ in range(cycles):
-            read = Ports(
-                status=Reading(self.below, Verdict.NEW), world=Reading(self.world, Verdict.NEW)
+            vars(self.planner).update(
+                below=Reading(self.below, Verdict.NEW), world=Reading(self.world, Verdict.NEW)
             )
-            if self.planner.wanted(read, self.tick):
-                self.planner.plan(read, Outbox(self), self.tick)
+            if self.planner.wanted(self.tick):
+                self.planner.plan(self.tick)
             self.tick += EVERY
         return [int(record["id"]) for record in self.sent[before:]]
-
-
-class Outbox:
-    """The planner's port of a queue with some places."""
-
-    def __init__(self, rig: PlanningRig) -> None:
-        object.__setattr__(self, "rig", rig)
-        object.__setattr__(self, "message", MotionRequest.zeros(SIZES))
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.message, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        setattr(self.message, name, value)
-
-    def send(self) -> bool:
-        """Take a copy, if there is a place."""
-        rig: PlanningRig = self.rig
-        if len(rig.sent) - rig.below.taken >= rig.places:
-            return False
-        rig.sent.append(self.message.record.copy())
-        return True
 
 
 def test_requests_are_queued_a_few_ahead_of_the_arm() -> None:
@@ -172,16 +159,17 @@ def test_a_program_that_does_not_fit_is_refused(step: dict[str, Any], why: str) 
 
 def test_the_level_reports_the_program_done_or_failed() -> None:
     rig = PlanningRig(MOVES)
-    level, write = RequestExecutor(rig.context), Ports(status=TaskStatus.zeros(SIZES))
+    level = RequestExecutor(rig.context)
 
     def state(done: int) -> int:
         rig.below.done = done
-        level.process(Ports(status=Reading(rig.below, Verdict.NEW)), write, rig.tick)
-        return int(write.status.state)
+        vars(level).update(below=Reading(rig.below, Verdict.NEW))
+        level.process(rig.tick)
+        return int(level.status.state)
 
     assert state(0) == State.EXECUTING
     assert state(6) == State.DONE
-    assert (write.status.action, write.status.actions) == (6, 6)
+    assert (level.status.action, level.status.actions) == (6, 6)
     rig.below.error, rig.below.reason = Error.LIMIT, "request 4: too fast"
     assert state(4) == State.ERROR
-    assert write.status.reason == "request 4: too fast"
+    assert level.status.reason == "request 4: too fast"
