@@ -95,6 +95,7 @@ from rack.backplane.words import Demand
 from rack.levels.compiled import preload
 from rack.levels.errors import LevelError, ProgramError
 from rack.levels.faults import Fault
+from rack.levels.messages import ArmState
 from rack.levels.operator import Commands, Operation
 from rack.levels.ports import (
     Input,
@@ -323,7 +324,7 @@ class Executor(LevelSection, ABC):
         # then it must be found.
         self.acted: dict[int, bool] = {}
         # Whatever it drives adds its own findings, and completes each cycle, given its `ARM_STATE`.
-        self.complete_cycle: list[Callable[[Message | None], None]] = []
+        self.complete_cycle: list[Callable[[ArmState | None], None]] = []
         Executor.made_last = self
 
     @classmethod

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, SegmentWindow
 from rack.levels.errors import Refused
@@ -266,7 +265,7 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
     return None
 
 
-def grip_of(row: int, tool: Pose, seen: Message) -> Pose:
+def grip_of(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
     """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a Scene or a
     WorldState."""
     return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])
