@@ -373,12 +373,10 @@ class Planner(LevelSection, ABC):
     is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
     """
 
-    output: Output[Any]
-
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         # Its mailbox is called after the plan.
-        cls.outputs = {"plan": cls.output} if "output" in cls.outputs else {}
+        cls.outputs = {"plan": plan} if (plan := cls.outputs.get("output")) is not None else {}
 
     def wanted(self, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is

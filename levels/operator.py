@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import REASON_BYTES, Command, Status, field
+from rack.backplane.message import REASON_BYTES, AnyMessage, Command, Status, field
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -309,7 +309,7 @@ class Orders:
         status.objection = self._shown.objection
 
 
-def answered(status: AnsweringStatus) -> int:
+def answered(status: AnsweringStatus | AnyMessage) -> int:
     """Return the newest command that a level had taken up by this status of it, so that a restarted
     board does not do it twice."""
     # The answer shown may be a late one, to a command before the newest.
