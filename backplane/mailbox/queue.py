@@ -168,7 +168,7 @@ class QueueReader(Reader):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
-        written = int(Reader(segment, taken_name(name)).peek().message.taken)
+        written = Reader(segment, taken_name(name)).peek().message.taken
         taken, rest = divmod(self._box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from struct import Struct
 from time import monotonic_ns
+from typing import Any
 
 import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
@@ -32,7 +33,6 @@ from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.backplane.message import AnyMessage, copied
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
-from rack.levels.messages import Any
 
 CHECKED_FROM = Slot.BASIS * 8
 # Plain integers: an IntEnum member costs a conversion at every use as an index.

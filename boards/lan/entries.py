@@ -19,7 +19,7 @@ from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import Arrived, Carrier
 from rack.boards.lan.peers import NONE, PeerRack
-from rack.levels.messages import Sender
+from rack.levels.ports import Sender
 
 NEVER = -1
 LARGEST = 1 << 62

@@ -133,7 +133,7 @@ class PeerRack:
         self.launch = launch
         self.confirm_by = -1
 
-    def resume(self, message: Any, confirm_by: int) -> None:
+    def resume(self, message: PeerPresence, confirm_by: int) -> None:
         """Continue from the message that an adapter before this one wrote: see
         `rack.levels.peer.PEER`."""
         self.presence = Presence(message.presence)
@@ -145,7 +145,7 @@ class PeerRack:
         if self.launch:
             self._seen.append(self.launch)
 
-    def fill(self, message: Any, is_lockstep: bool) -> None:
+    def fill(self, message: PeerPresence, is_lockstep: bool) -> None:
         """Write what is known into its message; launch numbers differ from run to run."""
         message.presence = self.presence
         message.launch = NONE if is_lockstep else self.launch

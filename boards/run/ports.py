@@ -90,7 +90,7 @@ class InputPorts:
 
         def read_and_note(tick: int) -> Reading[AnyMessage]:
             reading = found.read(tick)
-            queue.taken = int(reading.message.taken)
+            queue.taken = reading.message.taken
             return reading
 
         self._rest.append(({}, "", read_and_note))

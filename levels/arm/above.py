@@ -4,10 +4,17 @@ fresh."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
+from rack.backplane.message import field
 from rack.levels.level import LevelContext, Reading, Verdict
+from rack.levels.operator import RelayedCommand
 from rack.levels.robot.limits import MotorPatience
+
+
+class SampledCommand(RelayedCommand):
+    """Base of commands that say on which sample of the arm, or hand, they rest."""
+
+    sampled: int = field(unit="tick", doc="tick of the status that it rests on; -1: none yet")
 
 
 class CommandsAbove:
@@ -29,7 +36,9 @@ class CommandsAbove:
             for board, pace in context.above.items()
         }
 
-    def missing(self, commands: Mapping[str, Reading[Any]], tick: int, since: int) -> str:
+    def missing(
+        self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
+    ) -> str:
         """Return why commands are missing at `tick`; empty: all are fresh, and rest on a status of
         `since` or later."""
         all_know = True

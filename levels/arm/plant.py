@@ -114,4 +114,3 @@ class Plant:
         self.tick = state.tick
         for name in SAVED:
             setattr(self, name, getattr(state, name))
-        self.braked = bool(state.braked)

@@ -153,7 +153,7 @@ class ElementalMovePlanner(Planner):
                 job.move, job.start, situation, attempt=self._tries, goal=job.goal
             )
         except Refused as refused:
-            self.output.error = refused.code
+            self.output.error = Error(refused.code)
             self.output.reason = str(refused)
             again_at = visible_at + round(self._params.retry / self.context.tick_s)
             self._refusal = Refusal(

@@ -72,7 +72,7 @@ def read_move(record: Any) -> Move:
     )
 
 
-def read_window(command: Any) -> list[Move]:
+def read_window(command: TaskCommand) -> list[Move]:
     """Return the moves of a `TASK_COMMAND` or a `TASK_PLAN`, oldest first."""
     return [read_move(record) for record in command.moves[: command.count]]
 

@@ -73,7 +73,7 @@ class PrimitivePlanner(Planner):
         except (ValueError, ArithmeticError) as error:
             fault = SegmentFault(Error.LIMIT, f"segment {serial}: {error}")
         self.output.error, self.output.reason, self.output.earliest = fault or (
-            0,
+            Error.NONE,
             "",
             self.output.earliest,
         )

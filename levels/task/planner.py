@@ -91,7 +91,7 @@ class TaskPlanner(Planner):
         try:
             self._decompose(tick)
         except Refused as refused:
-            self.output.error = refused.code
+            self.output.error = Error(refused.code)
             self.output.reason = self._reason(refused)
             self.output.count = 0
         self._plan = copied(self.output)
