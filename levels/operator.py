@@ -98,6 +98,12 @@ class RelayedCommand(Command):
     operator: int = RESTS_ON
 
 
+class SampledCommand(RelayedCommand):
+    """Base of commands that say on which sample of the arm, or hand, they rest."""
+
+    sampled: int = field(unit="tick", doc="tick of the status that it rests on; -1: none yet")
+
+
 class AnsweringStatus(Status):
     """Fields of a status that answer an operator."""
 

@@ -5,16 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from rack.backplane.message import field
 from rack.levels.level import LevelContext, Reading, Verdict
-from rack.levels.operator import RelayedCommand
+from rack.levels.operator import SampledCommand
 from rack.levels.robot.limits import MotorPatience
-
-
-class SampledCommand(RelayedCommand):
-    """Base of commands that say on which sample of the arm, or hand, they rest."""
-
-    sampled: int = field(unit="tick", doc="tick of the status that it rests on; -1: none yet")
 
 
 class CommandsAbove:

@@ -16,8 +16,7 @@ import numpy as np
 
 from rack.backplane.message import field
 from rack.backplane.words import Demand
-from rack.levels.arm.above import SampledCommand
-from rack.levels.operator import AnsweringStatus, RelayedCommand
+from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 FLEXOR = 0
 EXTENSOR = 1

@@ -21,9 +21,8 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import field
-from rack.levels.arm.above import SampledCommand
 from rack.levels.messages import DrivenArm, JointCommand, ServoStatus
-from rack.levels.operator import AnsweringStatus, RelayedCommand
+from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 
 class JointReference(RelayedCommand, version=1):
