@@ -30,7 +30,6 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import AnyMessage
 from rack.levels.level import LevelContext, Program
 from rack.levels.ports import InputPort, Output, collect_ports
 from rack.levels.tables import Table
@@ -56,7 +55,7 @@ class Bus(Protocol):
         """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when
         the run ends."""
 
-    def read(self, port: str) -> Reading[AnyMessage]:
+    def read(self, port: str) -> Reading[Any]:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the
         mailbox keeps them."""
 

@@ -12,7 +12,7 @@ from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.host_ring import HostWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
-from rack.backplane.message import COMMAND_ID, AnyMessage
+from rack.backplane.message import COMMAND_ID
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.words import Block, System, TaskState
@@ -106,7 +106,7 @@ class HostBus:
         block[Block.DONE] = block[Block.RELEASED]
         done_semaphore(self._segment.rack, self._wiring.board).release()
 
-    def read(self, port: str) -> Reading[AnyMessage]:
+    def read(self, port: str) -> Reading[Any]:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the
         mailbox keeps them; the first read returns the newest alone."""
         reader = _of(self._readers, port)
