@@ -59,7 +59,6 @@ class TaskTable(StateTableExecutor):
     """Sends the commands of its steps to the level below, one after the other, as its table
     says."""
 
-    above = None
     below = Input(MoveTableStatus, "below.status")
     last_command = Input(TableCommand, "own.command")
     last_status = Input(TaskTableStatus, "own.status")
