@@ -164,9 +164,7 @@ class Coordinator(Executor):
         self._steps = [step.actions for step in program.step]
         margin_s = 2.0 * context.period_s
         self._agreement = Agreement(program.checksum, self._steps, margin_s, self._table.farewell_s)
-        self._readings: Mapping[
-            str, Reading[CellReport]
-        ] = {}  # as of this cycle
+        self._readings: Mapping[str, Reading[CellReport]] = {}  # of the arms, in this cycle
         self._operated = Orders(self.commands)
         self._started = False
         self._moves = 0  # moves of the steps done

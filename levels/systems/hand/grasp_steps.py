@@ -171,8 +171,8 @@ class PreshapeWork(StepWork):
         target = grasp.target
         part, rate = self.progress(passed_s)
         way = self._posture - self._start
-        target.mode = FingerMode.JOINTS
-        target.force = 0.0
+        target.mode[:] = FingerMode.JOINTS
+        target.force[:] = 0.0
         target.position = self._start + part * way
         target.velocity = rate * way
         if part < 1.0:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 from pydantic import Field as Key
 
 from rack.backplane.message import State, field
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Reading
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
@@ -128,8 +128,7 @@ class StateTableExecutor(Executor):
     each action."""
 
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
-    above: Mapping[str, Reading[TableCommand]]
-    """What the level above commands, if there is one."""
+    above = Inputs(TableCommand, "above.command", optional=True)
     last_status = Input(TableStatus, "own.status")
     operator = Input(OperatorCommand, "own.operator")
     status = Output(TableStatus)

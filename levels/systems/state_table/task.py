@@ -59,6 +59,7 @@ class TaskTable(StateTableExecutor):
     """Sends the commands of its steps to the level below, one after the other, as its table
     says."""
 
+    above = None  # type: ignore[assignment]  # drops the port: nothing commands it
     below = Input(MoveTableStatus, "below.status")
     last_command = Input(TableCommand, "own.command")
     last_status = Input(TaskTableStatus, "own.status")

@@ -238,7 +238,7 @@ class TouchGuard:
     def is_struck(self, boards: Mapping[str, Reading[JointStatus]], most: float) -> bool:
         """Return whether the torque of a joint has changed by more than `most`, N m."""
         if all(board.is_new and not board.message.holding for board in boards.values()):
-            self._past.append(sum(board.message.torque for board in boards.values()))
+            self._past.append(np.sum([board.message.torque for board in boards.values()], axis=0))
         else:
             self.begin_anew()
         past = np.array(self._past)
