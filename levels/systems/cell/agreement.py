@@ -70,10 +70,10 @@ class Agreement:
 
     def recall(self, last: CellProgress) -> None:
         """Continue from a `CellProgress`."""
-        self.phase = Phase(last.phase)
+        self.phase = last.phase
         self.step = last.step
         self.attempt = last.attempt
-        self.error = Error(last.error)
+        self.error = last.error
         self.reason = last.reason
         self.ending_s = last.ending
         self.begun_s = last.begun
@@ -248,9 +248,9 @@ class TakenOrder:
         if report is not None and report.echo:
             self.program = report.program
             self.order = report.echo
-            self.response = Response(report.response)
+            self.response = report.response
             if report.error:
-                self.error = Error(report.error)
+                self.error = report.error
                 self.reason = report.reason
 
     @property

@@ -169,7 +169,7 @@ class OrderedTaskExecutor(TaskExecutor):
             if plan.id == request.id and not plan.error:
                 taken.answer(Response.POSSIBLE)
             elif plan.id == request.id:
-                taken.fail(Error(plan.error), plan.reason)
+                taken.fail(plan.error, plan.reason)
             return
         self._waits = self._not_ready()
         if self._waits:

@@ -252,7 +252,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             status = self.last_status.message
             self._work.guarded = status.guarded
             self._work.axis = status.axis
-            self._without = Mode(status.mode)
+            self._without = status.mode
             self._since = self._now
 
     def _follow_boards(self) -> None:

@@ -249,7 +249,7 @@ class GraspExecutor(Executor):
             return step.model_copy(update={"points": points})
         after = self._program.step[index - 1] if isinstance(step, SqueezeStep) else None
         if isinstance(after, CloseStep):
-            return step.model_copy(update={"grip": float(plan.grip)})
+            return step.model_copy(update={"grip": plan.grip})
         if isinstance(step, PreshapeStep) and self._awaits_plan():
             self._grasp.postures[PLANNED] = plan.posture.copy()
             return step.model_copy(update={"posture": PLANNED})

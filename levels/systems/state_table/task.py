@@ -128,7 +128,7 @@ class TaskTable(StateTableExecutor):
     def look(self, tick: int) -> dict[str, str]:
         """Return where the level below is, and whether a step is left."""
         self.detail = self.below.message.reason
-        self.resting = bool(self.below.message.resting)
+        self.resting = self.below.message.resting
         is_left = self._step < len(self.table.plan.step)
         return {
             "below": answer_of(self.below, self._command.id),

@@ -20,6 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rack.backplane.message import AnyMessage
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext, Output
@@ -144,10 +145,9 @@ class Motions:
         return [round(float(x), 4) for x in self._status.tool]
 
     @property
-    def _status(self) -> MotionStatus:
+    def _status(self) -> AnyMessage:
         """The newest `MotionStatus`, or that of the level in its place."""
-        status: MotionStatus = self._bus.read("motion").message
-        return status
+        return self._bus.read("motion").message
 
     def _request(self, **fields: Any) -> int:
         request = {"body": WORLD, **fields, "id": self._newest + 1}
