@@ -257,20 +257,15 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
     )
 
 
-class SetPoint(RelayedCommand):
-    """Base of commands that say where the joints should be, and when."""
+class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
+    """From the primitive level to the servo level: where the joints should be, and when."""
 
     due: int = field(
-        unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
+        unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
     )
     position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
     velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
     acceleration: np.ndarray = field(unit="rad/s2", doc="joint accelerations", shape="joints")
-
-
-class JointCommand(SetPoint, version=2, message="joint_set_point"):
-    """From the primitive level to the servo level: a set point of arm and gripper."""
-
     opening: float = field(unit="m or rad", doc="gripper joint position to go to")
     force: float = field(unit="N or N m", doc="largest gripper force")
     held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")

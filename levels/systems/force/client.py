@@ -22,7 +22,6 @@ import mujoco
 import numpy as np
 from pydantic import ValidationError
 
-from rack.backplane.message import AnyMessage
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
@@ -170,9 +169,10 @@ class ForceMotions(Motions):
         return self._request(kind=MotionKind.COMPLY)
 
     @property
-    def _status(self) -> AnyMessage:
-        """The newest `ServerStatus`."""
-        return self._bus.read("motion").message
+    def _status(self) -> ServerStatus:
+        """The newest status of the server."""
+        status: ServerStatus = self._bus.read("motion").message
+        return status
 
     def wrench(self) -> Mapping[str, float]:
         """Return the wrench of the tool on the surroundings, N, N m, by axis of the task frame."""

@@ -246,7 +246,7 @@ class Workstation(HostProgram):
         status = bus.read("grasp")
         if not (world.is_there and status.is_there) or status.message.kind > GraspKind.PRESHAPE:
             return self._planned
-        model = world.message
+        model: WorldState = world.message
         position = model.position[self._row]
         if norm(position - self._at) < MOVED_M:
             return self._planned

@@ -21,14 +21,20 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import field
-from rack.levels.messages import DrivenArm, JointCommand, ServoStatus, SetPoint
+from rack.levels.messages import DrivenArm, JointCommand, ServoStatus
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 
-class JointReference(SetPoint, version=1):
+class JointReference(RelayedCommand, version=1):
     """From the trajectory level to all boards that servo joints; these interpolate between its set
     points."""
 
+    due: int = field(
+        unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
+    )
+    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
+    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
+    acceleration: np.ndarray = field(unit="rad/s2", doc="joint accelerations", shape="joints")
     inertia: np.ndarray = field(
         unit="kg m2", doc="diagonal of the joint-space inertia there", shape="joints"
     )

@@ -20,7 +20,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rack.backplane.message import AnyMessage
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram
 from rack.levels.level import Input, LevelContext, Output
@@ -145,9 +144,10 @@ class Motions:
         return [round(float(x), 4) for x in self._status.tool]
 
     @property
-    def _status(self) -> AnyMessage:
+    def _status(self) -> MotionStatus:
         """The newest `MotionStatus`, or that of the level in its place."""
-        return self._bus.read("motion").message
+        status: MotionStatus = self._bus.read("motion").message
+        return status
 
     def _request(self, **fields: Any) -> int:
         request = {"body": WORLD, **fields, "id": self._newest + 1}
