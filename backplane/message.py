@@ -204,14 +204,14 @@ class Message(metaclass=_Slotted):
         """Copy the bytes of a message of the same type."""
         self.raw[:] = other.raw
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        try:
-            _SET(self, name, value)
-        except AttributeError:
-            raise AttributeError(self._unknown(name)) from None
-
     if not TYPE_CHECKING:
         # A type checker knows the fields of a message class.
+        def __setattr__(self, name: str, value: Any) -> None:
+            try:
+                _SET(self, name, value)
+            except AttributeError:
+                raise AttributeError(self._unknown(name)) from None
+
         def __getattr__(self, name: str) -> Any:
             raise AttributeError(self._unknown(name))
 
@@ -261,9 +261,9 @@ def state_name(state: int | None, otherwise: str = "") -> str:
     return State(state).name.lower() if state in set(State) else otherwise or str(state)
 
 
-def copied(message: Message) -> Message:
+def copied(message: B) -> B:
     """Return a copy of a message, in memory of its own."""
-    copy: Message = object.__new__(type(message))
+    copy: B = object.__new__(type(message))
     copy.__init__(message.record.dtype, memoryview(bytearray(message.raw)))  # type: ignore[misc]
     return copy
 

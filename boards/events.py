@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State, reason_of, state_name
+from rack.backplane.message import AnyMessage, State, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
@@ -208,7 +208,7 @@ class Journal:
         return self.segment.words[System.TICK]
 
 
-def statuses(segment: Segment, field: str) -> Iterator[tuple[str, Message]]:
+def statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
     """Yield the last status of every level whose status has a field, with its board."""
     for box in segment.layout.mailboxes:
         if box.name.endswith(".status") and field in (own.name for own in box.fields):
@@ -217,7 +217,7 @@ def statuses(segment: Segment, field: str) -> Iterator[tuple[str, Message]]:
                 yield box.writer, status.message
 
 
-def arm_states(segment: Segment) -> Iterator[tuple[str, Message]]:
+def arm_states(segment: Segment) -> Iterator[tuple[str, AnyMessage]]:
     """Yield the last state of every arm or hand, which it counts by itself, with its board."""
     for box in segment.layout.mailboxes:
         if box.message == "arm_state":

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
-from rack.backplane.message import Message, field, make_message
+from rack.backplane.message import AnyMessage, Message, field, make_message
 
 if TYPE_CHECKING:
     # A look at a running rack must not import the levels.
@@ -66,7 +66,7 @@ def ages_of(exchange: Message) -> dict[str, PortAge]:
 class Taken(NamedTuple):
     """The last reading of one mailbox, `readings[key]`, and its reader."""
 
-    readings: Mapping[str, Reading[Any]]
+    readings: Mapping[str, Reading[AnyMessage]]
     key: str
     reader: Reader
 

@@ -8,7 +8,6 @@ from rack.backplane.checked import as_named, pick
 from rack.backplane.errors import DamageError
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.message import Message
 from rack.backplane.operator_table import RequestEntry
 from rack.levels.operator import Goal, Operation, OperatorCommand
 
@@ -18,10 +17,10 @@ def level_of(entry: RequestEntry, layout: Layout) -> str:
     return _mailbox(entry, layout).name.partition(".")[0]
 
 
-def message_of(entry: RequestEntry, layout: Layout) -> Message:
+def message_of(entry: RequestEntry, layout: Layout) -> OperatorCommand:
     """Return a copy of a request's message, an `OperatorCommand`."""
     spec = _mailbox(entry, layout)
-    message = Message(message_dtype(spec.fields, spec.size))
+    message = OperatorCommand(message_dtype(spec.fields, spec.size))
     message.raw[:] = entry.message[: spec.size]
     return message
 
@@ -34,14 +33,14 @@ def _mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
     return found
 
 
-def hold(mailbox: MailboxSpec) -> Message:
+def hold(mailbox: MailboxSpec) -> OperatorCommand:
     """Return the operator's hold, for the mailbox of a level's operator."""
-    message = Message(message_dtype(mailbox.fields, mailbox.size))
+    message = OperatorCommand(message_dtype(mailbox.fields, mailbox.size))
     message.what = Operation.HOLD
     return message
 
 
-def describe(message: Message) -> str:
+def describe(message: OperatorCommand) -> str:
     """Return a command as one line: its verb, what it names, and its goal."""
     what = as_named(Operation, message.what).name.lower()
     goal = message.goal

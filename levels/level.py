@@ -95,6 +95,7 @@ from rack.backplane.words import Demand
 from rack.levels.compiled import preload
 from rack.levels.errors import LevelError, ProgramError
 from rack.levels.faults import Fault
+from rack.levels.messages import ArmState
 from rack.levels.operator import Commands, Operation
 from rack.levels.ports import (
     Input,
@@ -323,7 +324,7 @@ class Executor(LevelSection, ABC):
         # then it must be found.
         self.acted: dict[int, bool] = {}
         # Whatever it drives adds its own findings, and completes each cycle, given its `ARM_STATE`.
-        self.complete_cycle: list[Callable[[Message | None], None]] = []
+        self.complete_cycle: list[Callable[[ArmState | None], None]] = []
         Executor.made_last = self
 
     @classmethod
@@ -372,12 +373,10 @@ class Planner(LevelSection, ABC):
     is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
     """
 
-    output: Output[Any]
-
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         # Its mailbox is called after the plan.
-        cls.outputs = {"plan": cls.output} if "output" in cls.outputs else {}
+        cls.outputs = {"plan": plan} if (plan := cls.outputs.get("output")) is not None else {}
 
     def wanted(self, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is

@@ -8,6 +8,7 @@ Simulated time is tick times the clock's period.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Protocol
 
 import numpy as np
 
@@ -269,6 +270,16 @@ class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
     opening: float = field(unit="m or rad", doc="gripper joint position to go to")
     force: float = field(unit="N or N m", doc="largest gripper force")
     held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")
+
+
+class ArmSetPoint(Protocol):
+    """What the servo level takes of a set point, of whichever message: see `JointCommand`."""
+
+    due: int
+    position: np.ndarray
+    velocity: np.ndarray
+    opening: float
+    force: float
 
 
 class ServoPlan(Message, version=1):

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import REASON_BYTES, Command, Message, Status, field
+from rack.backplane.message import REASON_BYTES, AnyMessage, Command, Status, field
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -96,6 +96,12 @@ class RelayedCommand(Command):
     """Base of commands that pass on which operator's command they rest on."""
 
     operator: int = RESTS_ON
+
+
+class SampledCommand(RelayedCommand):
+    """Base of commands that say on which sample of the arm, or hand, they rest."""
+
+    sampled: int = field(unit="tick", doc="tick of the status that it rests on; -1: none yet")
 
 
 class AnsweringStatus(Status):
@@ -199,7 +205,11 @@ class Orders:
         """Whether that is HOLD."""
         return self.standing is Operation.HOLD
 
-    def take(self, operator: Reading[Any], judge: Callable[[Message], None] | None = None) -> bool:
+    def take(
+        self,
+        operator: Reading[OperatorCommand],
+        judge: Callable[[OperatorCommand], None] | None = None,
+    ) -> bool:
         """Read the mailbox; return True in the cycle that accepts a command other than a setting.
 
         `judge` is called with each command accepted: there a level may refuse it for its own
@@ -218,7 +228,7 @@ class Orders:
                 self._news = [told for told in self._news if told.serial != replaced]
         return taken
 
-    def _take_up(self, message: Message) -> bool:
+    def _take_up(self, message: OperatorCommand) -> bool:
         # Once only: a clock board restarted while giving a command gives it again.
         if message.id <= self.serial:
             return False
@@ -294,7 +304,7 @@ class Orders:
         above."""
         return max(self.basis, above)
 
-    def report(self, status: Message, above: int = 0) -> None:
+    def report(self, status: AnsweringStatus, above: int = 0) -> None:
         """Fill the fields of `AnsweringStatus`."""
         if self._news:
             self._shown = self._news.pop(0)
@@ -305,15 +315,15 @@ class Orders:
         status.objection = self._shown.objection
 
 
-def answered(status: Message) -> int:
+def answered(status: AnsweringStatus | AnyMessage) -> int:
     """Return the newest command that a level had taken up by this status of it, so that a restarted
     board does not do it twice."""
     # The answer shown may be a late one, to a command before the newest.
-    return max(int(status.order), int(status.operator))
+    return max(status.order, status.operator)
 
 
 def joints_of(
-    message: Message, names: Sequence[str], ranges: NDArray[np.float64]
+    message: OperatorCommand, names: Sequence[str], ranges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the joint positions, (joints,), rad, of an `OperatorCommand`; `ranges` (joints, 2)
     are permitted.

@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array, each
 from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import Scene, WorldState
@@ -54,7 +53,7 @@ class WorldModel(Executor):
 
     def process(self, tick: int) -> None:
         """Update from a new scene; when one is missing, keep poses and set velocities to zero."""
-        model: Message = self.model
+        model = self.model
         if not self._started:
             self._started = True
             model.copy_from(self.last.message)
@@ -62,7 +61,7 @@ class WorldModel(Executor):
             if tick - self._seen_tick > self._interval:
                 model.velocity[:] = 0.0
             return
-        scene: Message = self.scene.message
+        scene = self.scene.message
         poses = np.hstack((scene.position, scene.quaternion))
         if self._seen_tick < 0:
             self._last = poses

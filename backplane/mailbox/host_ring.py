@@ -19,7 +19,7 @@ import numpy as np
 from rack.backplane.layout import SPARE, FieldSpec
 from rack.backplane.mailbox.mailbox import DoubleBufferWriter
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.message import Message
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 
@@ -68,7 +68,7 @@ class HostReader:
         """Tick at which the message taken last was written."""
         return self._slots.tick
 
-    def take(self) -> Message | None:
+    def take(self) -> AnyMessage | None:
         """Take the oldest message that waits; None if it is bad. Valid until the next call."""
         head = self._box[Box.HEAD]
         oldest = self._box[Box.TAKEN] + 1
@@ -78,7 +78,7 @@ class HostReader:
         self._box[Box.TAKEN] = serial
         return self._fetched(serial)
 
-    def take_newest(self, most: int) -> Message | None:
+    def take_newest(self, most: int) -> AnyMessage | None:
         """Take all that wait and return the newest good one, looking at no more than `most`; None:
         there is none."""
         waiting = self.waiting
@@ -90,7 +90,7 @@ class HostReader:
                 return message
         return None
 
-    def _fetched(self, serial: int) -> Message | None:
+    def _fetched(self, serial: int) -> AnyMessage | None:
         slots = self._slots
         if (
             slots.fetch(serial)

@@ -29,13 +29,13 @@ more process that may die).
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
 
 from rack.backplane.address_map import oldest_kept
 from rack.backplane.layout import InterruptSpec, MailboxSpec
 from rack.backplane.mailbox.inbox import Inbox
 from rack.backplane.mailbox.mailbox import MAX_STEP_BACK, Reader, Reading, Writer
 from rack.backplane.mailbox.slots import Slots
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.words import Slot
 
@@ -197,7 +197,7 @@ class InterruptReader(Reader):
         self._inbox = inbox
         self._line = inbox.lines[name]
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message served by the release at `tick`, with its verdict."""
         self.accesses += 1
         self._inbox.advance(tick)
@@ -206,7 +206,7 @@ class InterruptReader(Reader):
             return self._unchanged
         return self._new if self._obtain(serial) else self._take_older(serial, tick)
 
-    def _step_back(self, serial: int, tick: int) -> Reading[Any]:
+    def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Take the newest good message that was served before a lost, damaged or forged one, if it
         is unread."""
         for older in reversed(self._line.served):

@@ -18,14 +18,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.slots import Slots, claim, epoch_of, pid_of
-from rack.backplane.message import Message
+from rack.backplane.message import AnyMessage, Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
@@ -217,7 +217,7 @@ class Reader:
         """Messages copied so far."""
         self.statistics = ReadStatistics()
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict."""
         self.accesses += 1
         serial = self._box[0]
@@ -234,7 +234,7 @@ class Reader:
             return self._unchanged
         return self._new if self._obtain(serial) else self._take_older(serial, tick)
 
-    def _take_older(self, serial: int, tick: int) -> Reading[Any]:
+    def _take_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Judge a bad message, and take the newest good one before it."""
         # The reader came too late: the slot is being overwritten.
         if not self.slots.keeps(serial):
@@ -263,7 +263,7 @@ class Reader:
         self.basis = basis
         return True
 
-    def _step_back(self, serial: int, tick: int) -> Reading[Any]:
+    def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Take the newest good message before a lost, damaged or forged one, if it is unread."""
         slots = self.slots
         tries = MAX_STEP_BACK
@@ -293,20 +293,20 @@ class Reader:
         self.statistics.forged += 1
         self.statistics.forger = pid_of(self.slots.signature)
 
-    def _cut_off(self) -> Reading[Any]:
+    def _cut_off(self) -> Reading[AnyMessage]:
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
         verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
         return self._readings[verdict]
 
-    def with_earlier(self, reading: Reading[Any], before: int) -> Reading[Any]:
+    def with_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
         """Return a reading with the good messages after serial `before` and before its own, as far
         as the slots reach back."""
         if self.serial <= before + 1:
             return reading
         return reading._replace(earlier=tuple(self.slots.between(before, self.serial)))
 
-    def peek(self) -> Reading[Any]:
+    def peek(self) -> Reading[AnyMessage]:
         """Return the newest whole message at once, under any protocol: for the host side."""
         self.found = head = self._box[0]
         if head == self.serial:
@@ -329,7 +329,7 @@ class DoubleBufferReader(Reader):
     It reacts faster than time-slice; in real time it no longer depends on ticks alone.
     """
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest whole message, with its verdict."""
         self.accesses += 1
         return self.peek()

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Protocol
@@ -24,6 +23,7 @@ from rack.backplane.mailbox.mailbox import (
     Writer,
 )
 from rack.backplane.mailbox.queue import QueueReader, QueueWriter
+from rack.backplane.message import AnyMessage
 from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import lock_semaphore
@@ -106,7 +106,7 @@ class LockReader(Reader):
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message; BUS_ERROR with the last good one after a timeout."""
         statistics = self.statistics
         self.accesses += 1

@@ -31,12 +31,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from struct import Struct
-from typing import Any
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.message import Message, copied, field
+from rack.backplane.message import AnyMessage, Message, copied, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
@@ -169,7 +168,7 @@ class QueueReader(Reader):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._position = Writer(segment, taken_name(name))
-        written = int(Reader(segment, taken_name(name)).peek().message.taken)
+        written = Reader(segment, taken_name(name)).peek().message.taken
         taken, rest = divmod(self._box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
@@ -177,11 +176,11 @@ class QueueReader(Reader):
         if self.taken and self._obtain(self.taken):
             self.transfers = 0
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Take every message visible at `tick`."""
         return self.take(tick, ALL)
 
-    def take(self, tick: int, most: int, now: int | None = None) -> Reading[Any]:
+    def take(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:
         """Take the messages visible at `tick`, oldest first, at most `most`, and publish the
         position.
 
@@ -191,7 +190,7 @@ class QueueReader(Reader):
         self.accesses += 1
         box = self._box
         count = 0
-        earlier = list[Message]()
+        earlier = list[AnyMessage]()
         head = box[Box.HEAD]
         last = min(box[Box.SENT], self.taken + self._depth)
         if head > last and self.slots.fetch(head) and not self.slots.is_lawful(self._signature):

@@ -23,13 +23,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from struct import Struct
 from time import monotonic_ns
+from typing import Any
 
 import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
 from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.backplane.message import AnyMessage, Message, copied
+from rack.backplane.message import AnyMessage, copied
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
@@ -109,8 +110,8 @@ class Slots:
         self.depth = spec.depth
         self.mask = spec.depth - 1
         self.record = memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
-        kind = segment.message_classes.get(spec.name, AnyMessage)
-        self.message = kind(dtype, self.record[SLOT_HEAD_SIZE:])
+        kind: Any = segment.message_classes.get(spec.name, AnyMessage)
+        self.message: AnyMessage = kind(dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
         self.ring = segment.view(first, spec.depth * stride)
         self.places = [
@@ -182,7 +183,7 @@ class Slots:
         self.record[:] = self.places[serial & self.mask]
         return self.serial == serial and self.is_sound
 
-    def between(self, before: int, newest: int) -> Iterator[Message]:
+    def between(self, before: int, newest: int) -> Iterator[AnyMessage]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""
         for serial in range(max(before + 1, newest - self.mask), newest):
             if self.fetch(serial) and self.is_lawful(0):

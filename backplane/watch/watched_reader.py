@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.mailbox.protocols import open_reader
 from rack.backplane.mailbox.queue import ALL, QueueReader
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter, Episodes
 from rack.backplane.watch.message_watch import MessageWatch, QueueWatch, ReadFindings
@@ -54,7 +54,7 @@ class Watched(ABC):
         self._bad_reads = 0
 
     @abstractmethod
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
 
@@ -88,7 +88,7 @@ class WatchedReader(Watched):
         self._writer = segment.block(reader.spec.writer)
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
         reader = self.reader
@@ -128,7 +128,7 @@ class SporadicReader(Watched):
     board must know them.
     """
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict, and the unread ones before
         it."""
         before = self.reader.serial
@@ -165,7 +165,7 @@ class WatchedQueue(Watched):
         self._room = room
         self._writer = segment.block(reader.spec.writer)
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Take the messages visible at `tick`; the reading says whether their writer is lost."""
         reader = self.reader
         reading = reader.take(tick, self._room(), self._task.now())
@@ -195,7 +195,7 @@ class GridReader:
         self._kept = [(reading, reading._replace(is_lost=True)) for reading in kept]
         self._was_lost = False
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick` if it is due, otherwise that of the last
         read."""
         if (tick - self._phase) % self._every == 0:

@@ -10,7 +10,6 @@ from pydantic import ValidationError
 
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.message import Message
 from rack.backplane.operator_table import Request
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.published import Levels, PublishedLevel
@@ -19,7 +18,7 @@ from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.config.timing import first_tick
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import norm
-from rack.levels.operator import Goal, goal_names
+from rack.levels.operator import Goal, OperatorCommand, goal_names
 
 DOWN = (0.0, 0.0, -1.0)
 
@@ -59,7 +58,7 @@ def requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
 def _request(command: CommandConfig, layout: Layout) -> Request:
     name = f"{command.level}.operator"
     spec = layout.mailbox(name)
-    message = Message(message_dtype(spec.fields, spec.size))
+    message = OperatorCommand(message_dtype(spec.fields, spec.size))
     message.what = command.said
     message.goal = (command.goals or [Goal.NONE])[0]
     if command.joints is not None:

@@ -13,7 +13,6 @@ import numpy as np
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named, as_whole, pick
 from rack.backplane.fault_table import FaultEntry, FaultTable
-from rack.backplane.message import Message
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
@@ -28,7 +27,7 @@ from rack.boards.faults.describe import describe as describe_fault
 from rack.boards.operator import describe, level_of, message_of
 from rack.levels.errors import LevelError
 from rack.levels.messages import Error
-from rack.levels.operator import Operation
+from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.tables import read_setting
 
 About = Literal["task", "mailbox", "joint", "geom", "name", "brakes", "nothing"]
@@ -277,7 +276,7 @@ class AlarmEvents:
             **named, value=value, span=self._span(value), late_ms=value * 1e-6
         )
 
-    def _before(self, board: str, command: Message) -> str:
+    def _before(self, board: str, command: OperatorCommand) -> str:
         """Return what a parameter was before a command that sets it."""
         try:
             key, value = read_setting(command.name)

@@ -150,7 +150,7 @@ class PostReader:
         self._message = kind(post.dtype)
         self._readings = {verdict: Reading(self._message, verdict) for verdict in Verdict}
 
-    def read(self, tick: int) -> Reading[Any]:
+    def read(self, tick: int) -> Reading[Message]:
         """Return the newest message visible at `tick`, and its verdict."""
         newest = self._post.newest(tick)
         if newest is None:
@@ -175,7 +175,7 @@ class LoneTask:
         kind.preload()
         self.level = level = kind(wiring.context)
         # Where each reading goes: the level's ports, or the dict of one that reads many mailboxes.
-        self._readers: list[tuple[dict[str, Any], str, Callable[[int], Reading[Any]]]] = []
+        self._readers: list[tuple[dict[str, Any], str, Callable[[int], Reading[Message]]]] = []
         for port, source in wiring.inputs.items():
             message = level.inputs[port].message if port in level.inputs else AnyMessage
             table = level.input_table(port)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from rack.backplane.layout import Layout
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.boards.wiring import Entries
 from rack.levels.level import Executor, LevelContext, Reading
@@ -24,7 +25,7 @@ class Adapter(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self.readings: dict[str, Reading[Any]] = {}
+        self.readings: dict[str, Reading[AnyMessage]] = {}
         """What it has read, by port: a port that it writes may have the same name."""
 
     def input_table(self, port: str) -> dict[str, Any]:

@@ -168,7 +168,7 @@ class BusAdapter(Adapter):
         else:
             self._report(self.ports[STATUS], tick)
 
-    def _report(self, status: Message, tick: int) -> None:
+    def _report(self, status: Status, tick: int) -> None:
         for port, count in self._counts.items():
             count.fill(getattr(status, port), tick)
         states = {name: block[Block.STATE] for name, block in self._hosts.items()}

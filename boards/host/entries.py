@@ -14,7 +14,7 @@ from pydantic import ValidationError, model_validator
 from rack.backplane.mailbox.host_ring import HostReader
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer, open_writer
-from rack.backplane.message import Message, field, fill_counts
+from rack.backplane.message import AnyMessage, Message, field, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import wake_semaphore
 from rack.backplane.words import Block
@@ -140,7 +140,7 @@ class Crossing(Protocol):
     """One entry, at work."""
 
     def exchange(
-        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+        self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> object:
         """Exchange, in a cycle in which that is due."""
 
@@ -159,7 +159,7 @@ class Inward:
         self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(
-        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+        self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
         """Take what waits, and check it. In lockstep what a program sends is there once its
         computing is over."""
@@ -200,7 +200,7 @@ class Outward:
         ]
 
     def exchange(
-        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+        self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
         """Copy what is there."""
         reading = read[self._port]
@@ -234,7 +234,7 @@ class Replayed:
         self._at = sum(tick <= since for tick, _, _ in rows) if is_sent else 0
 
     def exchange(
-        self, read: Mapping[str, Reading[Any]], write: Mapping[str, Any], tick: int
+        self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> bool:
         """Give out what the recorded run wrote up to this cycle; return whether there was some."""
         out = write[self._port]

@@ -10,7 +10,7 @@ from typing import Any
 from rack.backplane.mailbox.host_ring import is_proper
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.slots import Slots, message_dtype
-from rack.backplane.message import AnyMessage, Message, fill_counts
+from rack.backplane.message import AnyMessage, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, switch
 from rack.boards.lan.config import ExportConfig, ImportConfig
@@ -19,6 +19,7 @@ from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import Arrived, Carrier
 from rack.boards.lan.peers import NONE, PeerRack
+from rack.levels.ports import Sender
 
 NEVER = -1
 LARGEST = 1 << 62
@@ -242,7 +243,7 @@ class Import:
         self._is_away = is_away
         self._box[self._word] = switch(tick, is_away)
 
-    def exchange(self, out: Message, tick: int) -> None:
+    def exchange(self, out: Sender[AnyMessage], tick: int) -> None:
         """Take what has come, and pass the newest good message on."""
         early = self._early
         self._early = []

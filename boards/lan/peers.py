@@ -18,11 +18,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
+from rack.backplane.message import AnyMessage
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Finding
-from rack.levels.peer import Presence
+from rack.levels.peer import PeerPresence, Presence
 
 NONE = 0
 REMEMBERED = 16
@@ -133,7 +133,7 @@ class PeerRack:
         self.launch = launch
         self.confirm_by = -1
 
-    def resume(self, message: Any, confirm_by: int) -> None:
+    def resume(self, message: PeerPresence | AnyMessage, confirm_by: int) -> None:
         """Continue from the message that an adapter before this one wrote: see
         `rack.levels.peer.PEER`."""
         self.presence = Presence(message.presence)
@@ -145,7 +145,7 @@ class PeerRack:
         if self.launch:
             self._seen.append(self.launch)
 
-    def fill(self, message: Any, is_lockstep: bool) -> None:
+    def fill(self, message: PeerPresence, is_lockstep: bool) -> None:
         """Write what is known into its message; launch numbers differ from run to run."""
         message.presence = self.presence
         message.launch = NONE if is_lockstep else self.launch

@@ -50,7 +50,7 @@ class VirtualControlLoop(Task):
             (
                 writer.message
                 for writer in self.outputs.writers.values()
-                if writer.spec.message == ArmState.message_type.name
+                if isinstance(writer.message, ArmState)
             ),
             None,
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 from rack.backplane.fault_table import FaultEntry
 from rack.backplane.layout import ExchangeSpec
@@ -12,7 +11,7 @@ from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.queue import QueueWriter, taken_name
-from rack.backplane.message import Message
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
@@ -24,7 +23,7 @@ from rack.boards.wiring import Source
 from rack.levels.level import LevelSection, Reading, Verdict
 from rack.levels.ports import Sender
 
-Line = tuple[dict[str, Reading[Any]], str, Callable[[int], Reading[Any]]]
+Line = tuple[dict[str, Reading[AnyMessage]], str, Callable[[int], Reading[AnyMessage]]]
 """One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
 
 
@@ -89,9 +88,9 @@ class InputPorts:
         its ports."""
         found = watched(segment, taken_name(queue.spec.name), alarms, self.task)
 
-        def read_and_note(tick: int) -> Reading[Any]:
+        def read_and_note(tick: int) -> Reading[AnyMessage]:
             reading = found.read(tick)
-            queue.taken = int(reading.message.taken)
+            queue.taken = reading.message.taken
             return reading
 
         self._rest.append(({}, "", read_and_note))
@@ -156,7 +155,7 @@ class OutputPort:
         self._basis: int | None = None
         self._is_queue = isinstance(writer, QueueWriter)
         self._sends_itself = self._is_queue and not sends
-        self.value: Message | Sender[Message] = writer.message
+        self.value: AnyMessage | Sender[AnyMessage] = writer.message
         """What the level finds in its port."""
         if self._is_on_demand:
             self.value = Sender(writer.message, self._send, lambda: 1)

@@ -4,9 +4,9 @@ fresh."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from rack.levels.level import LevelContext, Reading, Verdict
+from rack.levels.operator import SampledCommand
 from rack.levels.robot.limits import MotorPatience
 
 
@@ -29,7 +29,9 @@ class CommandsAbove:
             for board, pace in context.above.items()
         }
 
-    def missing(self, commands: Mapping[str, Reading[Any]], tick: int, since: int) -> str:
+    def missing(
+        self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
+    ) -> str:
         """Return why commands are missing at `tick`; empty: all are fresh, and rest on a status of
         `since` or later."""
         all_know = True

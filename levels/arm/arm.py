@@ -16,12 +16,11 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import AT_START, NO_TORQUE, Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.plant import Plant
 from rack.levels.level import Finding
-from rack.levels.messages import Error
+from rack.levels.messages import ArmState, Error, Scene
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import Interface, SceneConfig, SensorConfig, named_class
@@ -211,7 +210,7 @@ class Arm(Plant, ABC):
         self._brakes = why, since
         self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
 
-    def restore(self, state: Message) -> None:
+    def restore(self, state: ArmState) -> None:
         """Continue from an `ARM_STATE`. Default: drives that know no states are as they were."""
         super().restore(state)
         was_disabled = state.error == Error.DISABLED
@@ -244,7 +243,7 @@ class Arm(Plant, ABC):
         it has none."""
         return None
 
-    def look(self, scene: Message) -> None:
+    def look(self, scene: Scene) -> None:
         """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the
         tool as sensed."""
         offset = self.cell.encoders.offset

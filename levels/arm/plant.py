@@ -6,10 +6,9 @@ from operator import attrgetter
 
 import mujoco
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Executor, Finding
-from rack.levels.messages import Error
+from rack.levels.messages import ArmState, Error, Scene
 from rack.levels.robot.cell import Cell
 
 EPISODE_TICKS = 20
@@ -56,11 +55,11 @@ class Plant:
         )
         # the first violation, readable: which limit, by how much, and when
         self.first_violation = ""
-        self._saved: tuple[Message, object] | None = None  # last state filled, with these
+        self._saved: tuple[ArmState, object] | None = None  # last state filled, with these
         self._model = cell.model
         self._data = cell.start()
 
-    def _show(self, scene: Message) -> None:
+    def _show(self, scene: Scene) -> None:
         """Fill a `SCENE` from `_data`."""
         data = self._data
         bodies = self.cell.bodies
@@ -71,7 +70,7 @@ class Plant:
         scene.tool_position = data.site_xpos[tool]
         mujoco.mju_mat2Quat(scene.tool_quaternion, data.site_xmat[tool])
 
-    def save(self, state: Message) -> None:
+    def save(self, state: ArmState) -> None:
         """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
 
         A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.state`.
@@ -102,17 +101,16 @@ class Plant:
         """Add to the findings what a cycle did, at its end."""
         self._reported_tick = self.tick
 
-    def complete_cycle(self, state: Message | None) -> None:
+    def complete_cycle(self, state: ArmState | None) -> None:
         """Report a cycle, and fill its `ARM_STATE`, unless the level has saved it."""
         if self._reported_tick != self.tick:
             if state is not None:
                 self.save(state)
             self.report_cycle()
 
-    def restore(self, state: Message) -> None:
+    def restore(self, state: ArmState) -> None:
         """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
         board."""
         self.tick = state.tick
         for name in SAVED:
             setattr(self, name, getattr(state, name))
-        self.braked = bool(state.braked)

@@ -8,7 +8,6 @@ from collections import deque
 import mujoco
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array, mat_vec
 from rack.levels.arm.arm import Arm, JointTarget, Sensed, copied
 from rack.levels.arm.drives import LimitGate
@@ -16,6 +15,7 @@ from rack.levels.arm.sensors import CoarseSensors, WristSensor
 from rack.levels.arm.set_points import SetPointGate
 from rack.levels.arm.simulation import Simulation
 from rack.levels.level import Finding
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.model import SET_POINT_ROWS
@@ -180,12 +180,12 @@ class SimulatedArm(Simulation, Arm):
         are."""
         return None if self._wrist is None else self._wrist.sample(self.tick)
 
-    def save(self, state: Message) -> None:
+    def save(self, state: ArmState) -> None:
         """Fill an `ARM_STATE`."""
         super().save(state)
         state.rest = self._brake.rest
 
-    def restore(self, state: Message) -> None:
+    def restore(self, state: ArmState) -> None:
         """Continue, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
         super().restore(state)
         d = self._data

@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, Mask, norm
 from rack.levels.arm.plant import Plant
 from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
+from rack.levels.messages import ArmState, Scene
 from rack.levels.robot.cell import Cell, unintended_contacts
 from rack.levels.robot.engine import INTEGRATION, mj_update_sleep
 from rack.levels.robot.lookup import geom_name
@@ -88,17 +88,17 @@ class Simulation(Plant):
         first, second = (geom_name(self.cell.model, geom) for geom in contact)
         return f"'{first}' touches '{second}'"
 
-    def look(self, scene: Message) -> None:
+    def look(self, scene: Scene) -> None:
         """Fill a `SCENE` with the poses as simulated."""
         self._show(scene)
 
-    def save(self, state: Message) -> None:
+    def save(self, state: ArmState) -> None:
         """Fill an `ARM_STATE`."""
         super().save(state)
         steps = self._steps
         self._copy_state(steps.model, steps.data, steps.asleep, state.state)
 
-    def restore(self, state: Message) -> None:
+    def restore(self, state: ArmState) -> None:
         """Continue, bit for bit, from an `ARM_STATE`."""
         super().restore(state)
         restore_state(self._model, self._data, state.state)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
 from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import (
@@ -90,7 +90,7 @@ class ElementalMoveExecutor(Executor):
             self._fill(command.message, segments, tick)
         if self._error:
             segments.clear()
-        held = command.is_lost or bool(command.message.hold) or self._orders.holds
+        held = command.is_lost or command.message.hold or self._orders.holds
         self.command.hold = self._request > 0 or self._error > 0 or held
         self._report(segments, self.status)
         self._answer()
@@ -114,7 +114,9 @@ class ElementalMoveExecutor(Executor):
             if end is not None:
                 self.status.end = end
 
-    def _take_window(self, command: Message, status: Message, segments: SegmentWindow) -> None:
+    def _take_window(
+        self, command: TaskCommand, status: PrimitiveStatus, segments: SegmentWindow
+    ) -> None:
         """Start anew, once the arm rests, on a window that does not continue the last one."""
         first = int(command.moves["id"][0]) if command.count else 0
         if first <= self._handed_down + 1:
@@ -126,7 +128,7 @@ class ElementalMoveExecutor(Executor):
             self._error = Error.NONE
             self._reason = ""
 
-    def _check_below(self, status: Message, segments: SegmentWindow) -> None:
+    def _check_below(self, status: PrimitiveStatus, segments: SegmentWindow) -> None:
         """Fail when the level below has failed, or the held object is lost."""
         if status.state == State.ERROR:
             self._fail(Error(status.error), status.reason)
@@ -134,7 +136,9 @@ class ElementalMoveExecutor(Executor):
         if moving and status.held >= 0 and (shut := self._shut(status)):
             self._fail(Error.OBJECT_LOST, f"{shut}: the object is lost")
 
-    def _replan_if_blocked(self, status: Message, segments: SegmentWindow, tick: int) -> None:
+    def _replan_if_blocked(
+        self, status: PrimitiveStatus, segments: SegmentWindow, tick: int
+    ) -> None:
         """Request another path where the arm rests in front of an obstacle; cancel the request when
         the way is free."""
         blocked = bool(
@@ -159,7 +163,7 @@ class ElementalMoveExecutor(Executor):
                 self._open_request(tick)
             else:
                 segments.replace_first(plan)
-                self._handed_down = int(plan.move)
+                self._handed_down = plan.move
                 self._close_request()
                 self._replans += 1
                 self._replans_of_move += 1
@@ -174,7 +178,7 @@ class ElementalMoveExecutor(Executor):
             self._waiting_since = None
             self._reason = ""
 
-    def _fill(self, command: Message, segments: SegmentWindow, tick: int) -> None:
+    def _fill(self, command: TaskCommand, segments: SegmentWindow, tick: int) -> None:
         """Hand down the next moves, as far as they are planned and the window has room."""
         while not (self._request or self._error or segments.is_full):
             move = find_move(command.moves[: command.count], self._handed_down + 1)
@@ -209,7 +213,7 @@ class ElementalMoveExecutor(Executor):
         segments.add_path(move, plan, below_s if by_s > 0.0 else 0.0)
         return True
 
-    def _wait(self, refusal: Message, tick: int) -> None:
+    def _wait(self, refusal: MovePlan, tick: int) -> None:
         """Wait for a free path within `patience`; fail at once on any other refusal."""
         if self._waiting_since is None:
             self._waiting_since = tick
@@ -218,7 +222,7 @@ class ElementalMoveExecutor(Executor):
         if refusal.error != Error.NO_PATH or waited_s > self._params.patience:
             self._fail(Error(refusal.error), refusal.reason)
 
-    def _shut(self, status: Message, wanted: float | None = None) -> str:
+    def _shut(self, status: PrimitiveStatus, wanted: float | None = None) -> str:
         """Return how far the gripper has closed, if that is so far that it holds nothing, else an
         empty text.
 
@@ -240,7 +244,7 @@ class ElementalMoveExecutor(Executor):
             self._reason = reason
             self._request = 0
 
-    def _report(self, segments: SegmentWindow, report: Message) -> None:
+    def _report(self, segments: SegmentWindow, report: MoveStatus) -> None:
         command = self.above.message
         status = self.below.message
         report.echo = command.id
@@ -261,7 +265,7 @@ class ElementalMoveExecutor(Executor):
         is_begun = segments.count and under_way["id"] == status.current
         report.progress = status.progress if is_begun else 0.0
         move = find_move(window, report.current)
-        report.verb = Verb.NONE if move is None else int(move["verb"])
+        report.verb = Verb.NONE if move is None else move["verb"]
         # Report how far moves are planned: the planner continues from there.
         report.planned = self._plans.reach(window, self._handed_down)
         end = self._plans.end(report.planned)
@@ -300,10 +304,10 @@ class ElementalMoveExecutor(Executor):
         if self._reason:
             return self._reason
         if below.message.state == State.HOLDING and below.message.reason != HELD_FROM_ABOVE:
-            return str(below.message.reason)
+            return below.message.reason
         return HELD_FROM_ABOVE if command.message.hold else ""
 
-    def _state(self, command: Message) -> State:
+    def _state(self, command: TaskCommand) -> State:
         if self._error:
             return State.ERROR
         if not command.id:

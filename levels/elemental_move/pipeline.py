@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import Message, copied
+from rack.backplane.message import copied
 from rack.levels.algebra import Array
-from rack.levels.messages import SEGMENTS, WINDOW, Error, SegmentKind, Verb
+from rack.levels.messages import SEGMENTS, WINDOW, Error, MoveCommand, MovePlan, SegmentKind, Verb
 from rack.levels.tables import Positive, Table
 
 MAX_GAP_RAD = 0.005
@@ -43,10 +43,10 @@ class PlanStore:
     for another path."""
 
     def __init__(self) -> None:
-        self._by_move: dict[int, Message] = {}
-        self._answer: Message | None = None
+        self._by_move: dict[int, MovePlan] = {}
+        self._answer: MovePlan | None = None
 
-    def take(self, plan: Reading[Any], done: int, handed_down: int, end: Array) -> None:
+    def take(self, plan: Reading[MovePlan], done: int, handed_down: int, end: Array) -> None:
         """Keep a new plan of a move after `handed_down`, if it begins where the path before it
         ends.
 
@@ -79,11 +79,11 @@ class PlanStore:
         if len(self._by_move) < MAX_PLANS:
             self._by_move[message.move] = message
 
-    def of(self, move: int) -> Message | None:
+    def of(self, move: int) -> MovePlan | None:
         """Return the plan of a move, which may be a refusal; None: none yet."""
         return self._by_move.get(move)
 
-    def answer(self, request: int) -> Message | None:
+    def answer(self, request: int) -> MovePlan | None:
         """Return the answer to a request for another path; None: none yet."""
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
@@ -107,12 +107,12 @@ class PlanStore:
         return end_of(self._by_move[max(paths)]) if paths else None
 
 
-def joins(plan: Message, place: Array) -> bool:
+def joins(plan: MovePlan, place: Array) -> bool:
     """Return whether the path of a `MOVE_PLAN` begins at `place` (joints,), rad."""
     return is_same(np.asarray(plan.waypoints[0]), place)
 
 
-def end_of(plan: Message) -> Array:
+def end_of(plan: MovePlan) -> Array:
     """Return the end of the path of a `MOVE_PLAN`, (joints,), rad."""
     return np.asarray(plan.waypoints[plan.count - 1])
 
@@ -129,14 +129,14 @@ class SegmentWindow:
     Serials are never reused: a segment that replaces another has a newer one.
     """
 
-    def __init__(self, command: Message) -> None:
+    def __init__(self, command: MoveCommand) -> None:
         self._command = command
         self._segments = command.segments
 
     @property
     def count(self) -> int:
         """Segments in the window."""
-        return int(self._command.count)
+        return self._command.count
 
     @property
     def is_full(self) -> bool:
@@ -164,19 +164,19 @@ class SegmentWindow:
         self._command.count = 0
         self._blank()
 
-    def add_path(self, move: Any, plan: Message, by_s: float) -> None:
+    def add_path(self, move: Any, plan: MovePlan, by_s: float) -> None:
         """Hand down the path of `plan` for `move`, an element of a window of `ELEMENTAL_MOVE`."""
         segment = self._add(move, SegmentKind.PATH)
         segment["touch"] = move["verb"] in (Verb.APPROACH, Verb.DEPART)
         segment["by"] = by_s
         self._lay(segment, plan)
 
-    def replace_first(self, plan: Message) -> None:
+    def replace_first(self, plan: MovePlan) -> None:
         """Withdraw all segments; hand down the oldest again along another path, with a new
         serial."""
         self._command.count = 1
         self._blank()
-        self._command.id = self.first["id"] = int(self._command.id) + 1
+        self._command.id = self.first["id"] = self._command.id + 1
         self._lay(self.first, plan)
 
     def add_gripper(self, move: Any, opening: float, force: float) -> None:
@@ -197,13 +197,13 @@ class SegmentWindow:
     def _add(self, move: Any, kind: SegmentKind) -> Any:
         segment = self._segments[self.count]
         self._command.count = self.count + 1
-        self._command.id = segment["id"] = int(self._command.id) + 1
+        self._command.id = segment["id"] = self._command.id + 1
         segment["move"] = move["id"]
         segment["kind"] = kind
         segment["object"] = move["object"]
         return segment
 
-    def _lay(self, segment: Any, plan: Message) -> None:
+    def _lay(self, segment: Any, plan: MovePlan) -> None:
         segment["count"] = plan.count
         segment["waypoints"] = plan.waypoints
         segment["blend"] = plan.blend

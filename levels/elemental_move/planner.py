@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.elemental_move.pipeline import ElementalMoveParams, SegmentWindow
 from rack.levels.errors import Refused
@@ -154,7 +153,7 @@ class ElementalMovePlanner(Planner):
                 job.move, job.start, situation, attempt=self._tries, goal=job.goal
             )
         except Refused as refused:
-            self.output.error = refused.code
+            self.output.error = Error(refused.code)
             self.output.reason = str(refused)
             again_at = visible_at + round(self._params.retry / self.context.tick_s)
             self._refusal = Refusal(
@@ -266,7 +265,7 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
     return None
 
 
-def grip_of(row: int, tool: Pose, seen: Message) -> Pose:
+def grip_of(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
     """Return the pose of object `row` in the frame of a tool at `tool`; `seen` is a Scene or a
     WorldState."""
     return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])

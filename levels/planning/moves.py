@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rack.levels.algebra import Array
-from rack.levels.messages import Verb
+from rack.levels.messages import TaskCommand, TaskPlan, Verb
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.pose import Pose, pose
 
@@ -72,7 +72,7 @@ def read_move(record: Any) -> Move:
     )
 
 
-def read_window(command: Any) -> list[Move]:
+def read_window(command: TaskCommand | TaskPlan) -> list[Move]:
     """Return the moves of a `TASK_COMMAND` or a `TASK_PLAN`, oldest first."""
     return [read_move(record) for record in command.moves[: command.count]]
 

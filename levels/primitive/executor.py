@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import (
     Error,
@@ -131,7 +131,7 @@ class PrimitiveExecutor(Executor):
         self._write_status(self.status, serials, tick)
         self._answer(self.above.message.operator)
 
-    def _resume(self, servo: Message, tick: int) -> None:
+    def _resume(self, servo: ServoStatus, tick: int) -> None:
         """Continue from the position at which the servo holds the arm."""
         work = self._work
         self._displaced |= self._memory.is_known
@@ -153,7 +153,7 @@ class PrimitiveExecutor(Executor):
 
     def _do_segments(self, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the work: finish, drop, begin or advance it."""
-        hold = bool(self.above.message.hold) or self.above.is_lost or self._orders.holds
+        hold = self.above.message.hold or self.above.is_lost or self._orders.holds
         if self.below.is_new:
             self._finish(self.below.message, tick)
             self._straying.update(self.below.message)
@@ -179,7 +179,7 @@ class PrimitiveExecutor(Executor):
             work.step(WorkCycle(hold, plan, self.world.message, due_s, passed_s, part))
             self._position[:] = work.motion.set_point.position
 
-    def _finish(self, servo: Message, tick: int) -> None:
+    def _finish(self, servo: ServoStatus, tick: int) -> None:
         work = self._work
         if work is None or self._fault is not None or not work.done(servo):
             return
@@ -262,7 +262,7 @@ class PrimitiveExecutor(Executor):
         """Return the tick at which the set point of the cycle released at `tick` is due."""
         return tick + LEAD_CYCLES * self.context.every
 
-    def _write_set_point(self, command: Message, tick: int) -> None:
+    def _write_set_point(self, command: JointCommand, tick: int) -> None:
         work = self._work
         memory = self._memory
         in_step = self._tracking.in_step
@@ -278,7 +278,7 @@ class PrimitiveExecutor(Executor):
             command.force = memory.force
             command.held = memory.held
 
-    def _write_status(self, status: Message, serials: list[int], tick: int) -> None:
+    def _write_status(self, status: PrimitiveStatus, serials: list[int], tick: int) -> None:
         memory = self._memory
         work = self._work
         status.echo = self.above.message.id

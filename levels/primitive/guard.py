@@ -3,13 +3,11 @@ enough for motion."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.level import Reading
+from rack.levels.messages import WorldState
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory
 from rack.levels.planning.collision import CollisionChecker
@@ -58,7 +56,7 @@ class Guard:
         self._ahead = np.zeros((self._rows, 3))
         self.obstacle = ""  # the last pair of geoms found too close, with distance and bound
 
-    def carry(self, row: int, q: Array, world: Message) -> None:
+    def carry(self, row: int, q: Array, world: WorldState) -> None:
         """Carry object `row` with the tool, from its pose in `world` while the arm is at `q`
         (joints,), rad."""
         seen = Pose(world.position[row], world.quaternion[row])
@@ -69,7 +67,7 @@ class Guard:
         self._checker.hold(None)
 
     def watch(
-        self, segment: MotionSegment, path: BlendedPath, opening: float, world: Message
+        self, segment: MotionSegment, path: BlendedPath, opening: float, world: WorldState
     ) -> None:
         """Begin to watch the path of a segment, with the gripper at `opening`, in m."""
         self._checker.open_gripper(opening)
@@ -84,7 +82,7 @@ class Guard:
         self.obstacle = ""
 
     def is_clear(
-        self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: Message
+        self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: WorldState
     ) -> bool:
         """Return, by this cycle's share of the checks, whether the path is clear from `time_s`
         on."""
@@ -98,7 +96,7 @@ class Guard:
         return near_clear and (far_clear or not still)
 
     def _near_is_clear(
-        self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: Message | None
+        self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: WorldState | None
     ) -> bool:
         """Check the path within the look-ahead; `moving` is the world model while an obstacle
         moves."""
@@ -162,7 +160,7 @@ class Sight:
         if row < 0:
             self._guard.carry_nothing()
 
-    def update(self, world: Reading[Any], q: Array, tick: int) -> None:
+    def update(self, world: Reading[WorldState], q: Array, tick: int) -> None:
         """Process the newest world model; `q` (joints,), rad, is where the arm rests."""
         model = world.message
         seen = world.is_there and model.revision > 0

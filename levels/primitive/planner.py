@@ -4,7 +4,6 @@ moves."""
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
 
 import numpy as np
 
@@ -74,7 +73,7 @@ class PrimitivePlanner(Planner):
         except (ValueError, ArithmeticError) as error:
             fault = SegmentFault(Error.LIMIT, f"segment {serial}: {error}")
         self.output.error, self.output.reason, self.output.earliest = fault or (
-            0,
+            Error.NONE,
             "",
             self.output.earliest,
         )
@@ -102,7 +101,7 @@ class Plans:
     def __init__(self) -> None:
         self._plans: dict[int, Trajectory | SegmentFault] = {}
 
-    def accept(self, plan: Reading[Any], window: Collection[int]) -> None:
+    def accept(self, plan: Reading[TrajectoryPlan], window: Collection[int]) -> None:
         """Copy a new plan; drop those of segments that have left the window."""
         for serial in [s for s in self._plans if s not in window]:
             del self._plans[serial]

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.messages import Error, JointCommand, PrimitiveStatus, SegmentKind
+from rack.levels.messages import Error, JointCommand, MoveCommand, PrimitiveStatus, SegmentKind
 from rack.levels.motion.path import BlendedPath
 
 
@@ -50,13 +49,13 @@ class MotionSegment:
         return SegmentFault(Error.TOO_LATE, reason, earliest_s)
 
 
-def window(command: Message) -> list[int]:
+def window(command: MoveCommand) -> list[int]:
     """Return the serials of the segments in a MOVE_COMMAND, oldest first."""
     serials: list[int] = command.segments["id"][: command.count].tolist()
     return serials
 
 
-def read_segment(command: Message, serial: int) -> MotionSegment:
+def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
     """Return the segment with that serial, which must be in the window.
 
     Raises `ValueError` for an unknown kind and for numbers that are not finite.

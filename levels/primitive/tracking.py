@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.level import Reading
-from rack.levels.messages import Error
+from rack.levels.messages import DrivenArm, Error
 from rack.levels.primitive.segment import SegmentFault
 
 LEAD_CYCLES = 2
@@ -43,13 +42,13 @@ class Tracking:
         self._cycles_in_step = 0
         self._unexplained_cycles = 0
 
-    def update(self, status: Reading[Any]) -> bool:
+    def update(self, status: Reading[DrivenArm]) -> bool:
         """Process one status; True in the cycle in which servo and level get into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
         servo = status.message
-        left_alone = bool(servo.holding) and self._cycles_in_step > HANDOVER_CYCLES
+        left_alone = servo.holding and self._cycles_in_step > HANDOVER_CYCLES
         if self.silent_cycles > MAX_MISSED_STATUSES or left_alone or servo.stopped:
             self.in_step = False
         self._unexplained_cycles = (
@@ -67,7 +66,7 @@ class Tracking:
         self._cycles_in_step = 0
         return True
 
-    def awaited(self, servo: Message) -> str:
+    def awaited(self, servo: DrivenArm) -> str:
         """Return what a level out of step waits for."""
         if self.silent_cycles > MAX_MISSED_STATUSES:
             return f"waiting for servo: no status for {self.silent_cycles} cycles"
@@ -105,7 +104,7 @@ class Straying:
         self.place = ""
         self.fault = None
 
-    def update(self, servo: Message) -> None:
+    def update(self, servo: DrivenArm) -> None:
         """Process one status; set `fault` when a joint has been too far away for too long."""
         away = np.abs(servo.position - servo.target)
         if away.max() <= self._permitted_rad:

@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
-from rack.levels.messages import Error
+from rack.levels.messages import DrivenArm, Error, WorldState
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.speed import braking_limits
 from rack.levels.motion.trajectory import Trajectory
@@ -120,7 +119,7 @@ class WorkCycle(NamedTuple):
 
     hold: bool
     plan: Trajectory | None  # from where the motion rests
-    world: Message  # WORLD_MODEL
+    world: WorldState
     due_s: float  # simulated time of the set point commanded last
     passed_s: float  # since the cycle before
     part: float = 1.0  # of full speed, for a trajectory that begins
@@ -180,7 +179,7 @@ class PathWork:
         self.unplanned_cycles = self.unplanned_cycles + 1 if waits and cycle.plan is None else 0
         motion.advance(cycle.passed_s)
 
-    def done(self, status: Message) -> bool:
+    def done(self, status: DrivenArm) -> bool:
         """Return whether set point and arm rest at the end of the path."""
         if not self.motion.finished:
             return False
@@ -271,7 +270,7 @@ class GripperWork:
         than to open; -1: none."""
         return self.segment.object if self._closes else -1
 
-    def done(self, status: Message) -> bool:
+    def done(self, status: DrivenArm) -> bool:
         """Return whether the gripper rests."""
         self._cycles += 1
         # Before the command reaches it, the gripper rests too.

@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import JointTarget, find_arm
 from rack.levels.compiled import compiled_for
+from rack.levels.messages import ArmSetPoint, ServoPlan
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
 from rack.levels.servo.curves import Motion
@@ -94,7 +94,7 @@ class ComputedTorque:
         """Use these gains from now on."""
         gains.fill(self._constants)
 
-    def take(self, plan: Message) -> None:
+    def take(self, plan: ServoPlan) -> None:
         """Take a new plan."""
         self.holds = plan.held >= 0
         self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
@@ -190,7 +190,7 @@ class Grip:
         a restart of the board."""
         self._kept = force
 
-    def take(self, command: Message) -> None:
+    def take(self, command: ArmSetPoint) -> None:
         """Take a new `JOINT_SET_POINT`."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from rack.levels.level import (
     Reading,
 )
 from rack.levels.messages import ArmState, DrivenArm, Error, Scene
-from rack.levels.operator import Operation, Orders
+from rack.levels.operator import Operation, OperatorCommand, Orders
 from rack.levels.robot.cell import cell_of, sensed_by
 from rack.levels.robot.dynamics import Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
@@ -205,7 +205,7 @@ class ArmDriver(Executor):
         """What the status says while there is nothing worse to say. Default: nothing."""
         return ""
 
-    def obey(self, command: Message) -> str:
+    def obey(self, command: OperatorCommand) -> str:
         """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
         if command.what != Operation.RELEASE:
             return self.enabling.obey(command)
@@ -264,7 +264,7 @@ class ArmDriver(Executor):
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             self.arm.look(self.scene)
 
-    def _catch_up(self, before: Reading[Any], tick: int) -> bool:
+    def _catch_up(self, before: Reading[ArmState], tick: int) -> bool:
         """Advance the arm to `tick`; return whether cycles were missed. A restarted board first
         restores the arm."""
         if not self._started:
@@ -291,7 +291,7 @@ class ArmDriver(Executor):
             self.adopted()
         return is_adopted or is_enabled
 
-    def _start(self, before: Message | None, tick: int) -> None:
+    def _start(self, before: ArmState | None, tick: int) -> None:
         self.enabling.start(before is not None)
         if before is not None:
             self.arm.restore(before)
@@ -374,7 +374,7 @@ class ArmDriver(Executor):
             self._shown = shown
             self._show(status, course)
 
-    def _show(self, status: Message, course: Course) -> None:
+    def _show(self, status: DrivenArm, course: Course) -> None:
         """Fill the steady fields."""
         arm = self.arm
         stopping = self.stopping

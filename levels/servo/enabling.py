@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from rack.backplane.message import Message
 from rack.levels.arm import Arm, DriveState
 from rack.levels.level import LevelContext
-from rack.levels.operator import Operation
+from rack.levels.operator import Operation, OperatorCommand
 
 
 class Enabling:
@@ -38,7 +37,7 @@ class Enabling:
         if self._at_start and not (restarted or self._guessed):
             self._arm.enable()
 
-    def obey(self, command: Message) -> str:
+    def obey(self, command: OperatorCommand) -> str:
         """Obey one of `rack.levels.operator.DRIVES`; return why not, empty: it does."""
         arm = self._arm
         goal: Collection[DriveState] = list(DriveState)

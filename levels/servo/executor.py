@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.level import Input, LevelContext, Misfits, Output, Verdict
@@ -95,14 +94,14 @@ class ServoExecutor(ArmDriver):
         if self.plan.verdict is Verdict.NEW:
             self._loop.take(self.plan.message)
         if self.above.verdict is Verdict.NEW:
-            command: Message = self.above.message
+            command = self.above.message
             self.followed = command.id
             self.rests_on = command.operator
             self.reference.take(command)
             if self._grip is not None:
                 self._grip.take(command)
 
-    def _obey(self, command: Message) -> str:
+    def _obey(self, command: OperatorCommand) -> str:
         """Do what leaves the command in force as it is; return why not, empty: it does."""
         if command.what == Operation.MODIFY:
             return self._modified.switch(command.name, command.goal == Goal.ON)

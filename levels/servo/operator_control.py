@@ -4,14 +4,20 @@ return the same way."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import Message
 from rack.levels.algebra import Array, Mask
-from rack.levels.operator import DRIVES, SETTINGS, Commands, Operation, Orders, joints_of
+from rack.levels.operator import (
+    DRIVES,
+    SETTINGS,
+    Commands,
+    Operation,
+    OperatorCommand,
+    Orders,
+    joints_of,
+)
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
 
@@ -31,7 +37,7 @@ class OperatorControl:
         ranges: Array,
         driven: Mask | None = None,
         *,
-        obey: Callable[[Message], str],
+        obey: Callable[[OperatorCommand], str],
     ) -> None:
         """Permit set points of the joints `driven`, (joints,), default all, within `ranges`
         (joints, 2), rad.
@@ -50,7 +56,7 @@ class OperatorControl:
             Array
         ] = []  # (joints,), rad each: places from which the arm set out, oldest first
 
-    def take(self, operator: Reading[Any], position: Array) -> None:
+    def take(self, operator: Reading[OperatorCommand], position: Array) -> None:
         """Accept new commands, with the arm at `position`, (joints,), rad."""
         self._position[:] = position
         if not self.orders.take(operator, self._judge):
@@ -73,7 +79,7 @@ class OperatorControl:
         what = "held" if self.orders.holds else f"at the {self.orders.standing.name.lower()}"
         return f"{what} by the operator; `resume` releases it"
 
-    def _judge(self, command: Message) -> None:
+    def _judge(self, command: OperatorCommand) -> None:
         """Take the goal of a set point, or refuse it; do what leaves the command in force."""
         if command.what in (*SETTINGS, *DRIVES):
             if why := self._obey(command):

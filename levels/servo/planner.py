@@ -5,7 +5,6 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import mat_vec, transposed_mat_vec
 from rack.levels.level import Input, LevelContext, Output, Planner
 from rack.levels.messages import JointCommand, Scene, ServoPlan, ServoStatus
@@ -39,7 +38,7 @@ class ServoPlanner(Planner):
 
     def plan(self, tick: int) -> None:
         """Fill a `ServoPlan`."""
-        command: Message = self.above.message
+        command = self.above.message
         held = -1
         payload = Payload(0.0, np.zeros(3))
         if command.due != 0 and self.scene.is_there and 0 <= command.held < self._objects:
@@ -56,7 +55,7 @@ class ServoPlanner(Planner):
         self.output.payload_mass = payload.mass
         self.output.payload_offset = payload.offset
 
-    def _payload(self, scene: Message, held: int) -> Payload:
+    def _payload(self, scene: Scene, held: int) -> Payload:
         """Return mass and centre, in the frame of the tool, of an object as the scene shows it."""
         mujoco.mju_quat2Mat(self._rotation, scene.quaternion[held])
         centre = scene.position[held] + mat_vec(self._rotation.reshape(3, 3), self._centres[held])

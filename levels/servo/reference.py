@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
+from rack.levels.messages import ArmSetPoint
 from rack.levels.robot.limits import Bounds, Limits
 from rack.levels.servo.curves import Bridge, Curve, Decay, Motion, Passage, Ramp, set_motion
 
@@ -53,7 +53,7 @@ class Reference:
         )  # the one wanted, and its difference from the curve
         self._wanted = Motion(self._motions[0])
         self._interpolate = set_motion.load()
-        self._command: Message | None = None  # the newest `JOINT_SET_POINT`
+        self._command: ArmSetPoint | None = None  # the newest `JOINT_SET_POINT`
         self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # the set point to follow after that
@@ -86,7 +86,7 @@ class Reference:
         else:
             self._join(position, velocity, tick)
 
-    def take(self, command: Message) -> None:
+    def take(self, command: ArmSetPoint) -> None:
         """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is
         taken."""
         self._command = command

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.arm import Sensed
 from rack.levels.compiled import compiled_for
 from rack.levels.level import Finding
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import Cell
 from rack.levels.servo.control import ArmParams
 
@@ -126,7 +126,7 @@ class SensorMonitor:
         self._streak = 0  # good samples in a row
         self._rung: set[Alarm] = set()  # alarms raised in this episode
 
-    def recall(self, state: Message) -> None:
+    def recall(self, state: ArmState) -> None:
         """Continue from the estimate in an `ARM_STATE`."""
         self.position[:] = state.position
         self.velocity[:] = state.velocity

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.level import Finding
-from rack.levels.messages import Error
+from rack.levels.messages import ArmState, Error
 from rack.levels.servo.control import ArmParams
 from rack.levels.servo.sensor_monitor import SensorMonitor
 
@@ -76,7 +75,7 @@ class Stopping:
         self._struck_until: int | None = None  # tick until which a struck arm stays stopped
         self._on_blow = Reaction.BRAKE  # reaction until then
 
-    def recall(self, state: Message) -> None:
+    def recall(self, state: ArmState) -> None:
         """Continue from the state in an `ARM_STATE`."""
         self._tick = state.tick
         self._kept = state.kept
@@ -84,7 +83,7 @@ class Stopping:
             self.error = Error(state.error)
             self.reason = state.reason
 
-    def remember(self, state: Message) -> None:
+    def remember(self, state: ArmState) -> None:
         """Fill in the state for `recall`."""
         error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
         if (self._kept, error) != self._remembered:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.level import Executor, Input, LevelContext, Output, Program, Reading
 from rack.levels.messages import Error, MoveStatus, TaskCommand, TaskPlan, TaskStatus
 from rack.levels.operator import (
@@ -89,10 +89,9 @@ class TaskExecutor(Executor):
         """Return the actions with which the level begins: its whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
-    def _plan_to_follow(self, tick: int) -> Message:
+    def _plan_to_follow(self, tick: int) -> TaskPlan:
         """Return the `TaskPlan` of the present actions; one of zeros if there is none yet."""
-        plan: Message = self.plan.message
-        return plan
+        return self.plan.message
 
     def _recall(self) -> None:
         """Continue from the last command and status in the mailboxes, after a restart of the
@@ -107,13 +106,13 @@ class TaskExecutor(Executor):
             self._window = ShownWindow(last.first, self.last_command.message.id, before)
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
-    def _judge(self, command: Message, answered: int) -> None:
+    def _judge(self, command: OperatorCommand, answered: int) -> None:
         """Accept or refuse a goto; one already answered before a restart of this board is not
         new."""
         if self._orders.standing is Operation.GOTO:
             self._detour.begin(command, command.id > answered)
 
-    def _follow(self, plan: Message, below: Message) -> None:
+    def _follow(self, plan: TaskPlan, below: MoveStatus) -> None:
         if plan.error:
             self._error = Error(plan.error)
             self._reason = plan.reason
@@ -129,11 +128,11 @@ class TaskExecutor(Executor):
         """Return a reason with the number of its action; `why` begins with what separates them."""
         return f"action {action}{why}"
 
-    def _step_aside(self, plan: Message, below: Message) -> int:
+    def _step_aside(self, plan: TaskPlan, below: MoveStatus) -> int:
         """Interrupt the program for an operator; return how many moves of the plan are done."""
         return self._detour.step(plan, self._done, below)
 
-    def _reason_to_wait(self, below: Reading[Any]) -> str:
+    def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
         """Return the reason why the level waits, and the condition that ends the wait; empty: it
         does not."""
         orders = self._orders
@@ -144,9 +143,9 @@ class TaskExecutor(Executor):
         if below.is_lost:
             return BELOW_LOST
         is_held = below.message.state == State.HOLDING and below.message.reason != HELD_FROM_ABOVE
-        return str(below.message.reason) if is_held else ""
+        return below.message.reason if is_held else ""
 
-    def _check_progress(self, plan: Message, waits: str, tick: int) -> None:
+    def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
         """Fail when nothing has moved for too long, unless an operator keeps it from moving."""
         below = self.below.message
         reported = below.done, below.planned, below.current, below.progress
@@ -165,14 +164,14 @@ class TaskExecutor(Executor):
         """Return what else counts as progress."""
         return ()
 
-    def _actions_done(self, plan: Message) -> int:
+    def _actions_done(self, plan: TaskPlan) -> int:
         if not plan.count:
             return 0
         if self._done == plan.count:
             return len(self._actions)
         return int(plan.moves["action"][self._done])
 
-    def _hand_down(self, plan: Message, command: Message) -> None:
+    def _hand_down(self, plan: TaskPlan, command: TaskCommand) -> None:
         """Show the program's next moves, or the operator's goto."""
         detour = self._detour
         if detour.move and detour.is_known and not self._error:
@@ -182,12 +181,12 @@ class TaskExecutor(Executor):
             until = 0 if is_kept else self._shown_until(plan)
             self._window.show(plan, self._done, command, until)
 
-    def _shown_until(self, plan: Message) -> int:
+    def _shown_until(self, plan: TaskPlan) -> int:
         """Return the first move of the plan that must not begin."""
         return plan.count if self._detour.until is None else self._detour.until
 
-    def _report(self, plan: Message, waits: str) -> None:
-        status: Message = self.status
+    def _report(self, plan: TaskPlan, waits: str) -> None:
+        status = self.status
         status.echo = plan.id
         status.state = self._state(plan)
         holds = waits and status.state == State.EXECUTING
@@ -202,7 +201,7 @@ class TaskExecutor(Executor):
         status.first = self._window.first
         status.detour = self._detour.move
 
-    def _answer(self, below: Message) -> None:
+    def _answer(self, below: MoveStatus) -> None:
         """Obey and answer the operator, and pass down the newest command on which this cycle is
         based."""
         orders = self._orders
@@ -212,7 +211,7 @@ class TaskExecutor(Executor):
             orders.done()
         orders.report(self.status)
 
-    def _state(self, plan: Message) -> State:
+    def _state(self, plan: TaskPlan) -> State:
         if self._error:
             return State.ERROR
         if not self._actions:
@@ -220,7 +219,7 @@ class TaskExecutor(Executor):
         return State.DONE if plan.count and self._done == plan.count else State.EXECUTING
 
 
-def _awaited(plan: Message, below: Message) -> str:
+def _awaited(plan: TaskPlan, below: MoveStatus) -> str:
     """Return the event for which a task waits while nothing holds it."""
     if not plan.id:
         return "no plan yet: the objects must be at rest and the position of the arm known"

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from rack.backplane.message import Message, copied
+from rack.backplane.message import copied
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Output, Planner, Program
 from rack.levels.messages import MOVES, Error, ServoStatus, TaskPlan, TaskStatus, WorldState
@@ -57,7 +57,7 @@ class TaskPlanner(Planner):
         self._needs = read_params(self.params, context.params)
         cell = cell_of(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
-        self._plan: Message | None = None  # made by this process
+        self._plan: TaskPlan | None = None  # made by this process
         self._visible_at = 0  # tick from which it is visible
         self._since: int | None = None  # tick of the first cycle
 
@@ -91,7 +91,7 @@ class TaskPlanner(Planner):
         try:
             self._decompose(tick)
         except Refused as refused:
-            self.output.error = refused.code
+            self.output.error = Error(refused.code)
             self.output.reason = self._reason(refused)
             self.output.count = 0
         self._plan = copied(self.output)

@@ -10,10 +10,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.messages import WINDOW, Verb
-from rack.levels.operator import Answer, Goal, Operation, Orders, described, joints_of
+from rack.levels.messages import WINDOW, MoveStatus, TaskCommand, TaskPlan, Verb
+from rack.levels.operator import (
+    Answer,
+    Goal,
+    Operation,
+    OperatorCommand,
+    Orders,
+    described,
+    joints_of,
+)
 from rack.levels.planning.moves import Move
 from rack.levels.planning.pose import Pose, pointing, pose
 from rack.levels.tables import RobotConfig
@@ -47,11 +55,11 @@ class ShownWindow:
         self.first = self.newest + JUMP - done
         self.before = self.first + done - 1
 
-    def done(self, below: Message) -> int:
+    def done(self, below: MoveStatus) -> int:
         """Return how many of the plan's moves the level below reports done."""
-        return int(below.done) - self.first + 1
+        return below.done - self.first + 1
 
-    def breaking_off(self, plan: Message, done: int, below: Message) -> tuple[int, bool]:
+    def breaking_off(self, plan: TaskPlan, done: int, below: MoveStatus) -> tuple[int, bool]:
         """Return the first move that must not begin so that the plan is broken off, and whether the
         arm may rest now.
 
@@ -62,7 +70,7 @@ class ShownWindow:
             return next(k for k in range(done, plan.count + 1) if is_free(plan, k)), False
         return done, True
 
-    def show(self, plan: Message, done: int, command: Message, until: int) -> None:
+    def show(self, plan: TaskPlan, done: int, command: TaskCommand, until: int) -> None:
         """Show the moves from the first one that is not done up to `until`, none before it; after
         the last, the window stays.
 
@@ -74,12 +82,12 @@ class ShownWindow:
         command.moves["id"][:count] = np.arange(count) + (self.first + first)
         self._end(command, count)
 
-    def show_one(self, move: Move, command: Message) -> None:
+    def show_one(self, move: Move, command: TaskCommand) -> None:
         """Show one move alone."""
         move.write_to(command.moves[0])
         self._end(command, 1)
 
-    def _end(self, command: Message, count: int) -> None:
+    def _end(self, command: TaskCommand, count: int) -> None:
         command.count = count
         # Equal windows have equal bytes.
         command.moves[count:] = np.zeros((), command.moves.dtype)
@@ -88,7 +96,7 @@ class ShownWindow:
         command.id = self.newest
 
 
-def is_free(plan: Message, k: int) -> bool:
+def is_free(plan: TaskPlan, k: int) -> bool:
     """Return whether move `k` of the plan is a free motion; before the first and after the last
     move, True."""
     return not 0 <= k < plan.count or plan.moves["verb"][k] in FREE
@@ -122,7 +130,7 @@ class Detour:
         stage = "done" if self._orders.answer is Answer.DONE else "under way"
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
-    def begin(self, message: Message, is_new: bool) -> None:
+    def begin(self, message: OperatorCommand, is_new: bool) -> None:
         """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under
         its id."""
         try:
@@ -133,7 +141,7 @@ class Detour:
         self._goal = Goal(message.goal)
         self._is_new = is_new
 
-    def step(self, plan: Message, done: int, below: Message) -> int:
+    def step(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
         """Advance by one cycle; return how many of the plan's moves are done: `done`, or one
         less."""
         self.holds = False
@@ -151,7 +159,7 @@ class Detour:
         self._is_new = False
         return done
 
-    def _leave(self, plan: Message, done: int, below: Message) -> int:
+    def _leave(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
         """Interrupt the program where possible; until then show only the moves that must be done
         first."""
         self.until, self.holds = self._window.breaking_off(plan, done, below)
@@ -172,13 +180,13 @@ class Detour:
         verb, tool, joints = self._target
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 
-    def _follow(self, below: Message) -> None:
+    def _follow(self, below: MoveStatus) -> None:
         if below.done >= self.move:
             self._orders.done()
         elif below.state == State.ERROR and below.done >= self._window.before:
             self._orders.fail(below.reason)
 
-    def _read(self, message: Message) -> tuple[Verb, Pose, Array]:
+    def _read(self, message: OperatorCommand) -> tuple[Verb, Pose, Array]:
         """Return the kind of move to a goal, and its end. Raises `ValueError` for an invalid
         one."""
         joints = np.array(self._robot.home)

@@ -116,8 +116,8 @@ def arm_of(segment: Segment) -> ArmEnd:
     seen = [status for _, status in statuses(segment, "violations")]
     counted = [*seen, *(state for _, state in arm_states(segment))]
     return ArmEnd(
-        violations=max((int(arm.violations) for arm in counted), default=0),
-        touches=max((int(arm.touches) for arm in counted), default=0),
+        violations=max((arm.violations for arm in counted), default=0),
+        touches=max((arm.touches for arm in counted), default=0),
         is_at_rest=all(np.abs(arm.velocity).max() < AT_REST for arm in seen),
     )
 

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.message import Message, State, reason_of
+from rack.backplane.message import AnyMessage, Message, State, reason_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.events import Event
 from rack.boards.lan.awaited import awaited
 from rack.boards.operator import describe
 from rack.levels.messages import Error
-from rack.levels.operator import Answer, Operation, answered
+from rack.levels.operator import Answer, Operation, OperatorCommand, answered
 from rack.tools.live.newest import Newest
 
 STILL_S = 5.0
@@ -104,7 +104,7 @@ def _find_holds(newest: Newest) -> Iterator[Hold]:
                 yield hold(level, segment.block(level)[Block.LEVEL_SINCE], why, release)
 
 
-def _command_in_force(segment: Segment, level: str, status: Message) -> tuple[int, int, str]:
+def _command_in_force(segment: Segment, level: str, status: AnyMessage) -> tuple[int, int, str]:
     """Return tick, serial and text of the operator's command in force at a level; serial 0 where
     its message is gone."""
     rows = MailboxRing(segment, f"{level}.operator").drain().rows
@@ -118,9 +118,9 @@ def _command_in_force(segment: Segment, level: str, status: Message) -> tuple[in
         return segment.block(level)[Block.LEVEL_SINCE], 0, Operation(status.standing).name.lower()
     answering = found[found["message"]["id"] == status.order]
     row = (answering if len(answering) else found)[-1]
-    message = Message(given.dtype)
+    message = OperatorCommand(given.dtype)
     message.raw[:] = row["message"].tobytes()
-    return int(row["tick"]), int(message.id), describe(message)
+    return int(row["tick"]), message.id, describe(message)
 
 
 class Standstill:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 
 
@@ -18,7 +18,7 @@ class Newest:
         self.segment = segment
         self._readers: dict[str, Reader] = {}
 
-    def message(self, mailbox: str) -> Message | None:
+    def message(self, mailbox: str) -> AnyMessage | None:
         """Return the newest message of a mailbox; None without one, or without the mailbox."""
         if mailbox not in self.segment.map.mailboxes:
             return None
@@ -27,13 +27,15 @@ class Newest:
         reading = self._readers[mailbox].peek()
         return reading.message if reading.is_there else None
 
-    def messages(self, is_wanted: Callable[[MailboxSpec], bool]) -> Iterator[tuple[str, Message]]:
+    def messages(
+        self, is_wanted: Callable[[MailboxSpec], bool]
+    ) -> Iterator[tuple[str, AnyMessage]]:
         """Yield the newest message of every wanted mailbox that has one, with its writer."""
         for box in self.segment.layout.mailboxes:
             if is_wanted(box) and (message := self.message(box.name)) is not None:
                 yield box.writer, message
 
-    def statuses(self, field: str) -> Iterator[tuple[str, Message]]:
+    def statuses(self, field: str) -> Iterator[tuple[str, AnyMessage]]:
         """Yield the newest status of every level whose status has a field, with the level."""
         return self.messages(
             lambda box: box.name.endswith(".status") and field in (own.name for own in box.fields)

@@ -13,7 +13,7 @@ from rack.backplane.checked import as_named
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
-from rack.backplane.message import Message, reason_of, state_name
+from rack.backplane.message import AnyMessage, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block, Demand, Run, System, TaskState
@@ -250,7 +250,7 @@ class RackMonitor:
             longest = self._longest_ns[task] = newest
         return [None, None] if longest is None else (longest * 1e-6).tolist()
 
-    def _of_type(self, message: str) -> Iterator[tuple[str, Message]]:
+    def _of_type(self, message: str) -> Iterator[tuple[str, AnyMessage]]:
         """Yield the newest message in every mailbox of a message type, with its writer."""
         return self._newest.messages(lambda box: box.message == message)
 
@@ -261,7 +261,7 @@ class RackMonitor:
         return None
 
 
-def fired(status: Message) -> str:
+def fired(status: AnyMessage) -> str:
     """Return what fired of a state table in a level's newest cycle, as text; empty for a level
     without one."""
     if not {"row", "fired", "in_state", "table"} <= {*(status.record.dtype.names or ())}:

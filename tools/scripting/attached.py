@@ -16,6 +16,7 @@ import numpy as np
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
+from rack.backplane.message import AnyMessage
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure, as_failure
@@ -75,7 +76,7 @@ class AttachedRack:
         return self._monitor.look()
 
     @as_failure()
-    def read(self, mailbox: str) -> Reading[Any]:
+    def read(self, mailbox: str) -> Reading[AnyMessage]:
         """Return the newest message of a mailbox, a copy; it costs no board anything."""
         return open_observer(self._segment, mailbox_of(mailbox, self._boxes).name).peek()
 

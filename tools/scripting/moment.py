@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from rack.backplane.message import Message
+from rack.backplane.message import AnyMessage
 from rack.backplane.words import Run, System
 from rack.boards import Rack
 from rack.boards.crate.line import CrateLine
@@ -38,10 +38,10 @@ class RecordedMoment:
         """Its simulated time, s."""
         return round(self.tick * self._recording.layout.clock_ns * 1e-9, 9)
 
-    def read(self, mailbox: str) -> Message:
+    def read(self, mailbox: str) -> AnyMessage:
         """Return the message that is in force, as a reader released now finds it."""
         content = self.row(mailbox_of(mailbox, self._recording.layout.timed).name)["message"]
-        return Message(content.dtype, memoryview(bytearray(content.tobytes())))
+        return AnyMessage(content.dtype, memoryview(bytearray(content.tobytes())))
 
     def row(self, mailbox: str) -> Any:
         """Return the same with its head, as a row of the mailbox's ring. Raises `Failure`."""
@@ -57,7 +57,7 @@ class RecordedMoment:
         return signal.in_message(self.read(signal.mailbox).record)
 
     @property
-    def mailboxes(self) -> dict[str, Message]:
+    def mailboxes(self) -> dict[str, AnyMessage]:
         """The messages in force, by mailbox."""
         found = (box.name for box in self._recording.layout.timed)
         return {

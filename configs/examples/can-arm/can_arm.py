@@ -6,11 +6,11 @@ import numpy as np
 import wire
 from wire import Control, Power, Report
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, DriveState, Sensed
 from rack.levels.errors import LevelError
 from rack.levels.level import Finding
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
@@ -106,7 +106,7 @@ class CanArm(Arm):
             self.state = DriveState.DISABLED
             self._reset_until = self.tick + wire.SILENT_S * self._rate_hz
 
-    def restore(self, state: Message) -> None:
+    def restore(self, state: ArmState) -> None:
         """Continue: the drives are as they were, but for what their watchdogs have done."""
         super().restore(state)
         if self.state is not DriveState.DISABLED:

@@ -6,9 +6,9 @@ import numpy as np
 from drives import Drives
 from numpy.typing import NDArray
 
-from rack.backplane.message import Message
 from rack.levels.arm import Arm, DriveState, Sensed
 from rack.levels.level import Finding
+from rack.levels.messages import ArmState
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
@@ -74,12 +74,12 @@ class HardwareArm(Arm):
         if self.drives.braked and not self.braked:
             self.brake()
 
-    def save(self, state: Message) -> None:
+    def save(self, state: ArmState) -> None:
         """Add what a restarted board could ask real drives for."""
         super().save(state)
         state.state[: 2 * len(self.torque)] = [*self.drives.position, *self.drives.velocity]
 
-    def restore(self, state: Message) -> None:
+    def restore(self, state: ArmState) -> None:
         """Continue where the arm was left."""
         super().restore(state)
         saved = state.state[: 2 * len(self.torque)].reshape(2, -1)

@@ -16,7 +16,7 @@ import numpy as np
 
 from rack.backplane.message import field
 from rack.backplane.words import Demand
-from rack.levels.operator import AnsweringStatus, RelayedCommand
+from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 FLEXOR = 0
 EXTENSOR = 1
@@ -47,7 +47,7 @@ DRIVEN = field("u1", unit="1", doc="1: the joint is one of this board's", shape=
 SENSED = field(unit="tick", doc="tick of the hand's status that it rests on; -1: none yet")
 
 
-class TensionCommand(RelayedCommand, version=1):
+class TensionCommand(SampledCommand, version=1):
     """From the boards of tendon loops to the board of the hand."""
 
     sampled: int = field(

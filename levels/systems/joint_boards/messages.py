@@ -22,7 +22,7 @@ import numpy as np
 
 from rack.backplane.message import field
 from rack.levels.messages import DrivenArm, JointCommand, ServoStatus
-from rack.levels.operator import AnsweringStatus, RelayedCommand
+from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 
 class JointReference(RelayedCommand, version=1):
@@ -51,7 +51,7 @@ class JointReference(RelayedCommand, version=1):
     )
 
 
-class JointTorque(RelayedCommand, version=1):
+class JointTorque(SampledCommand, version=1):
     """From a board that servoes joints to the board of the arm, which adds them up; id rises with
     every
     cycle."""

@@ -21,7 +21,7 @@ from rack.backplane.layout import PROTOCOLS, InterruptSpec, Layout, MailboxSpec,
 from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_reader, open_writer
-from rack.backplane.message import Command, Message, field
+from rack.backplane.message import AnyMessage, Command, field
 from rack.backplane.segment import Segment, unlink
 from rack.boards.config.layout import field_specs
 from rack.boards.faults.bounds import counting
@@ -183,13 +183,12 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
     yield Transport(writer.message, writer.write, readers)
 
 
-def _reading(reader: Reader) -> Callable[[int], Message]:
+def _reading(reader: Reader) -> Callable[[int], AnyMessage]:
     read = reader.read
     delay = reader.spec.delay
 
-    def take(tick: int) -> Message:
-        message: Message = read(tick + delay).message
-        return message
+    def take(tick: int) -> AnyMessage:
+        return read(tick + delay).message
 
     return take
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import SHM_FOLDER
 
 KEY = "rack"
@@ -29,9 +29,9 @@ class Transport(NamedTuple):
     """Fill `message`, call `send` with a tick, then every reader with the same tick: each returns
     what it received."""
 
-    message: Message
+    message: AnyMessage
     send: Callable[[int], object]
-    readers: Sequence[Callable[[int], Message]]
+    readers: Sequence[Callable[[int], AnyMessage]]
 
 
 class Peer(NamedTuple):
@@ -46,7 +46,7 @@ class Peer(NamedTuple):
 @contextmanager
 def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Update an entry of an iceoryx2 blackboard; every reader copies its newest value."""
-    message = Message(dtype)
+    message = AnyMessage(dtype)
     with _iceoryx2_names() as (iceoryx2, node):
         payload = _structure(dtype)
         key = ctypes.c_uint64(0)
@@ -74,7 +74,7 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 @contextmanager
 def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Send bytes through a pipe to every reader."""
-    message = Message(dtype)
+    message = AnyMessage(dtype)
     pipes = [multiprocessing.Pipe(duplex=False) for _ in range(readers)]
 
     def send(tick: int) -> None:
@@ -96,12 +96,12 @@ PEERS = (
 )
 
 
-def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[int], Message]:
+def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[int], AnyMessage]:
     """Return a reader that lets `fetch` fill the bytes of a message of its own."""
-    message = Message(dtype)
+    message = AnyMessage(dtype)
     raw = message.raw
 
-    def take(tick: int) -> Message:
+    def take(tick: int) -> AnyMessage:
         fetch(raw)
         return message
 
