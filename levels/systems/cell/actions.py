@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from rack.backplane.message import Message
 from rack.levels.errors import ProgramError
 from rack.levels.level import LevelContext
 from rack.levels.operator import Goal
@@ -17,7 +16,7 @@ from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, misf
 _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 
-def write_action(action: AnyAction, message: Message) -> None:
+def write_action(action: AnyAction, message: CellAction) -> None:
     """Fill the `CellAction` of a message; what the action lacks is zero."""
     for field in CellAction.message_type.fields:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
@@ -25,7 +24,7 @@ def write_action(action: AnyAction, message: Message) -> None:
     if isinstance(action, Transfer):
         message.action = OrderAction.TRANSFER
         message.object = action.object
-        message.position = action.to
+        message.position[:] = action.to
         message.turned = action.yaw is not None
         message.yaw = action.yaw or 0.0
         message.lift = action.lift
@@ -36,24 +35,24 @@ def write_action(action: AnyAction, message: Message) -> None:
             message.count = len(action.joints)
             message.joints[: message.count] = action.joints
             return
-        message.position = action.position
+        message.position[:] = action.position
         if action.quaternion is not None:
             message.goal = Goal.POSE
-            message.quaternion = action.quaternion
+            message.quaternion[:] = action.quaternion
         else:
             message.goal = Goal.DIRECTION
-            message.direction = action.direction or DOWN
+            message.direction[:] = action.direction or DOWN
     elif isinstance(action, Home):
         message.action = OrderAction.HOME
 
 
-def copy_action(source: Message, target: Message) -> None:
+def copy_action(source: CellAction, target: CellAction) -> None:
     """Copy the `CellAction` from one message to another."""
     for field in CellAction.message_type.fields:
         target.record[field.name] = source.record[field.name]
 
 
-def read_action(message: Message, context: LevelContext) -> AnyAction:
+def read_action(message: CellAction, context: LevelContext) -> AnyAction:
     """Return the action in the `CellAction` of a message. Raises `ProgramError`: it does not
     suit arm or scene."""
     try:
@@ -69,7 +68,7 @@ def read_action(message: Message, context: LevelContext) -> AnyAction:
     return action
 
 
-def _table(message: Message) -> dict[str, Any]:
+def _table(message: CellAction) -> dict[str, Any]:
     """Return the action, but for its `by`, as a table of a program."""
     place = message.position.tolist()
     match message.action, message.goal:

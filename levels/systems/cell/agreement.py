@@ -21,12 +21,16 @@ begin together, or not at all:
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
-from rack.backplane.message import Message
 from rack.levels.level import Reading
 from rack.levels.messages import Error
-from rack.levels.systems.cell.messages import OrderVerb, Phase, Response
+from rack.levels.systems.cell.messages import (
+    CellProgress,
+    CellReport,
+    OrderVerb,
+    Phase,
+    Response,
+)
 
 ATTEMPTS = 1000
 """Ids of orders for one step."""
@@ -41,7 +45,7 @@ VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLIN
 
 class Agreement:
     """Steps through a program with several arms. `program`: its checksum; `steps`: the arms of each
-    step. The arms' answers are their `CELL_REPORT`s."""
+    step. The arms' answers are their `CellReport`s."""
 
     def __init__(
         self, program: int, steps: Sequence[Collection[str]], margin_s: float, farewell_s: float
@@ -53,7 +57,7 @@ class Agreement:
         self._margin_s = margin_s
         self._farewell_s = farewell_s
         self._arms = list(dict.fromkeys(arm for step in steps for arm in step))
-        self._answers: Mapping[str, Reading[Any]] = {}  # as of this cycle
+        self._answers: Mapping[str, Reading[CellReport]] = {}  # as of this cycle
         self._now_s = 0.0  # likewise, simulated time
         self.phase = Phase.AWAITING
         self.step = 0
@@ -64,18 +68,18 @@ class Agreement:
         self.begun_s = 0.0
         self.ending_s = 0.0  # since when the arms are ended, simulated time; 0: not yet
 
-    def recall(self, last: Message) -> None:
-        """Continue from a `CELL_PROGRESS`."""
-        self.phase = Phase(last.phase)
+    def recall(self, last: CellProgress) -> None:
+        """Continue from a `CellProgress`."""
+        self.phase = last.phase
         self.step = last.step
         self.attempt = last.attempt
-        self.error = Error(last.error)
+        self.error = last.error
         self.reason = last.reason
         self.ending_s = last.ending
         self.begun_s = last.begun
 
-    def write_to(self, progress: Message) -> None:
-        """Fill a `CELL_PROGRESS`, but for the count of moves."""
+    def write_to(self, progress: CellProgress) -> None:
+        """Fill a `CellProgress`, but for the count of moves."""
         progress.phase = self.phase
         progress.step = self.step
         progress.attempt = self.attempt
@@ -102,7 +106,7 @@ class Agreement:
             return OrderVerb.END
         return VERBS[self.phase] if arm in self.partners else OrderVerb.NONE
 
-    def advance(self, answers: Mapping[str, Reading[Any]], now_s: float) -> None:
+    def advance(self, answers: Mapping[str, Reading[CellReport]], now_s: float) -> None:
         """Take one step forward, if the answers allow it; be over once every arm has confirmed the
         end, or had time to."""
         self._answers = answers
@@ -232,8 +236,8 @@ NOT_PROMISED = "told to do what it has not promised: its rack was launched anew"
 class TakenOrder:
     """One order at a time, by the checksum of its program and its id."""
 
-    def __init__(self, report: Message | None = None) -> None:
-        """Begin without an order, or with that of a `CELL_REPORT`, after a restart of the board."""
+    def __init__(self, report: CellReport | None = None) -> None:
+        """Begin without an order, or with that of a `CellReport`, after a restart of the board."""
         self.program = 0
         self.order = 0
         self.response = Response.NONE
@@ -244,9 +248,9 @@ class TakenOrder:
         if report is not None and report.echo:
             self.program = report.program
             self.order = report.echo
-            self.response = Response(report.response)
+            self.response = report.response
             if report.error:
-                self.error = Error(report.error)
+                self.error = report.error
                 self.reason = report.reason
 
     @property

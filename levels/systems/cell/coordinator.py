@@ -164,7 +164,7 @@ class Coordinator(Executor):
         self._steps = [step.actions for step in program.step]
         margin_s = 2.0 * context.period_s
         self._agreement = Agreement(program.checksum, self._steps, margin_s, self._table.farewell_s)
-        self._readings: Mapping[str, Reading[Any]] = {}  # of the arms' reports, in this cycle
+        self._readings: Mapping[str, Reading[CellReport]] = {}  # of the arms, in this cycle
         self._operated = Orders(self.commands)
         self._started = False
         self._moves = 0  # moves of the steps done
@@ -272,7 +272,7 @@ class Coordinator(Executor):
             reason = f"nothing has happened for {self._table.stalled_s:g} s: {awaited}"
             agreement.end(Error.STALLED, reason)
 
-    def _order(self, arm: str, held: str, order: Message) -> None:
+    def _order(self, arm: str, held: str, order: CellOrder) -> None:
         """Fill the order for one arm."""
         agreement = self._agreement
         what = agreement.verb(arm)
@@ -287,7 +287,7 @@ class Coordinator(Executor):
         order.hold = bool(held)
         order.reason = agreement.reason if what is OrderVerb.END else held
 
-    def _report(self, waits: str, status: Message) -> None:
+    def _report(self, waits: str, status: TaskStatus) -> None:
         agreement = self._agreement
         status.state = State.IDLE
         status.error = Error.NONE

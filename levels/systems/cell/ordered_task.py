@@ -15,7 +15,7 @@ from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.rack_name import RACK_NAME
 from rack.levels.errors import ProgramError, Refused
 from rack.levels.level import Input, LevelContext, MadePorts, Output, Reading
-from rack.levels.messages import Error, TaskPlan, WorldState
+from rack.levels.messages import Error, MoveStatus, TaskPlan, WorldState
 from rack.levels.peer import PeerPresence, peer_port
 from rack.levels.systems.cell.actions import copy_action, read_action
 from rack.levels.systems.cell.agreement import TakenOrder
@@ -108,17 +108,17 @@ class OrderedTaskExecutor(TaskExecutor):
         self._moves = last.moves_done, last.moves
         if not self.last_report.is_there:
             return
-        report: Message = self.last_report.message
+        report = self.last_report.message
         self.report.copy_from(report)
         self.request.copy_from(self.last_request.message)
         self._taken = TakenOrder(report)
-        self._halted = bool(report.halted)
+        self._halted = report.halted
         self._is_end_reported = self._taken.response is Response.ENDED
         if self._taken.is_under_way and report.moves:
             self._begun = self.request.id
             self._take_action(self.request)
 
-    def _plan_to_follow(self, tick: int) -> Message:
+    def _plan_to_follow(self, tick: int) -> TaskPlan:
         """Follow the orders; return the plan of the one under way."""
         self._listen(self.ports["order"])
         self._waits = ""
@@ -143,9 +143,9 @@ class OrderedTaskExecutor(TaskExecutor):
         self.report.operated = below.operated or self._orders.stands
         return plan if self._begun and self._begun == plan.id else self._nothing
 
-    def _listen(self, reading: Reading[Any]) -> None:
+    def _listen(self, reading: Reading[CellOrder]) -> None:
         """Take up what the coordinator says, or note why it says nothing."""
-        order: Message = reading.message
+        order = reading.message
         self._held = self._absent = ""
         if not reading.is_there:
             self._absent = f"no orders from {self._source} yet"
@@ -161,7 +161,7 @@ class OrderedTaskExecutor(TaskExecutor):
                 self._reason = self._taken.reason
             self._absent = ""
 
-    def _answer_order(self, request: Message, tick: int) -> None:
+    def _answer_order(self, request: CellRequest, tick: int) -> None:
         """Answer when the order is planned; have it planned as soon as the arm rests."""
         plan = self.plan.message
         taken = self._taken
@@ -169,7 +169,7 @@ class OrderedTaskExecutor(TaskExecutor):
             if plan.id == request.id and not plan.error:
                 taken.answer(Response.POSSIBLE)
             elif plan.id == request.id:
-                taken.fail(Error(plan.error), plan.reason)
+                taken.fail(plan.error, plan.reason)
             return
         self._waits = self._not_ready()
         if self._waits:
@@ -194,7 +194,7 @@ class OrderedTaskExecutor(TaskExecutor):
         planned_s = (self.context.within_cycles + 1) * self.context.period_s
         self._request(request, now_s + planned_s + self._table.decision)
 
-    def _request(self, request: Message, begin_s: float) -> None:
+    def _request(self, request: CellRequest, begin_s: float) -> None:
         """Have the action in `request` planned, to begin at `begin_s`."""
         request.id += 1
         request.begin = begin_s
@@ -213,7 +213,7 @@ class OrderedTaskExecutor(TaskExecutor):
                 return f"the clock of {self._source} has not been compared yet"
         return ""
 
-    def _begin(self, request: Message) -> None:
+    def _begin(self, request: CellRequest) -> None:
         """Begin with the plan that was promised; have it planned anew if the world has changed
         since."""
         if not self._actions:
@@ -230,11 +230,11 @@ class OrderedTaskExecutor(TaskExecutor):
             self._window.renumber(0)
             self._orders_begun += 1
 
-    def _take_action(self, request: Message) -> None:
+    def _take_action(self, request: CellRequest) -> None:
         self._actions = (read_action(request, self.context),)
         self._ahead_s = request.ahead
 
-    def _step_aside(self, plan: Message, below: Message) -> int:
+    def _step_aside(self, plan: TaskPlan, below: MoveStatus) -> int:
         """Interrupt the order for an operator, or break it off."""
         done = super()._step_aside(plan, below)
         self._halted = self._halted and not self._detour.move
@@ -250,17 +250,17 @@ class OrderedTaskExecutor(TaskExecutor):
                 self._halted = True
         return done
 
-    def _shown_until(self, plan: Message) -> int:
+    def _shown_until(self, plan: TaskPlan) -> int:
         until = super()._shown_until(plan)
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
-    def _reason_to_wait(self, below: Reading[Any]) -> str:
+    def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
         waits = super()._reason_to_wait(below)
         if self._orders.stands:
             return waits
         return self._absent or self._held or waits or self._waits
 
-    def _check_progress(self, plan: Message, waits: str, tick: int) -> None:
+    def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
         # While the coordinator holds the arm, it also says for how long.
         if self._held:
             self._moved_at = tick
@@ -270,7 +270,7 @@ class OrderedTaskExecutor(TaskExecutor):
     def _stage(self) -> tuple[int, ...]:
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
-    def _report(self, plan: Message, waits: str) -> None:
+    def _report(self, plan: TaskPlan, waits: str) -> None:
         report = self.report
         status = self.status
         echo = self.status.echo
@@ -302,7 +302,7 @@ class OrderedTaskExecutor(TaskExecutor):
         """Return a reason without the number: an order is one action."""
         return why.lstrip(",: ")
 
-    def _settle(self, plan: Message) -> None:
+    def _settle(self, plan: TaskPlan) -> None:
         """End the order that is done or has failed; what ends the run as well stays an error."""
         taken = self._taken
         if self._error and (taken.is_asked or taken.is_under_way):
@@ -316,13 +316,13 @@ class OrderedTaskExecutor(TaskExecutor):
             taken.answer(Response.DONE)
             self._orders_done += 1
 
-    def _answer(self, below: Message) -> None:
+    def _answer(self, below: MoveStatus) -> None:
         super()._answer(below)
         is_held = self._taken.is_under_way and (self._absent or self._held)
         if not self._detour.move and (self._halted or self._rests or is_held):
             self.command.hold = True
 
-    def _state(self, plan: Message) -> State:
+    def _state(self, plan: TaskPlan) -> State:
         if self._error:
             return State.ERROR
         if self._taken.response is Response.ENDED:
@@ -348,7 +348,7 @@ class OrderedTaskPlanner(TaskPlanner):
 
     def wanted(self, tick: int) -> bool:
         """Return whether a request is not answered yet, and the world is known and at rest."""
-        request: Message = self.request.message
+        request = self.request.message
         if request.id not in (0, self._id):
             # Whoever requests it has found that it suits the arm.
             action = read_action(request, self.context)

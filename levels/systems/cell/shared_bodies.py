@@ -90,7 +90,7 @@ class SharedBody:
             self.claim = Claim(min(self.claim.number + 1, MOST_CLAIMS), self.rack)
         self.is_touched = touches
 
-    def hear(self, message: Message) -> Array | None:
+    def hear(self, message: SharedBodies) -> Array | None:
         """Take what another rack says; return where the body is, (7,), m and quaternion; None:
         nothing new.
 
@@ -105,7 +105,7 @@ class SharedBody:
                 return np.concatenate((told["position"], told["quaternion"]))
         return None
 
-    def recall(self, message: Message) -> None:
+    def recall(self, message: SharedBodies) -> None:
         """Take over what this rack itself said last, after a restart of the board."""
         for told in message.bodies[message.bodies["name"] == self.name]:
             self.claim = Claim(int(told["claim"]), bytes(told["owner"]))

@@ -8,10 +8,9 @@ from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array, Mask, norm
 from rack.levels.level import Executor, LevelContext, Misfits
-from rack.levels.systems.force.messages import AXES
+from rack.levels.systems.force.messages import AXES, Compliance
 
 Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXIS_NAMES: tuple[Axis, ...] = get_args(Axis)
@@ -26,7 +25,7 @@ SAME = 1e-9
 
 
 class Wanted(NamedTuple):
-    """What a request asks of a contact; the last four (6,), by axis. See `SERVER_REQUEST`."""
+    """What a request asks of a contact; the last four (6,), by axis. See `ServerRequest`."""
 
     frame: Array  # (4,)
     selected: Mask
@@ -42,7 +41,7 @@ class Wanted(NamedTuple):
 
 
 class Contact:
-    """What is in force: the content of a server's `COMPLIANCE`."""
+    """What is in force: the content of a server's `Compliance`."""
 
     def __init__(self) -> None:
         self.id = 0  # rises with every change
@@ -105,14 +104,14 @@ class Contact:
         # q and -q are the same orientation.
         return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
-    def fill(self, compliance: Message) -> None:
-        """Fill a `COMPLIANCE`."""
+    def fill(self, compliance: Compliance) -> None:
+        """Fill a `Compliance`."""
         compliance.id = self.id
         compliance.active = self.complies or bool(self.guard.any())
         for name in Wanted._fields:
             setattr(compliance, name, getattr(self, name))
 
-    def recall(self, compliance: Message) -> None:
+    def recall(self, compliance: Compliance) -> None:
         """Continue from the last message of a level that was restarted."""
         self.id = compliance.id
         for name in Wanted._fields:

@@ -3,12 +3,10 @@ that servo joints."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.algebra import Array, Mask, norm
 from rack.levels.level import Input, Inputs, LevelContext, Output, Reading
 from rack.levels.operator import ABOVE_LOST
@@ -48,7 +46,7 @@ class ComplianceWatch:
         self.rests = False  # the motion must end
         self.reason = ""  # why, or why the force wanted is another; empty: all is as commanded
 
-    def recall(self, last: Reading[Any]) -> None:
+    def recall(self, last: Reading[ForceStatus]) -> None:
         """Continue after a restart from the last `ForceStatus`: a guard strikes once."""
         if last.is_there:
             self.struck = last.message.struck
@@ -85,7 +83,7 @@ class ComplianceWatch:
         self.rests = True
         self.reason = reason
 
-    def _blind(self, wrench: Reading[Any], tick: int) -> str:
+    def _blind(self, wrench: Reading[Wrench], tick: int) -> str:
         """Return why the contact is not known; empty: it is."""
         if not wrench.is_there or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"
@@ -93,7 +91,7 @@ class ComplianceWatch:
             return f"wrench is stale, {tick - self.sensed} ticks: waiting for the board of the arm"
         return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
 
-    def _take(self, compliance: Message, rotation: Array) -> None:
+    def _take(self, compliance: Compliance, rotation: Array) -> None:
         """Take over the axes of force; those forces are not sought while the motion must end."""
         selected = compliance.selected.astype(bool)
         if selected.any():
@@ -114,7 +112,7 @@ class ComplianceWatch:
                 self.reason = self.reason or text
         return wanted
 
-    def _guard(self, compliance: Message) -> None:
+    def _guard(self, compliance: Compliance) -> None:
         """End the motion once for a command whose guard is struck."""
         beyond: Mask = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
         if beyond.any() and self.struck != compliance.id:
@@ -126,7 +124,7 @@ class ComplianceWatch:
             )
 
 
-def objection(compliance: Message) -> str:
+def objection(compliance: Compliance) -> str:
     """Return why a command is impossible; empty: it is not."""
     numbers = np.concatenate(
         (compliance.frame, compliance.wrench, compliance.speed, compliance.guard)
@@ -228,7 +226,7 @@ class HybridExecutor(WristLevel):
         self._target = position.copy()
         self._reference.start(position, self._still, tick)
 
-    def _move(self, command: Message, tick: int, passed_s: float) -> None:
+    def _move(self, command: JointReference, tick: int, passed_s: float) -> None:
         """Write the reference of two cycles later."""
         watch = self._watch
         reference = self._reference
@@ -243,11 +241,11 @@ class HybridExecutor(WristLevel):
         if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
             self._begin(self._target, tick)
 
-    def _report(self, status: Message) -> None:
+    def _report(self, status: JointStatus) -> None:
         """Show the boards below as one, whose set points are those of this level."""
         values = [reading.message for reading in self.statuses.values()]
         status.position = values[0].position
-        status.torque = sum(v.torque for v in values)
+        status.torque[:] = sum(v.torque for v in values)
         status.driven = np.any([v.driven for v in values], axis=0)
         status.target = self._target
         status.target_velocity = self._moving

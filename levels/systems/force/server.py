@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.level import Input, LevelContext, Output
 from rack.levels.messages import Error
@@ -28,7 +27,7 @@ from rack.levels.systems.force.messages import (
 )
 from rack.levels.systems.trajectory import TrajectoryExecutor
 from rack.levels.systems.trajectory.boards import JointBoards
-from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
+from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import Agenda
 from rack.levels.systems.trajectory.work import MotionTools, RequestWork, TrajectoryParams
@@ -73,8 +72,8 @@ class ServerWork(RequestWork):
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         super().__init__(agenda, motion, tools)
         self.contact = Contact()
-        # ForceStatus that answers the contact in force; None: none does yet.
-        self.force: Message | None = None
+        # That answers the contact in force; None: none does yet.
+        self.force: ForceStatus | None = None
         self.guarded = 0  # newest request that a guard has ended
         self.axis = -1  # of that guard
         self._on_s = 0.0  # time for which all forces are as wanted
@@ -156,7 +155,7 @@ class ServerWork(RequestWork):
         self.boards.leave(why)
         self.interrupt()
 
-    def _misfit(self, request: Message) -> str:
+    def _misfit(self, request: MotionRequest) -> str:
         wanted = Wanted.of(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
@@ -166,7 +165,7 @@ class ServerWork(RequestWork):
             return reason or self.contact.objection(frame, wanted.guard)
         return super()._misfit(request)
 
-    def _start(self, request: Message) -> None:
+    def _start(self, request: MotionRequest) -> None:
         wanted = Wanted.of(request.record)
         if request.kind == MotionKind.GUARD:
             self.contact.watch(wanted.frame, wanted.guard)
@@ -181,14 +180,14 @@ class ServerWork(RequestWork):
         else:
             super()._start(request)
 
-    def _is_done(self, current: Message) -> bool:
+    def _is_done(self, current: MotionRequest) -> bool:
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
         return self.motion.settled and (
             not self.contact.complies or self.passed_s >= self._params.settle
         )
 
-    def _lasts_s(self, request: Message) -> float:
+    def _lasts_s(self, request: MotionRequest) -> float:
         if request.kind == MotionKind.COMPLY and self.contact.complies:
             return self._params.settle
         return super()._lasts_s(request)
@@ -253,7 +252,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             status = self.last_status.message
             self._work.guarded = status.guarded
             self._work.axis = status.axis
-            self._without = Mode(status.mode)
+            self._without = status.mode
             self._since = self._now
 
     def _follow_boards(self) -> None:
@@ -272,7 +271,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         )
         work.force = status if answers else None
         if answers and status.struck == work.contact.id and work.contact.guard.any():
-            work.strike(int(status.axis))
+            work.strike(status.axis)
         self._miss_client()
 
     def _miss_client(self) -> None:
@@ -307,7 +306,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
     def _passed_s(self, tick: int) -> float:
         return (self._now - tick) * self.context.tick_s
 
-    def _show(self, status: Message) -> None:
+    def _show(self, status: ServerStatus) -> None:
         """Fill what a server's status says beyond a trajectory level's."""
         work = self._work
         force = work.force

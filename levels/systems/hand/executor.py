@@ -4,11 +4,10 @@ them."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.algebra import Array
@@ -166,7 +165,7 @@ class HandExecutor(Executor):
             self._opened = True
             self.hand.pull(self.wanted_tensions.tension)
 
-    def _report(self, status: Message, sample: HandSample, tick: int) -> None:
+    def _report(self, status: HandStatus, sample: HandSample, tick: int) -> None:
         """Fill the status."""
         hand = self.hand
         status.tick = tick
@@ -249,7 +248,7 @@ class Tensions(CommandsAbove):
         self.tension = np.zeros((2, len(hand.most)))  # N
         self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
 
-    def join(self, tensions: Mapping[str, Reading[Any]]) -> None:
+    def join(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
         """Set `tension` and `rests_on`, while nothing is `missing`."""
         self.rests_on = 0
         for board in self.oldest:

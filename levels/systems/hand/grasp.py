@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
@@ -146,7 +146,7 @@ class GraspExecutor(Executor):
         if not waits and not self._failed.code and self._done < len(self._program.step):
             self._go_on()
         if waits or self._failed.code:
-            grasp.target.velocity = grasp.target.tip_velocity = 0.0
+            grasp.target.velocity[:] = grasp.target.tip_velocity[:] = 0.0
         grasp.target.id += 1
         grasp.target.operator = self._orders.basis
         self.command.copy_from(grasp.target)
@@ -249,7 +249,7 @@ class GraspExecutor(Executor):
             return step.model_copy(update={"points": points})
         after = self._program.step[index - 1] if isinstance(step, SqueezeStep) else None
         if isinstance(after, CloseStep):
-            return step.model_copy(update={"grip": float(plan.grip)})
+            return step.model_copy(update={"grip": plan.grip})
         if isinstance(step, PreshapeStep) and self._awaits_plan():
             self._grasp.postures[PLANNED] = plan.posture.copy()
             return step.model_copy(update={"posture": PLANNED})
@@ -281,7 +281,7 @@ class GraspExecutor(Executor):
         if status.state == State.ERROR:
             self._failed = Refused(status.error, status.reason)
 
-    def _report(self, status: Message, waits: str) -> None:
+    def _report(self, status: GraspStatus, waits: str) -> None:
         grasp = self._grasp
         steps = self._program.step
         status.echo = grasp.target.id

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array, Ints, Mask, norm
 from rack.levels.errors import Refused
 from rack.levels.level import LevelContext, Reading
@@ -30,7 +29,7 @@ from rack.levels.systems.hand.grasp_program import (
     SqueezeStep,
 )
 from rack.levels.systems.hand.grip import GripGains, HandGrip
-from rack.levels.systems.hand.messages import FingerMode
+from rack.levels.systems.hand.messages import FingerMode, FingerStatus, GraspTarget
 from rack.levels.tables import Positive, Table
 
 SLIPPED_PART = 0.2
@@ -38,7 +37,7 @@ SLIPPED_PART = 0.2
 
 
 class FingersBelow:
-    """Merges `FINGER_STATUS`es; each board fills what is its own. Points and forces are in the
+    """Merges `FingerStatus`es; each board fills what is its own. Points and forces are in the
     frame of the palm."""
 
     def __init__(self, context: LevelContext, fingers: Sequence[Ints]) -> None:
@@ -54,7 +53,7 @@ class FingersBelow:
         self.error = Error.NONE  # of the hand
         self.rests_on = 0  # newest command of an operator that all boards rest on
 
-    def look(self, statuses: Mapping[str, Reading[Any]]) -> None:
+    def look(self, statuses: Mapping[str, Reading[FingerStatus]]) -> None:
         """Read the statuses of all boards."""
         self.awaited = ""
         self.error = Error.NONE
@@ -101,7 +100,7 @@ class Grasp:
     postures: dict[str, Array]  # (joints,), rad, by name
     period_s: float
     fingers: FingersBelow
-    target: Message  # the `GRASP_TARGET` that the steps fill
+    target: GraspTarget  # that the steps fill
     grip: HandGrip
     touching: Mask  # (fingers,)
     close: CloseStep | None = None  # by which the object was, or is, gripped
@@ -172,8 +171,8 @@ class PreshapeWork(StepWork):
         target = grasp.target
         part, rate = self.progress(passed_s)
         way = self._posture - self._start
-        target.mode = FingerMode.JOINTS
-        target.force = 0.0
+        target.mode[:] = FingerMode.JOINTS
+        target.force[:] = 0.0
         target.position = self._start + part * way
         target.velocity = rate * way
         if part < 1.0:

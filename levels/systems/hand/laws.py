@@ -48,7 +48,6 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import Field
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array, Mask, gram, transposed_mat_vec
 from rack.levels.compiled import compiled_for
 from rack.levels.level import LevelContext
@@ -57,7 +56,7 @@ from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
 from rack.levels.robot.hand import Hand
 from rack.levels.servo.driver import numbers
 from rack.levels.systems.hand.kinematics import FingerKinematics
-from rack.levels.systems.hand.messages import FingerMode
+from rack.levels.systems.hand.messages import FingerMode, FingerTarget, GraspTarget, HandStatus
 from rack.levels.tables import NotNegative, Positive, Table
 
 HOMING = 0.02
@@ -107,8 +106,8 @@ class FingertipLaw:
             self._tips[finger] = self.kinematics.tip(finger)
         return self._tips
 
-    def targets(self, grasp: Message, ahead_s: float, out: Message) -> None:
-        """Fill a `FINGER_TARGET` from a `GRASP_TARGET`, taken on by `ahead_s` at its velocities;
+    def targets(self, grasp: GraspTarget, ahead_s: float, out: FingerTarget) -> None:
+        """Fill a `FingerTarget` from a `GraspTarget`, taken on by `ahead_s` at its velocities;
         after `sense`."""
         before = self.wanted.copy()
         points = grasp.tip + ahead_s * grasp.tip_velocity
@@ -178,10 +177,10 @@ class JointLaw:
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
     def torques(
-        self, hand: Message, target: Message, age_s: float, ahead_s: float, out: Array
+        self, hand: HandStatus, target: FingerTarget, age_s: float, ahead_s: float, out: Array
     ) -> None:
-        """Set `out`, (joints,), N m, for when the sample in a `HAND_STATUS` is `age_s` old; the
-        `FINGER_TARGET` is taken on by `ahead_s`."""
+        """Set `out`, (joints,), N m, for when the sample in a `HandStatus` is `age_s` old; the
+        `FingerTarget` is taken on by `ahead_s`."""
         terms = self._dynamics.terms(hand.position, self._still)
         is_cut = self._set(
             self._gains,
@@ -284,15 +283,15 @@ class TendonLaw:
         self._sampled = 0  # tick of the last sample
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
-    def start(self, status: Message) -> None:
-        """Begin with the tensions of a `HAND_STATUS`."""
+    def start(self, status: HandStatus) -> None:
+        """Begin with the tensions of a `HandStatus`."""
         self._valves[0] = status.wanted
         self._valves[1] = status.tension
         self._valves[2] = 0.0
         self._sampled = status.tick
 
-    def tensions(self, status: Message, torque: Array, out: Array) -> None:
-        """Set `out`, (2, joints), N, for `torque`, (joints,), N m, at a `HAND_STATUS`."""
+    def tensions(self, status: HandStatus, torque: Array, out: Array) -> None:
+        """Set `out`, (2, joints), N, for `torque`, (joints,), N m, at a `HandStatus`."""
         # Valves that are closed do not follow their commands: nothing is to be learned from them.
         elapsed = 0 if status.holding else status.tick - self._sampled
         self._sampled = status.tick

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.algebra import Mask
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Reading
 from rack.levels.operator import (
@@ -68,6 +67,8 @@ class HandLoop(Executor):
     operator: Reading[OperatorCommand]
     command: RelayedCommand
     status: LoopStatus | FingerStatus
+    followed: RelayedCommand
+    """The command that is followed."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -76,7 +77,7 @@ class HandLoop(Executor):
         self.hand_model: Hand = self.cell.hand
         self.orders = Orders(self.commands)
         command = self.inputs["above"].message
-        self.followed = command.zeros(context.sizes)  # that is followed
+        self.followed = command.zeros(context.sizes)
         # Names of its fields that must be finite.
         self._numbers = [field.name for field in command.message_type.fields if field.kind == "f8"]
         self.commanded = False  # there was one
@@ -104,17 +105,17 @@ class HandLoop(Executor):
                 yield place, [], "it needs a board there"
 
     @abstractmethod
-    def meet(self, hand: Message) -> None:
+    def meet(self, hand: HandStatus) -> None:
         """Begin with the first `HandStatus`, or continue from the level's own last messages."""
 
     @abstractmethod
-    def follow(self, hand: Message, tick: int) -> None:
+    def follow(self, hand: HandStatus, tick: int) -> None:
         """Write the level's command for `self.followed`, and what its status says of fingers or
         joints."""
 
     def process(self, tick: int) -> None:
         """Follow the newest command, and report."""
-        hand: Reading[Any] = self.hand
+        hand = self.hand
         self.orders.take(self.operator)
         if not self._met:
             if not hand.is_there:
@@ -135,7 +136,7 @@ class HandLoop(Executor):
         self._report(self.status, kept)
         self.orders.report(self.status, self.followed.operator)
 
-    def age_s(self, hand: Message, tick: int) -> float:
+    def age_s(self, hand: HandStatus, tick: int) -> float:
         """Return how old the sample of a `HandStatus` is when what this cycle commands acts, s."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
@@ -146,7 +147,7 @@ class HandLoop(Executor):
         the level above."""
         return min(tick - self._taken, self._period) * self.context.tick_s
 
-    def _take(self, command: Reading[Any], tick: int) -> None:
+    def _take(self, command: Reading[RelayedCommand], tick: int) -> None:
         """Follow what is new, unless an operator holds the loop."""
         released = self._held
         self._held = self.orders.holds
@@ -181,10 +182,10 @@ class HandLoop(Executor):
             if below.is_lost or not below.is_there:
                 return BELOW_LOST
             if below.message.stopped:
-                return str(below.message.reason)
+                return below.message.reason
         return self.orders.keeps(self.context.board)
 
-    def _report(self, status: Message, kept: str) -> None:
+    def _report(self, status: LoopStatus | FingerStatus, kept: str) -> None:
         """Fill the status."""
         hand = self.hand.message
         lost = self.commanded and self.above.is_lost
@@ -219,6 +220,7 @@ class FingertipLoop(HandLoop):
     last = Input(FingerTarget, "own.command")
     command = Output(FingerTarget, rests_on=above)
     status = Output(FingerStatus)
+    followed: GraspTarget
     params = FingertipGains
 
     def __init__(self, context: LevelContext) -> None:
@@ -228,13 +230,13 @@ class FingertipLoop(HandLoop):
         gains = read_params(FingertipGains, context.params)
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
-    def meet(self, hand: Message) -> None:
+    def meet(self, hand: HandStatus) -> None:
         """Begin where the joints are, or with the last targets."""
         last = self.last.message
         begin = last if self.last.is_there and last.active else hand
         self._law.start(begin.position)
 
-    def follow(self, hand: Message, tick: int) -> None:
+    def follow(self, hand: HandStatus, tick: int) -> None:
         """Write the targets of the joints."""
         follow_grasp(self, self._law, hand, self.command, self.status, tick)
 
@@ -252,6 +254,7 @@ class JointLoop(HandLoop):
     operator = Input(OperatorCommand, "own.operator")
     command = Output(TendonTorque, rests_on=above)
     status = Output(LoopStatus)
+    followed: FingerTarget
     params = JointGains
     preloads = (dynamics, laws)
 
@@ -260,12 +263,12 @@ class JointLoop(HandLoop):
         self.driven = np.full(len(context.robot.joints), True)
         self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
 
-    def meet(self, hand: Message) -> None:
+    def meet(self, hand: HandStatus) -> None:
         """Hold the joints where they are, until there are targets."""
         self.followed.position = hand.position
-        self.followed.stiff = 1.0
+        self.followed.stiff[:] = 1.0
 
-    def follow(self, hand: Message, tick: int) -> None:
+    def follow(self, hand: HandStatus, tick: int) -> None:
         """Write the torques for the newest targets."""
         self._law.torques(
             hand, self.followed, self.age_s(hand, tick), self.ahead_s(tick), self.command.torque
@@ -286,6 +289,7 @@ class TendonLoop(HandLoop):
     operator = Input(OperatorCommand, "own.operator")
     command = Output(TensionCommand, rests_on=above)
     status = Output(LoopStatus)
+    followed: TendonTorque
     params = TendonGains
     preloads = (laws,)
 
@@ -295,11 +299,11 @@ class TendonLoop(HandLoop):
         gains = read_params(TendonGains, context.params)
         self._law = TendonLaw(self.hand_model, self.driven, gains, context)
 
-    def meet(self, hand: Message) -> None:
+    def meet(self, hand: HandStatus) -> None:
         """Begin with the tensions that are there."""
         self._law.start(hand)
 
-    def follow(self, hand: Message, tick: int) -> None:
+    def follow(self, hand: HandStatus, tick: int) -> None:
         """Write the tensions for the newest torques."""
         command = self.command
         command.driven = self.driven
@@ -329,6 +333,7 @@ class FingerExecutor(HandLoop):
     operator = Input(OperatorCommand, "own.operator")
     command = Output(TensionCommand, rests_on=above)
     status = Output(FingerStatus)
+    followed: GraspTarget
     params = FingerParams
     preloads = (dynamics, laws)
 
@@ -359,14 +364,14 @@ class FingerExecutor(HandLoop):
         if hand is not None and name not in (names := [finger.name for finger in hand.finger]):
             yield "params.finger", name, f"the hand has no such finger; fingers: {', '.join(names)}"
 
-    def meet(self, hand: Message) -> None:
+    def meet(self, hand: HandStatus) -> None:
         """Hold the joints where they are."""
         self._tip.start(hand.position)
         self._tendons.start(hand)
         self._target.position = hand.position
-        self._target.stiff = 1.0
+        self._target.stiff[:] = 1.0
 
-    def follow(self, hand: Message, tick: int) -> None:
+    def follow(self, hand: HandStatus, tick: int) -> None:
         """Write the tensions of the finger's tendons."""
         follow_grasp(self, self._tip, hand, self._target, self.status, tick)
         self._servo.torques(hand, self._target, self.age_s(hand, tick), 0.0, self._torque)
@@ -376,7 +381,12 @@ class FingerExecutor(HandLoop):
 
 
 def follow_grasp(
-    loop: HandLoop, law: FingertipLaw, hand: Message, target: Message, status: Message, tick: int
+    loop: FingertipLoop | FingerExecutor,
+    law: FingertipLaw,
+    hand: HandStatus,
+    target: FingerTarget,
+    status: FingerStatus,
+    tick: int,
 ) -> None:
     """Fill a `FingerTarget` for the `GraspTarget` that a loop follows, and the
     `FingerStatus`."""

@@ -23,7 +23,6 @@ import mujoco
 import numpy as np
 from pydantic import Field
 
-from rack.backplane.message import Message
 from rack.backplane.words import Block
 from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
@@ -247,7 +246,7 @@ class Workstation(HostProgram):
         status = bus.read("grasp")
         if not (world.is_there and status.is_there) or status.message.kind > GraspKind.PRESHAPE:
             return self._planned
-        model: Message = world.message
+        model: WorldState = world.message
         position = model.position[self._row]
         if norm(position - self._at) < MOVED_M:
             return self._planned

@@ -4,11 +4,10 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.arm.above import CommandsAbove
@@ -52,7 +51,7 @@ class JointTorques(CommandsAbove):
         """The mass in the gripper, as the boards know it."""
         return Payload(float(self._sum[-4]), self._sum[-3:])
 
-    def add_up(self, commands: Mapping[str, Reading[Any]]) -> None:
+    def add_up(self, commands: Mapping[str, Reading[JointTorque]]) -> None:
         """Set `torque`, `wanted`, `grip_force` and `payload`, while nothing is `missing`."""
         self.rests_on = 0
         self._sum[:] = 0.0
@@ -95,7 +94,7 @@ class ArmExecutor(ArmDriver):
         self._rest_by: int | None = None
         # Tick of the first status that said so; None: not braked, or not yet said.
         self._braked_at: int | None = None
-        self._torques: Mapping[str, Reading[Any]] = {}
+        self._torques: Mapping[str, Reading[JointTorque]] = {}
         self._waiting = ""  # why the boards above do not drive the arm
 
     @classmethod
@@ -132,7 +131,7 @@ class ArmExecutor(ArmDriver):
         self._torques = self.joint_torques
         self.orders.take(self.operator, self._judge)
 
-    def _judge(self, command: Message) -> None:
+    def _judge(self, command: OperatorCommand) -> None:
         """Obey what leaves the command in force as it is, or refuse it."""
         if command.what in DRIVES and (why := self.obey(command)):
             self.orders.refuse(why)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from pydantic import Field
 
@@ -83,13 +83,13 @@ class JointGateway(Executor):
         self._up.append((tick + self._delay, bytes(self._merged.raw)))
         take_arrived(self._up, self.status, tick)
 
-    def _take(self, command: Reading[Any], tick: int) -> None:
+    def _take(self, command: Reading[JointReference], tick: int) -> None:
         """Put what is new on the link; take what has passed it."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.message.raw)))
         take_arrived(self._down, self._newest, tick)
 
-    def _extrapolate(self, command: Message) -> None:
+    def _extrapolate(self, command: JointReference) -> None:
         """Make up the reference after the last one given, or give up."""
         newest = self._newest
         ahead = self._due + self._period - self.latency - newest.due  # ticks
@@ -105,7 +105,7 @@ class JointGateway(Executor):
         command.velocity[:] = newest.velocity
         command.acceleration[:] = 0.0
 
-    def _merge(self, statuses: Mapping[str, Reading[Any]]) -> None:
+    def _merge(self, statuses: Mapping[str, Reading[JointStatus]]) -> None:
         merged = self._merged
         values = [reading.message for reading in statuses.values()]
         merged.position[:] = values[0].position
@@ -184,11 +184,10 @@ class NetworkGateway(JointGateway):
         self._arrived = JointReference.zeros(context.sizes)
         self._refused = ""  # why the newest reference was not taken
         self._their_s = 0.0  # simulated time there less that here
-        self._program: Message
 
     def process(self, tick: int) -> None:
         """Hand references down, and statuses up."""
-        peer: Message = self.peer.message
+        peer = self.peer.message
         self._follow(peer.ahead)
         super().process(tick)
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
@@ -199,7 +198,7 @@ class NetworkGateway(JointGateway):
         elif self._refused:
             self.status.state = State.HOLDING
             self.status.reason = self._refused
-        program: Message = self.task.message
+        program = self.task.message
         if program.state in (State.DONE, State.ERROR):
             self.status.state = program.state
             self.status.error = program.error
@@ -215,7 +214,7 @@ class NetworkGateway(JointGateway):
             step_s = self.context.tick_s / STATUS_CYCLES
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
-    def _take(self, command: Reading[Any], tick: int) -> None:
+    def _take(self, command: Reading[JointReference], tick: int) -> None:
         """Hand on what is new when the boards below need it, at ticks of this rack."""
         if command.is_new:
             arrived = self._arrived

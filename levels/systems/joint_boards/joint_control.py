@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload
+from rack.levels.systems.joint_boards.messages import JointReference
 
 MOVED_RAD = 0.01
 """Distance of a joint from where the loads were computed at which they are computed again; and
@@ -42,8 +42,8 @@ class JointLoads:
         # (joints,), rad; NaN: they are those of a reference.
         self._computed_at = np.full(joints, np.nan)
 
-    def misfit(self, command: Message) -> str:
-        """Return the field of a `JOINT_REFERENCE` that asks for more than the arm can do; empty:
+    def misfit(self, command: JointReference) -> str:
+        """Return the field of a `JointReference` that asks for more than the arm can do; empty:
         none does."""
         # Written so that NaN is too much.
         within = {
@@ -54,7 +54,7 @@ class JointLoads:
         }
         return next((name for name, fits in within.items() if not np.all(fits)), "")
 
-    def _can_hold(self, command: Message) -> bool:
+    def _can_hold(self, command: JointReference) -> bool:
         """Return whether the motors hold the arm at home with the payload of a reference."""
         mass = command.payload_mass
         offset = command.payload_offset
@@ -63,8 +63,8 @@ class JointLoads:
         bias = self._dynamics.terms(self._home, self._still, Payload(mass, offset)).bias
         return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
 
-    def take(self, command: Message, tick: int) -> None:
-        """Go over to those of a `JOINT_REFERENCE` that fits, until it is due."""
+    def take(self, command: JointReference, tick: int) -> None:
+        """Go over to those of a `JointReference` that fits, until it is due."""
         self.table[AT] += self.part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
         self._begin = tick

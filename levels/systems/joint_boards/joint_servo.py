@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Output
 from rack.levels.messages import Error
@@ -98,7 +98,7 @@ class JointServo(Executor):
         self._oldest = below + cell.patience.ticks(below, context.tick_s)
         self._sample: Array  # numbers of a status of the arm
         self._shown_numbers: tuple[Array, ...] = ()  # of the messages to write
-        self._offered: Message | None = None  # reference whose loads are not yet taken
+        self._offered: JointReference | None = None  # reference whose loads are not yet taken
         self._command = self._rests_on = self._due = 0
         self._refused = ""  # why the newest reference was not taken
         self._met = False  # a status of the arm has come
@@ -132,7 +132,7 @@ class JointServo(Executor):
 
     def process(self, tick: int) -> None:
         """Interpolate, and compute the torques that act from the next cycle on."""
-        arm: Message = self.below.message
+        arm = self.below.message
         if not self._met and not self._meet(self.below.is_there, arm):
             return
         self._take_messages()
@@ -141,7 +141,7 @@ class JointServo(Executor):
         reference = self.reference
         operator = self.operator_control
         away = self.below.is_lost or tick - sampled > self._oldest
-        stopped = away or bool(arm.stopped)
+        stopped = away or arm.stopped
         if away or (stopped and arm.braked):
             reference.start(arm.position, arm.velocity, tick)
             self._modified.interrupt()
@@ -172,7 +172,7 @@ class JointServo(Executor):
         self._report(self.status, arm, away, stopped)
         operator.orders.report(self.status, self._rests_on)
 
-    def _obey(self, command: Message) -> str:
+    def _obey(self, command: OperatorCommand) -> str:
         """Modify the law, or set a live parameter; return why not, empty: it is done."""
         if command.what == Operation.MODIFY:
             return self._modified.switch(command.name, command.goal == Goal.ON)
@@ -199,7 +199,7 @@ class JointServo(Executor):
         np.copyto(given[:joints], modified, where=self._driven)
         np.copyto(shown[3 * joints :], modified, where=self._driven)
 
-    def _meet(self, is_there: bool, arm: Message) -> bool:
+    def _meet(self, is_there: bool, arm: ArmStatus) -> bool:
         """Begin with the first status of the arm; return whether there is one."""
         status = self.status
         torque = self.command
@@ -224,7 +224,7 @@ class JointServo(Executor):
         if self.operator.is_new:
             self.operator_control.take(self.operator, self.below.message.position)
         if self.above.is_new:
-            command: Message = self.above.message
+            command = self.above.message
             self._command = command.id
             self._rests_on = command.operator
             self._refused = ""
@@ -240,7 +240,7 @@ class JointServo(Executor):
                 self.command.payload_mass = command.payload_mass
                 self.command.payload_offset = command.payload_offset
 
-    def _report(self, status: Message, arm: Message, away: bool, stopped: bool) -> None:
+    def _report(self, status: JointStatus, arm: ArmStatus, away: bool, stopped: bool) -> None:
         """Fill what the law has not set in the status."""
         operator = self.operator_control
         holding = self.reference.holding

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints
 
-from rack.backplane.message import Command, Message, State, Status, field
+from rack.backplane.message import Command, State, Status, field
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Output
 from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand, Orders
 from rack.levels.systems.joint_boards.joint_servo import JointServo
@@ -99,7 +99,7 @@ class ModificationSender(Executor):
             status.state = State.HOLDING
         self._orders.report(status)
 
-    def _obey(self, command: Message) -> None:
+    def _obey(self, command: OperatorCommand) -> None:
         if command.name not in self._known:
             self._orders.refuse(
                 f"no modification '{command.name}'; permitted: {', '.join(self._known)}"

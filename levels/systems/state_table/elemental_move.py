@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import field
 from rack.levels.algebra import Array, norm
 from rack.levels.level import Input, Inputs, LevelContext, Output
 from rack.levels.messages import WorldState
@@ -111,8 +111,8 @@ class MoveTable(StateTableExecutor):
         },
         plan=MovePlanConfig,
     )
-    _below: Message
-    _world: Message
+    _below: JointMoveStatus
+    _world: WorldState
     """As of this cycle."""
 
     def __init__(self, context: LevelContext) -> None:
@@ -139,7 +139,7 @@ class MoveTable(StateTableExecutor):
             last = self.last_status.message
             self._command.copy_from(self.last_command.message)
             self._command.id = last.sent
-            self._reached = bool(last.reached)
+            self._reached = last.reached
             self._put = last.put
 
     def look(self, tick: int) -> dict[str, str]:
@@ -159,7 +159,7 @@ class MoveTable(StateTableExecutor):
             "world": ("unseen", "seen")[is_seen],
             "target": target,
             "support": ("there", "elsewhere")[is_elsewhere],
-            "gripper": ("free", "holds")[self._below.held > 0],
+            "gripper": ("free", "holds")[self._below.held],
             "reach": YES_NO[self._reached],
         }
 

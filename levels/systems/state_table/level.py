@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field as Key
 
-from rack.backplane.message import Message, State, field
+from rack.backplane.message import State, field
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
@@ -305,7 +305,7 @@ class StateTableExecutor(Executor):
         orders.take(self.operator, self._judge)
         self._kept = ""
         self._rests_on = orders.rests_on(0)
-        above: Reading[Any] | None = None
+        above: Reading[TableCommand] | None = None
         if "above" in self.inputs:
             above = next(iter(self.above.values()), None)
         if above is not None:
@@ -315,9 +315,9 @@ class StateTableExecutor(Executor):
         if orders.holds:
             self._kept = orders.keeps(self.context.board)
 
-    def _hear(self, above: Reading[Any]) -> None:
+    def _hear(self, above: Reading[TableCommand]) -> None:
         """Take up what the level above commands, unless an operator commands instead."""
-        command: Message = above.message
+        command = above.message
         self._rests_on = self.orders.rests_on(command.operator)
         if self.orders.standing is Operation.DO:
             return
@@ -336,7 +336,7 @@ class StateTableExecutor(Executor):
         lexicon = self.lexicon(self.context.scene, self.table.plan)
         return objection(words, self.vocabulary.commands, lexicon)
 
-    def _judge(self, order: Message) -> None:
+    def _judge(self, order: OperatorCommand) -> None:
         """Take up an operator's command for this kind of level."""
         if order.what == Operation.TABLE:
             if order.name not in self.tables:
@@ -351,7 +351,7 @@ class StateTableExecutor(Executor):
 
     def _report(self, number: int, row: RowConfig) -> None:
         """Fill the fields of `TableStatus`, and the operator's in the command."""
-        shown: Message = self.status
+        shown = self.status
         orders = self.orders
         state = STATES[row.status]
         reason = row.reason
@@ -391,7 +391,7 @@ class StateTableExecutor(Executor):
         orders.report(shown, self._rests_on)
 
 
-def answer_of(reading: Reading[Any], serial: int) -> str:
+def answer_of(reading: Reading[TableStatus], serial: int) -> str:
     """Return the value of `BELOW` for a status and the serial of the newest command sent down."""
     if reading.is_lost:
         return "lost"

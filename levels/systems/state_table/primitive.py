@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import field
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.level import Input, Inputs, LevelContext, Output
@@ -135,8 +135,8 @@ class PrimitiveTable(StateTableExecutor):
         super().recall()
         if self.last_status.is_there:
             last = self.last_status.message
-            self._closed = bool(last.closed)
-            self._held = bool(last.held)
+            self._closed = last.closed
+            self._held = last.held
             self._object = last.object
             self._point[0] = last.position
             self._end[:] = last.end
@@ -171,7 +171,7 @@ class PrimitiveTable(StateTableExecutor):
     def _follow(self) -> Array:
         """Find out whether the boards below follow; return the joint positions, rad."""
         readings = list(self.statuses.values())
-        statuses: list[Message] = [reading.message for reading in readings]
+        statuses = [reading.message for reading in readings]
         position: Array = statuses[0].position
         gone = any(reading.is_lost or not reading.is_there for reading in readings)
         stopped = gone or any(below.stopped for below in statuses)
@@ -190,7 +190,7 @@ class PrimitiveTable(StateTableExecutor):
             self._follows += 1
         return position
 
-    def _grip(self, arm: Message) -> str:
+    def _grip(self, arm: ArmStatus) -> str:
         """Return the value of the condition `gripper`."""
         self._grips = max(0, self._grips - 1)
         if self._grips or abs(arm.opening_velocity) > GRIP_STILL_M_S:

@@ -59,7 +59,7 @@ class TaskTable(StateTableExecutor):
     """Sends the commands of its steps to the level below, one after the other, as its table
     says."""
 
-    above = None
+    above = None  # type: ignore[assignment]  # drops the port: nothing commands it
     below = Input(MoveTableStatus, "below.status")
     last_command = Input(TableCommand, "own.command")
     last_status = Input(TaskTableStatus, "own.status")
@@ -128,7 +128,7 @@ class TaskTable(StateTableExecutor):
     def look(self, tick: int) -> dict[str, str]:
         """Return where the level below is, and whether a step is left."""
         self.detail = self.below.message.reason
-        self.resting = bool(self.below.message.resting)
+        self.resting = self.below.message.resting
         is_left = self._step < len(self.table.plan.step)
         return {
             "below": answer_of(self.below, self._command.id),

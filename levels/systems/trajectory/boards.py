@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.level import Reading
+from rack.levels.systems.joint_boards.messages import JointStatus
 
 HANDOVER_CYCLES = 4
 """Cycles from the first set point until the boards' statuses must show that they follow."""
@@ -40,7 +40,7 @@ class JointBoards:
         self._silent: dict[str, int] = {}  # consecutive cycles without a new status, by board
         self.awaited = "no board servoes a joint"  # what a level out of step waits for
 
-    def update(self, statuses: Mapping[str, Reading[Any]]) -> bool:
+    def update(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
         """Read all statuses; return True in the cycle in which the boards get into step."""
         self._cycles += 1
         for board, reading in statuses.items():
@@ -61,7 +61,7 @@ class JointBoards:
         self.in_step = False
         self.awaited = why
 
-    def _kept(self, statuses: Mapping[str, Reading[Any]]) -> str:
+    def _kept(self, statuses: Mapping[str, Reading[JointStatus]]) -> str:
         """Return the board that does not follow, and why; empty: all do, or could."""
         for board, reading in statuses.items():
             status = reading.message
@@ -74,7 +74,7 @@ class JointBoards:
                 return f"{board}: it holds"
         return ""
 
-    def _hold(self, statuses: Mapping[str, Reading[Any]]) -> bool:
+    def _hold(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
         """Return whether all boards hold all joints at rest; take over where."""
         driven = np.zeros(len(self._joints), dtype=bool)
         for board, reading in statuses.items():

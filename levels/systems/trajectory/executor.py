@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Output, Reading
 from rack.levels.messages import WorldState
@@ -157,7 +157,7 @@ class TrajectoryExecutor(Executor):
     def _due(self, tick: int) -> int:
         return tick + LEAD_CYCLES * self.context.every
 
-    def _write_reference(self, command: Message, tick: int) -> None:
+    def _write_reference(self, command: JointReference, tick: int) -> None:
         state = self._motion.state
         command.id = tick // self.context.every + 1
         # Out of step the arm's position is not certain: no set point is better than a wrong one.
@@ -169,7 +169,7 @@ class TrajectoryExecutor(Executor):
         command.opening, command.force = self._work.grip
         command.operator = self._orders.rests_on(self._agenda.rests_on)
 
-    def _write_status(self, status: Message) -> None:
+    def _write_status(self, status: MotionStatus) -> None:
         agenda = self._agenda
         motion = self._motion
         goal = self._work.goal
@@ -235,10 +235,10 @@ class TouchGuard:
         """Forget the torques so far."""
         self._past.clear()
 
-    def is_struck(self, boards: Mapping[str, Reading[Any]], most: float) -> bool:
+    def is_struck(self, boards: Mapping[str, Reading[JointStatus]], most: float) -> bool:
         """Return whether the torque of a joint has changed by more than `most`, N m."""
         if all(board.is_new and not board.message.holding for board in boards.values()):
-            self._past.append(sum(board.message.torque for board in boards.values()))
+            self._past.append(np.sum([board.message.torque for board in boards.values()], axis=0))
         else:
             self.begin_anew()
         past = np.array(self._past)

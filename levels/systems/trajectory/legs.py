@@ -16,17 +16,18 @@ arm cannot. The smoothed frame catches up with a body of constant velocity compl
 from __future__ import annotations
 
 from math import ceil
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array, norm
 from rack.levels.level import Reading
+from rack.levels.messages import WorldState
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, pose
 from rack.levels.robot.limits import Limits
+from rack.levels.systems.trajectory.messages import MotionRequest
 
 BLEND_PART = 0.5
 """Part of the acceleration limits that one leg takes: two blended ones take all."""
@@ -53,9 +54,9 @@ class WorldSight:
         self._bodies = bodies
         self._blind_s = blind_s
         self._tick_s = tick_s
-        self._model: Message | None = None
+        self._model: WorldState | None = None
 
-    def look(self, world: Reading[Any]) -> None:
+    def look(self, world: Reading[WorldState]) -> None:
         """Take over the newest model."""
         if world.is_there and world.message.revision:
             self._model = world.message
@@ -89,11 +90,11 @@ class WorldSight:
 class ToolGoal:
     """The goal of one request."""
 
-    def __init__(self, request: Message, sight: WorldSight, follow_s: float) -> None:
+    def __init__(self, request: MotionRequest, sight: WorldSight, follow_s: float) -> None:
         """Follow a live goal with the time constant `follow_s`."""
         self._goal = pose(request.position, request.quaternion)  # in the frame of the body
         self._body = request.body  # row in the world model; -1: the world
-        self.live = request.live > 0 and request.body >= 0
+        self.live = request.live and request.body >= 0
         self._sight = sight
         self._follow_s = follow_s
         self._stamp_s = -1.0  # of the sample for which `pose` was evaluated

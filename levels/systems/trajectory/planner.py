@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from rack.backplane.message import Message, State
+from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.level import (
     Executor,
@@ -287,7 +287,7 @@ class RequestPlanner(Planner):
         begun_s = (tick - self._begun_at) * self.context.tick_s
         return self._begun >= sent and begun_s >= step.after
 
-    def _fill(self, request: Message, k: int, world: Message) -> None:
+    def _fill(self, request: MotionRequest, k: int, world: WorldState) -> None:
         """Make a request of step k."""
         step = self._steps[k]
         self._goals[k] = self._goal(k, world)
@@ -322,7 +322,7 @@ class RequestPlanner(Planner):
         else:
             request.kind = MotionKind.CANCEL
 
-    def _goal_before(self, k: int, world: Message) -> Array:
+    def _goal_before(self, k: int, world: WorldState) -> Array:
         """Return joint positions at the end of the step before step k, planning it if need be, as
         after a restart."""
         if k == 0:
@@ -331,7 +331,7 @@ class RequestPlanner(Planner):
             self._goals[k - 1] = self._goal(k - 1, world)
         return self._goals[k - 1]
 
-    def _goal(self, k: int, world: Message) -> Array:
+    def _goal(self, k: int, world: WorldState) -> Array:
         """Return joint positions at the end of step k; those before it where there are none."""
         step = self._steps[k]
         before = self._goal_before(k, world)

@@ -7,11 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Message, copied
+from rack.backplane.message import copied
 from rack.levels.algebra import Array
 from rack.levels.level import Reading
 from rack.levels.messages import Error
-from rack.levels.systems.trajectory.messages import ENDED, HELD, MotionKind, RequestEnd
+from rack.levels.systems.trajectory.messages import (
+    ENDED,
+    HELD,
+    MotionKind,
+    MotionRequest,
+    MotionState,
+    MotionStatus,
+    RequestEnd,
+)
 
 MOTIONS = (MotionKind.JOINTS, MotionKind.POSE)
 """Kinds that may be blended into each other."""
@@ -19,14 +27,14 @@ KINDS = range(MotionKind.JOINTS, MotionKind.GRIP + 1)
 """Kinds that any trajectory level can do."""
 
 
-def copy_request(record: Any) -> Message:
+def copy_request(record: Any) -> MotionRequest:
     """Return a copy of the record of a request."""
-    request = Message(record.dtype)
+    request = MotionRequest(record.dtype)
     request.record[...] = record
     return request
 
 
-def misfit_of(request: Message, ranges: Array) -> str:
+def misfit_of(request: MotionRequest, ranges: Array) -> str:
     """Return why no arm whose joints have `ranges`, (joints, 2), rad, could do a request; empty: it
     may be possible."""
     if request.kind not in KINDS:
@@ -63,9 +71,9 @@ class Agenda:
     """
 
     def __init__(self) -> None:
-        self.held: list[Message] = []
+        self.held: list[MotionRequest] = []
         self.begun = False  # the first of them is under way
-        self.goal: Message | None = None  # at whose goal the arm is, or to which it goes
+        self.goal: MotionRequest | None = None  # at whose goal the arm is, or to which it goes
         self.taken = 0  # newest id taken
         self.rests_on = 0  # newest command of an operator on which a request taken rests
         self.error = Error.NONE
@@ -75,12 +83,12 @@ class Agenda:
         self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
 
     @property
-    def current(self) -> Message | None:
+    def current(self) -> MotionRequest | None:
         """The request under way."""
         return self.held[0] if self.begun else None
 
     @property
-    def next(self) -> Message | None:
+    def next(self) -> MotionRequest | None:
         """The request after that, or the first one."""
         at = int(self.begun)
         return self.held[at] if len(self.held) > at else None
@@ -95,7 +103,7 @@ class Agenda:
         """Requests that may be taken now."""
         return HELD - len(self.held)
 
-    def take(self, requests: Reading[Any]) -> bool:
+    def take(self, requests: Reading[MotionRequest]) -> bool:
         """Take what is new; return whether the arm must stop: a CANCEL came."""
         cancelled = False
         if requests.is_new:
@@ -103,7 +111,7 @@ class Agenda:
                 cancelled |= self._take(copied(message))
         return cancelled
 
-    def _take(self, request: Message) -> bool:
+    def _take(self, request: MotionRequest) -> bool:
         # One sent again, by a planning level that was restarted or that misses it in the status, is
         # not a new one.
         if request.id <= self.taken:
@@ -128,7 +136,7 @@ class Agenda:
             self.held.append(request)
         return False
 
-    def begin(self) -> Message:
+    def begin(self) -> MotionRequest:
         """Begin the next request; the one under way is done."""
         if self.begun:
             self.end(RequestEnd.DONE)
@@ -159,11 +167,11 @@ class Agenda:
         self.held = []
         self.begun = False
 
-    def _end(self, request: Message, how: RequestEnd) -> None:
+    def _end(self, request: MotionRequest, how: RequestEnd) -> None:
         self._ended.appendleft((request.id, how))
 
-    def report(self, status: Message) -> None:
-        """Fill the ids, the ends and the error of a `MOTION_STATUS`."""
+    def report(self, status: MotionStatus) -> None:
+        """Fill the ids, the ends and the error of a `MotionStatus`."""
         current = self.current
         status.taken = self.taken
         status.current = current.id if current is not None else 0
@@ -171,8 +179,8 @@ class Agenda:
         for k, ended in enumerate(self._ended):
             status.ended[k], status.ends[k] = ended
 
-    def save(self, state: Message) -> None:
-        """Fill a `MOTION_STATE`."""
+    def save(self, state: MotionState) -> None:
+        """Fill a `MotionState`."""
         state.begun = self.begun
         state.count = len(self.held)
         for k, request in enumerate(self.held):
@@ -182,10 +190,10 @@ class Agenda:
         else:
             state.goal["id"] = 0
 
-    def recall(self, state: Message, status: Message) -> None:
+    def recall(self, state: MotionState, status: MotionStatus) -> None:
         """Continue from the last messages of a level that was restarted."""
         self.held = [copy_request(record) for record in state.requests[: state.count]]
-        self.begun = bool(state.begun)
+        self.begun = state.begun
         self.goal = copy_request(state.goal) if state.goal["id"] else None
         self.taken = status.taken
         self.rests_on = status.operator

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import Error
 from rack.levels.planning.ik import InverseKinematics
@@ -21,7 +20,7 @@ from rack.levels.systems.trajectory.legs import (
     Unfit,
     WorldSight,
 )
-from rack.levels.systems.trajectory.messages import MotionKind, RequestEnd
+from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.requests import MOTIONS, Agenda, misfit_of
 from rack.levels.tables import Positive, Table
@@ -149,7 +148,7 @@ class RequestWork:
             segment_s = goal.segment * self._left if is_under_way else 0.0
             self._move(goal, 0.0, segment_s)
 
-    def _is_done(self, current: Message) -> bool:
+    def _is_done(self, current: MotionRequest) -> bool:
         if not self.motion.settled:
             return False
         if current.kind in MOTIONS or current.kind == MotionKind.CANCEL:
@@ -157,12 +156,12 @@ class RequestWork:
         self.passed_s += self._tools.period_s
         return self.passed_s >= self._lasts_s(current)
 
-    def _lasts_s(self, request: Message) -> float:
+    def _lasts_s(self, request: MotionRequest) -> float:
         if request.kind == MotionKind.GRIP and not request.segment:
             return self._tools.params.gripping
-        return float(request.segment)
+        return request.segment
 
-    def _consider(self, request: Message) -> None:
+    def _consider(self, request: MotionRequest) -> None:
         """Begin `request` if its time has come: nothing is under way, or the leg under way is to be
         blended into it."""
         current = self.agenda.current
@@ -177,7 +176,7 @@ class RequestWork:
             if half_s is not None:
                 self._begin(half_s)
 
-    def _blend_s(self, leg: Leg, request: Message) -> float | None:
+    def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
         """Return half the time in which `leg` slows down, if now is the time to blend it into
         `request`."""
         law = leg.law
@@ -190,7 +189,7 @@ class RequestWork:
         left_s = law.nominal_s - passed_s
         return left_s if left_s < half_s + self._tools.period_s else None
 
-    def _can_begin(self, request: Message) -> bool:
+    def _can_begin(self, request: MotionRequest) -> bool:
         return request.kind not in MOTIONS or request.body < 0 or self._tools.sight.knows
 
     def _begin(self, half_s: float) -> None:
@@ -205,17 +204,17 @@ class RequestWork:
         else:
             self._start(request)
 
-    def _misfit(self, request: Message) -> str:
+    def _misfit(self, request: MotionRequest) -> str:
         """Return why a request cannot be done; empty: it may be possible."""
         tools = self._tools
         return misfit_of(request, tools.limits.position) or tools.sight.misfit(request.body)
 
-    def _start(self, request: Message) -> None:
+    def _start(self, request: MotionRequest) -> None:
         """Begin a request that does not move the arm."""
         if request.kind == MotionKind.GRIP:
             self.grip = request.opening, request.force
 
-    def _move(self, request: Message, half_s: float, segment_s: float) -> None:
+    def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
         """Begin the leg to the goal of `request`; the motion so far slows down over twice
         `half_s`."""
         tools = self._tools
