@@ -212,7 +212,7 @@ class Arm(Plant, ABC):
         self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
 
     def restore(self, state: Message) -> None:
-        """Continue from an `ARM_STATE`. Default: drives that know no states are as they were."""
+        """Continue from an `ArmState`. Default: drives that know no states are as they were."""
         super().restore(state)
         was_disabled = state.error == Error.DISABLED
         self.state = DriveState.DISABLED if was_disabled else DriveState.ENABLED
@@ -245,7 +245,7 @@ class Arm(Plant, ABC):
         return None
 
     def look(self, scene: Message) -> None:
-        """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the
+        """Fill a `Scene` with the poses of bodies and tool. Default: bodies at their start, the
         tool as sensed."""
         offset = self.cell.encoders.offset
         position = self.sense().position

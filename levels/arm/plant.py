@@ -15,12 +15,12 @@ from rack.levels.robot.cell import Cell
 EPISODE_TICKS = 20
 """Ticks without a finding of a kind after which the next one is reported again."""
 SAVED = ("waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
-"""Attributes of a plant that its `ARM_STATE` keeps, and that seldom change."""
+"""Attributes of a plant that its `ArmState` keeps, and that seldom change."""
 read_saved = attrgetter(*SAVED)
 
 
 class Plant:
-    """Time, counters and state of a driven mechanism in a cell; `ARM_STATE` and `SCENE` are filled
+    """Time, counters and state of a driven mechanism in a cell; `ArmState` and `Scene` are filled
     from them.
 
     Its `findings` are those of the level that makes it: they reach the board, and the counters the
@@ -61,7 +61,7 @@ class Plant:
         self._data = cell.start()
 
     def _show(self, scene: Message) -> None:
-        """Fill a `SCENE` from `_data`."""
+        """Fill a `Scene` from `_data`."""
         data = self._data
         bodies = self.cell.bodies
         tool = self.cell.tool
@@ -72,7 +72,7 @@ class Plant:
         mujoco.mju_mat2Quat(scene.tool_quaternion, data.site_xmat[tool])
 
     def save(self, state: Message) -> None:
-        """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
+        """Fill an `ArmState` with the state that a restarted board needs. Default: the attributes.
 
         A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.state`.
         """
@@ -103,14 +103,14 @@ class Plant:
         self._reported_tick = self.tick
 
     def complete_cycle(self, state: Message | None) -> None:
-        """Report a cycle, and fill its `ARM_STATE`, unless the level has saved it."""
+        """Report a cycle, and fill its `ArmState`, unless the level has saved it."""
         if self._reported_tick != self.tick:
             if state is not None:
                 self.save(state)
             self.report_cycle()
 
     def restore(self, state: Message) -> None:
-        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
+        """Continue from an `ArmState`: called once, before the first `step`, on a restarted
         board."""
         self.tick = state.tick
         for name in SAVED:

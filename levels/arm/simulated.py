@@ -181,12 +181,12 @@ class SimulatedArm(Simulation, Arm):
         return None if self._wrist is None else self._wrist.sample(self.tick)
 
     def save(self, state: Message) -> None:
-        """Fill an `ARM_STATE`."""
+        """Fill an `ArmState`."""
         super().save(state)
         state.rest = self._brake.rest
 
     def restore(self, state: Message) -> None:
-        """Continue, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
+        """Continue, bit for bit, from an `ArmState`; its last torques are the last command."""
         super().restore(state)
         d = self._data
         cell = self.cell

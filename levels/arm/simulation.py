@@ -89,17 +89,17 @@ class Simulation(Plant):
         return f"'{first}' touches '{second}'"
 
     def look(self, scene: Message) -> None:
-        """Fill a `SCENE` with the poses as simulated."""
+        """Fill a `Scene` with the poses as simulated."""
         self._show(scene)
 
     def save(self, state: Message) -> None:
-        """Fill an `ARM_STATE`."""
+        """Fill an `ArmState`."""
         super().save(state)
         steps = self._steps
         self._copy_state(steps.model, steps.data, steps.asleep, state.state)
 
     def restore(self, state: Message) -> None:
-        """Continue, bit for bit, from an `ARM_STATE`."""
+        """Continue, bit for bit, from an `ArmState`."""
         super().restore(state)
         restore_state(self._model, self._data, state.state)
         self._refresh()

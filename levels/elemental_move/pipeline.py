@@ -108,12 +108,12 @@ class PlanStore:
 
 
 def joins(plan: Message, place: Array) -> bool:
-    """Return whether the path of a `MOVE_PLAN` begins at `place` (joints,), rad."""
+    """Return whether the path of a `MovePlan` begins at `place` (joints,), rad."""
     return is_same(np.asarray(plan.waypoints[0]), place)
 
 
 def end_of(plan: Message) -> Array:
-    """Return the end of the path of a `MOVE_PLAN`, (joints,), rad."""
+    """Return the end of the path of a `MovePlan`, (joints,), rad."""
     return np.asarray(plan.waypoints[plan.count - 1])
 
 
@@ -124,7 +124,7 @@ def is_same(a: Array, b: Array) -> bool:
 
 class SegmentWindow:
     """Segments handed down and not known to be done, oldest first, kept in the outgoing
-    `MOVE_COMMAND` itself.
+    `MoveCommand` itself.
 
     Serials are never reused: a segment that replaces another has a newer one.
     """
@@ -165,7 +165,7 @@ class SegmentWindow:
         self._blank()
 
     def add_path(self, move: Any, plan: Message, by_s: float) -> None:
-        """Hand down the path of `plan` for `move`, an element of a window of `ELEMENTAL_MOVE`."""
+        """Hand down the path of `plan` for `move`, an element of a window of `ElementalMove`."""
         segment = self._add(move, SegmentKind.PATH)
         segment["touch"] = move["verb"] in (Verb.APPROACH, Verb.DEPART)
         segment["by"] = by_s

@@ -51,7 +51,7 @@ class MotionSegment:
 
 
 def window(command: Message) -> list[int]:
-    """Return the serials of the segments in a MOVE_COMMAND, oldest first."""
+    """Return the serials of the segments in a `MoveCommand`, oldest first."""
     serials: list[int] = command.segments["id"][: command.count].tolist()
     return serials
 

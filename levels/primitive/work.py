@@ -120,7 +120,7 @@ class WorkCycle(NamedTuple):
 
     hold: bool
     plan: Trajectory | None  # from where the motion rests
-    world: Message  # WORLD_MODEL
+    world: Message  # WorldState
     due_s: float  # simulated time of the set point commanded last
     passed_s: float  # since the cycle before
     part: float = 1.0  # of full speed, for a trajectory that begins

@@ -191,7 +191,7 @@ class Grip:
         self._kept = force
 
     def take(self, command: Message) -> None:
-        """Take a new `JOINT_SET_POINT`."""
+        """Take a new `JointCommand`."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
             self._limit = min(max(command.force, 0.0), self._most_force)

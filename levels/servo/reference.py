@@ -53,7 +53,7 @@ class Reference:
         )  # the one wanted, and its difference from the curve
         self._wanted = Motion(self._motions[0])
         self._interpolate = set_motion.load()
-        self._command: Message | None = None  # the newest `JOINT_SET_POINT`
+        self._command: Message | None = None  # the newest `JointCommand`
         self._offered = 0  # tick at which it is due
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # the set point to follow after that
@@ -87,7 +87,7 @@ class Reference:
             self._join(position, velocity, tick)
 
     def take(self, command: Message) -> None:
-        """Take a new `JOINT_SET_POINT`. It must stay the newest message until the next one is
+        """Take a new `JointCommand`. It must stay the newest message until the next one is
         taken."""
         self._command = command
         self._offered = command.due

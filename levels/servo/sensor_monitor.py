@@ -127,7 +127,7 @@ class SensorMonitor:
         self._rung: set[Alarm] = set()  # alarms raised in this episode
 
     def recall(self, state: Message) -> None:
-        """Continue from the estimate in an `ARM_STATE`."""
+        """Continue from the estimate in an `ArmState`."""
         self.position[:] = state.position
         self.velocity[:] = state.velocity
         self.doubt[:] = state.doubt

@@ -77,7 +77,7 @@ class Stopping:
         self._on_blow = Reaction.BRAKE  # reaction until then
 
     def recall(self, state: Message) -> None:
-        """Continue from the state in an `ARM_STATE`."""
+        """Continue from the state in an `ArmState`."""
         self._tick = state.tick
         self._kept = state.kept
         if state.error != Error.DISABLED:

@@ -123,7 +123,7 @@ class Detour:
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
     def begin(self, message: Message, is_new: bool) -> None:
-        """Accept a goto, an `OPERATOR_COMMAND`, or refuse it; one that is not new continues under
+        """Accept a goto, an `OperatorCommand`, or refuse it; one that is not new continues under
         its id."""
         try:
             self._target = self._read(message)

@@ -41,7 +41,7 @@ VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLIN
 
 class Agreement:
     """Steps through a program with several arms. `program`: its checksum; `steps`: the arms of each
-    step. The arms' answers are their `CELL_REPORT`s."""
+    step. The arms' answers are their `CellReport` messages."""
 
     def __init__(
         self, program: int, steps: Sequence[Collection[str]], margin_s: float, farewell_s: float
@@ -65,7 +65,7 @@ class Agreement:
         self.ending_s = 0.0  # since when the arms are ended, simulated time; 0: not yet
 
     def recall(self, last: Message) -> None:
-        """Continue from a `CELL_PROGRESS`."""
+        """Continue from a `CellProgress`."""
         self.phase = Phase(last.phase)
         self.step = last.step
         self.attempt = last.attempt
@@ -75,7 +75,7 @@ class Agreement:
         self.begun_s = last.begun
 
     def write_to(self, progress: Message) -> None:
-        """Fill a `CELL_PROGRESS`, but for the count of moves."""
+        """Fill a `CellProgress`, but for the count of moves."""
         progress.phase = self.phase
         progress.step = self.step
         progress.attempt = self.attempt
@@ -233,7 +233,7 @@ class TakenOrder:
     """One order at a time, by the checksum of its program and its id."""
 
     def __init__(self, report: Message | None = None) -> None:
-        """Begin without an order, or with that of a `CELL_REPORT`, after a restart of the board."""
+        """Begin without an order, or with that of a `CellReport`, after a restart of the board."""
         self.program = 0
         self.order = 0
         self.response = Response.NONE

@@ -26,7 +26,7 @@ SAME = 1e-9
 
 
 class Wanted(NamedTuple):
-    """What a request asks of a contact; the last four (6,), by axis. See `SERVER_REQUEST`."""
+    """What a request asks of a contact; the last four (6,), by axis. See `ServerRequest`."""
 
     frame: Array  # (4,)
     selected: Mask
@@ -42,7 +42,7 @@ class Wanted(NamedTuple):
 
 
 class Contact:
-    """What is in force: the content of a server's `COMPLIANCE`."""
+    """What is in force: the content of a server's `Compliance`."""
 
     def __init__(self) -> None:
         self.id = 0  # rises with every change
@@ -106,7 +106,7 @@ class Contact:
         return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
     def fill(self, compliance: Message) -> None:
-        """Fill a `COMPLIANCE`."""
+        """Fill a `Compliance`."""
         compliance.id = self.id
         compliance.active = self.complies or bool(self.guard.any())
         for name in Wanted._fields:

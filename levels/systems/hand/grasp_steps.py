@@ -38,7 +38,7 @@ SLIPPED_PART = 0.2
 
 
 class FingersBelow:
-    """Merges `FINGER_STATUS`es; each board fills what is its own. Points and forces are in the
+    """Merges `FingerStatus` messages; each board fills its own part. Points and forces are in the
     frame of the palm."""
 
     def __init__(self, context: LevelContext, fingers: Sequence[Ints]) -> None:
@@ -101,7 +101,7 @@ class Grasp:
     postures: dict[str, Array]  # (joints,), rad, by name
     period_s: float
     fingers: FingersBelow
-    target: Message  # the `GRASP_TARGET` that the steps fill
+    target: Message  # the `GraspTarget` that the steps fill
     grip: HandGrip
     touching: Mask  # (fingers,)
     close: CloseStep | None = None  # by which the object was, or is, gripped

@@ -108,7 +108,7 @@ class FingertipLaw:
         return self._tips
 
     def targets(self, grasp: Message, ahead_s: float, out: Message) -> None:
-        """Fill a `FINGER_TARGET` from a `GRASP_TARGET`, taken on by `ahead_s` at its velocities;
+        """Fill a `FingerTarget` from a `GraspTarget`, taken on by `ahead_s` at its velocities;
         after `sense`."""
         before = self.wanted.copy()
         points = grasp.tip + ahead_s * grasp.tip_velocity
@@ -180,8 +180,8 @@ class JointLaw:
     def torques(
         self, hand: Message, target: Message, age_s: float, ahead_s: float, out: Array
     ) -> None:
-        """Set `out`, (joints,), N m, for when the sample in a `HAND_STATUS` is `age_s` old; the
-        `FINGER_TARGET` is taken on by `ahead_s`."""
+        """Set `out`, (joints,), N m, for when the sample in a `HandStatus` is `age_s` old; the
+        `FingerTarget` is taken on by `ahead_s`."""
         terms = self._dynamics.terms(hand.position, self._still)
         is_cut = self._set(
             self._gains,
@@ -285,14 +285,14 @@ class TendonLaw:
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
     def start(self, status: Message) -> None:
-        """Begin with the tensions of a `HAND_STATUS`."""
+        """Begin with the tensions of a `HandStatus`."""
         self._valves[0] = status.wanted
         self._valves[1] = status.tension
         self._valves[2] = 0.0
         self._sampled = status.tick
 
     def tensions(self, status: Message, torque: Array, out: Array) -> None:
-        """Set `out`, (2, joints), N, for `torque`, (joints,), N m, at a `HAND_STATUS`."""
+        """Set `out`, (2, joints), N, for `torque`, (joints,), N m, at a `HandStatus`."""
         # Valves that are closed do not follow their commands: nothing is to be learned from them.
         elapsed = 0 if status.holding else status.tick - self._sampled
         self._sampled = status.tick

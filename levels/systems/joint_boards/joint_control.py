@@ -43,7 +43,7 @@ class JointLoads:
         self._computed_at = np.full(joints, np.nan)
 
     def misfit(self, command: Message) -> str:
-        """Return the field of a `JOINT_REFERENCE` that asks for more than the arm can do; empty:
+        """Return the field of a `JointReference` that asks for more than the arm can do; empty:
         none does."""
         # Written so that NaN is too much.
         within = {
@@ -64,7 +64,7 @@ class JointLoads:
         return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
 
     def take(self, command: Message, tick: int) -> None:
-        """Go over to those of a `JOINT_REFERENCE` that fits, until it is due."""
+        """Go over to those of a `JointReference` that fits, until it is due."""
         self.table[AT] += self.part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
         self._begin = tick

@@ -163,7 +163,7 @@ class Agenda:
         self._ended.appendleft((request.id, how))
 
     def report(self, status: Message) -> None:
-        """Fill the ids, the ends and the error of a `MOTION_STATUS`."""
+        """Fill the ids, the ends and the error of a `MotionStatus`."""
         current = self.current
         status.taken = self.taken
         status.current = current.id if current is not None else 0
@@ -172,7 +172,7 @@ class Agenda:
             status.ended[k], status.ends[k] = ended
 
     def save(self, state: Message) -> None:
-        """Fill a `MOTION_STATE`."""
+        """Fill a `MotionState`."""
         state.begun = self.begun
         state.count = len(self.held)
         for k, request in enumerate(self.held):
