@@ -5,12 +5,12 @@ class PowerStatus(Status, version=1):
     \"\"\"Power drawn by the arm.\"\"\"
 
     power: float = field(unit="W", doc="mechanical power")
-    torque: Vector = field(unit="N m", shape="joints", doc="applied torque")
+    torque: np.ndarray = field(unit="N m", doc="applied torque", shape="joints")
 ```
 
 A scalar is a `float`, an `int`, a `bool`, a `str` or a member of an `IntEnum`; every other
-annotation stands for an array. A class without a version is a group of fields that others derive
-from.
+annotation stands for an array. A status derives from `Status`, a command from `Command`. A class
+without a version is only a base of others.
 """
 
 from __future__ import annotations

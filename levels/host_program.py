@@ -6,8 +6,8 @@ time never waits for it. It reaches the levels only through a bus adapter
 (`rack.boards.host.bus_adapter`), which exchanges at its own rate. The author writes `run`:
 
     class Stroll(HostProgram):
-        inputs = {"motion": Input(MOTION_STATUS, "below.motion")}
-        outputs = {"requests": MOTION_REQUEST}
+        motion = Input(MotionStatus, "below.motion")
+        requests = Output(MotionRequest)
 
         def run(self, bus: Bus) -> None:
             bus.send("requests", kind=MotionKind.JOINTS, joints=(0.0, -0.5, ...))

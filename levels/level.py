@@ -7,44 +7,52 @@ belong to the board that runs the level. The other duties, each with its reason:
 Every level
 - `process` takes bounded time: it never waits, logs or prints. The cycle has a deadline.
 - An exception ends the board, which is restarted as a new process with a new object. State that
-  must survive this is read back from your own mailboxes (`Input(STATUS, "own.status")`).
+  must survive this is read back from your own mailboxes: `before = Input(MyStatus, "own.status")`.
 - `tick` may advance by more than `context.every`: cycles are skipped after a miss. Compute elapsed
   time from it; never read a clock, and take randomness from `context.seed` and `tick`. Otherwise
   lockstep runs differ.
 - Use `rack.levels.algebra` in place of `@`, `np.linalg`, `exp`, `arctan2` and the like: those
   differ in the last bit between processors.
-- Every output is written at the end of every cycle, unchanged fields with the values of the cycle
-  before.
-- An output rests on the input of its name (a command on the command above); for another, see
-  `Output.rests_on`.
-- A `Reading` before the first message is all zeros (`is_there` is False); later it repeats the
-  newest (`is_new` is False). `is_lost`: its writer is dead or silent. A level that moves the arm
-  then holds, and reports the reason.
+
+Ports
+- Ports are attributes of the class. The input of the level above is called `above`, that of the
+  level below `below`: `above = Input(TaskCommand, "above.command")`.
+- An input is a `Reading` in every cycle: `self.above.message` and its `verdict`. Before the first
+  message all fields are 0 (`is_there` is False); later it repeats the newest one (`is_new` is
+  False). `is_lost`: its writer is dead or silent. A level that moves the arm then holds, and
+  reports the reason.
+- `Inputs` reads the mailbox of every neighbour, and is a mapping from board to `Reading`.
+- An output is the message itself: assign its fields, `self.status.state = State.EXECUTING`. It is
+  written at the end of every cycle; fields keep their values from cycle to cycle.
+- A command names the input on which it rests, `Output(MoveCommand, rests_on=above)`, and a status
+  likewise `rests_on=below`: without it the response of the system cannot be measured.
+- Messages of which none may be missed, such as requests for motions, go through a `QueuedOutput`:
+  fill its `message` and call `send()` for each, several in a cycle if need be. `send()` returns
+  False when the queue is full; try again in a later cycle. The only reader gets each message once
+  and in order, the older unread ones in `Reading.earlier`, at most `room(port)` in a cycle. What a
+  board has taken in the cycle in which it dies is lost with it: the sender notices by the ids that
+  the reader's status echoes.
+- A mailbox of another rack, which `[adapter.lan]` imports, is read as `Input(Message,
+  "lan.<port>")`. It is lost when its information is older than `max_age_ms`, and at once when that
+  rack is. `lan.peer_<rack>`, a `PeerPresence`, shows whether that rack is there.
+- Ports that a config makes (`made_ports`) are in `self.ports`, by name.
 
 Messages
-- A command (`rack.backplane.message.command`) has an `id` that rises with every new command; 0: no
-  command.
-- A status (`status`), written to the port "status", echoes the command's `id` and shows `state` in
-  every cycle: the board with `ends_run` ends the run by DONE or ERROR; HOLDING (kept from its work)
-  and ERROR need a `reason` of one line, which users see as the cause of a stall. A status whose
-  `error` is not 0 at the end fails the run.
-- Messages of which none may be missed, such as requests for motions, go through a queue: declare
-  `Output(REQUEST, queued=True)`, fill `write.port` and call `write.port.send()` for each, several
-  in a cycle if need be. False: the queue is full; try again in a later cycle. Its one reader gets
-  each once and in order, the older unread ones in `Reading.earlier`, at most `room(port)` in a
-  cycle. What a board has taken in the cycle in which it dies is lost with it: the sender notices by
-  the ids that the reader's status echoes.
-- A mailbox of another rack, which `[adapter.lan]` imports, is read as `Input(TYPE, "lan.<port>")`.
-  It is lost when its information is older than `max_age_ms`, and at once when that rack is. Where
-  that is says `lan.peer_<rack>`, a `PEER`.
+- A message is a class: see `rack.backplane.message`. Reader and writer of a mailbox must name the
+  same message and version. The version rises with every change of the fields.
 - Symbolic sizes of fields ("joints", "bodies", "state") follow from `[robot]` and `[scene]`, see
-  `context.sizes`. Reader and writer of a mailbox must name the same message type and version.
+  `context.sizes`.
+- A command derives from `Command`. Its `id` rises with every new command; 0: no command.
+- A status derives from `Status`, and its port is called `status`. It echoes the command's `id` and
+  shows `state` in every cycle: the board with `ends_run` ends the run by DONE or ERROR; HOLDING
+  (kept from its work) and ERROR need a `reason` of one line, which users see as the cause of a
+  stall. A status whose `error` is not 0 at the end fails the run.
 
-Operator: a level that takes commands reads `Input(OPERATOR_COMMAND, "own.operator")`, lists them in
-`commands`, follows with `rack.levels.operator.Orders`, has `*ANSWER` in its status
-(`orders.report`) and `RESTS_ON` in its command (`command.operator = orders.rests_on(...)`). A level
-that takes none passes `operator` on, down and into its status: without it the system's response to
-an operator cannot be measured.
+Operator: a level that takes commands declares `operator = Input(OperatorCommand, "own.operator")`,
+lists them in `commands`, and follows with `rack.levels.operator.Orders`. Its status derives from
+`AnsweringStatus` (`orders.report`) and its command from `RelayedCommand` (`command.operator =
+orders.rests_on(...)`). A level that takes none copies `operator` from the command above to its own
+command and status: without it the system's response to an operator cannot be measured.
 
 Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check`
 then reports every mistake before the launch. The text below a field says what it means, with its
@@ -55,7 +63,7 @@ declares `program = MyProgram`, a `Program`, likewise.
 
 A servo level of your own
 - reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0`
-  until the first set point (while `command.due` is 0), and again when set points stop: the
+  until the first set point (while `due` of the command is 0), and again when set points stop: the
   primitive level waits for this, and motion begins at that `target`. Four primitive cycles after
   set points began, `holding` must be 0; else it starts over.
 - reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the
@@ -226,7 +234,7 @@ class LevelSection:
     inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
     """The ports that it reads, by name: collected from the class and its bases."""
     outputs: ClassVar[Mapping[str, Output[Any]]] = {}
-    """The ports that it writes, likewise; the port of a planner is called "plan"."""
+    """The ports that it writes, likewise; of a planner the one port "plan"."""
     params: ClassVar[type[Table] | None] = None
     """Keys of `[board.<name>.params]`, checked before the launch; executor and planner share one
     table. None: unchecked, the level reads them by itself."""
@@ -363,14 +371,14 @@ class Executor(LevelSection, ABC):
 
     @abstractmethod
     def process(self, tick: int) -> None:
-        """Compute one cycle, released at `tick`: sample the inputs, fill the outputs."""
+        """Compute one cycle, released at `tick`: read the inputs, fill the outputs."""
 
 
 class Planner(LevelSection, ABC):
     """The background of a level: plans ahead, at low priority, within `within_cycles` cycles.
 
     It runs in a separate process and shares nothing with the executor but mailboxes. Its one output
-    is its mailbox `<board>.plan`, which may be a queue: `output = Output(PLAN, queued=True)`.
+    is its mailbox `<board>.plan`, which may be a queue: `output = QueuedOutput(MyPlan)`.
     """
 
     def __init_subclass__(cls) -> None:

@@ -1,9 +1,10 @@
 """An operator's commands to any level: operations, messages, and how a level follows them.
 
 An operator may command every level that reads "own.operator" and declares `commands`, in addition
-to the level above it or in its place. The level follows with `Orders` and has `AnsweringStatus`
-among the fields of its status. `RESTS_ON` is passed down with every command, so the lowest status
-shows on which command its torque is based: the system's response can be measured."""
+to the level above it or in its place. The level follows with `Orders`; its status derives from
+`AnsweringStatus`, its command from `RelayedCommand`. `operator` is passed down with every command,
+so the lowest status shows on which command its torque is based: the system's response can be
+measured."""
 
 from __future__ import annotations
 
@@ -105,7 +106,7 @@ class SampledCommand(RelayedCommand):
 
 
 class AnsweringStatus(Status):
-    """Fields of a status that answer an operator."""
+    """Base of statuses that answer an operator."""
 
     operator: int = RESTS_ON
     order: int = field(

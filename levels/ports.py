@@ -104,14 +104,16 @@ class Inputs(InputPort[M]):
 class Output(Port[M]):
     """A port that a level writes: an attribute that is a message, written at the end of each cycle.
 
+    Fields keep their values from cycle to cycle.
+
     Args:
         message: The class of its messages.
         cycles: Written in every n-th cycle: the last one before a multiple of n cycles' ticks,
             counted from the board's phase, so that readers released then find it fresh. If that
             cycle is missed, the message is missing too.
         rests_on: The input whose information it passes on. Its messages carry the tick of that
-            information, of an input that reads many the oldest, of none their own release. By
-            these ticks the response of the whole hierarchy is measured.
+            information, the oldest one of an `Inputs`. By default they carry the tick of their own
+            release. The response of the whole hierarchy is measured by these ticks.
     """
 
     queued = False

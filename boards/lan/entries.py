@@ -33,7 +33,7 @@ _WHOLE = (1 << WINDOW) - 1
 
 @dataclass
 class ImportCount:
-    """The first fields of `IMPORT`, in their order."""
+    """The first fields of `LanImport`, in their order."""
 
     taken: int = 0
     missing: int = 0

@@ -135,7 +135,7 @@ class PeerRack:
 
     def resume(self, message: PeerPresence | AnyMessage, confirm_by: int) -> None:
         """Continue from the message that an adapter before this one wrote: see
-        `rack.levels.peer.PEER`."""
+        `rack.levels.peer.PeerPresence`."""
         self.presence = Presence(message.presence)
         self.launch = message.launch
         self.launches = message.launches

@@ -232,9 +232,9 @@ class OutputPort:
 class OutputPorts:
     """The mailboxes that a task writes; the level holds the outgoing message of each port.
 
-    Each message carries the tick of the oldest information that it rests on. A command inherits the
-    tick of the command that it follows, a status that of the status below: see `Output.rests_on`.
-    So the system's response time can be measured.
+    Each message carries the tick of the information that it rests on: a command the tick of the
+    command above, a status the tick of the status below, see `Output.rests_on`. From these ticks
+    the system's response time is measured.
     """
 
     def __init__(

@@ -14,12 +14,12 @@ from rack.levels.robot.cell import Cell
 EPISODE_TICKS = 20
 """Ticks without a finding of a kind after which the next one is reported again."""
 SAVED = ("waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
-"""Attributes of a plant that its `ARM_STATE` keeps, and that seldom change."""
+"""Attributes of a plant that its `ArmState` keeps, and that seldom change."""
 read_saved = attrgetter(*SAVED)
 
 
 class Plant:
-    """Time, counters and state of a driven mechanism in a cell; `ARM_STATE` and `SCENE` are filled
+    """Time, counters and state of a driven mechanism in a cell; `ArmState` and `Scene` are filled
     from them.
 
     Its `findings` are those of the level that makes it: they reach the board, and the counters the

@@ -316,5 +316,5 @@ class ElementalMoveExecutor(Executor):
 
 
 def find_move(window: Any, serial: int) -> Any:
-    """Return the move of that serial in a window of `ELEMENTAL_MOVE`; None: it is not there."""
+    """Return the move of that serial in a window of `ElementalMove`; None: it is not there."""
     return next((move for move in window if move["id"] == serial), None)

@@ -124,7 +124,7 @@ def is_same(a: Array, b: Array) -> bool:
 
 class SegmentWindow:
     """Segments handed down and not known to be done, oldest first, kept in the outgoing
-    `MOVE_COMMAND` itself.
+    `MoveCommand` itself.
 
     Serials are never reused: a segment that replaces another has a newer one.
     """

@@ -24,7 +24,7 @@ VERB_NAMES = {
 
 
 class Move(NamedTuple):
-    """One `ELEMENTAL_MOVE`."""
+    """One `ElementalMove`."""
 
     id: int
     action: int
@@ -46,7 +46,7 @@ class Move(NamedTuple):
         return self.verb in (Verb.APPROACH, Verb.DEPART)
 
     def write_to(self, record: Any) -> None:
-        """Fill one element of an array of `ELEMENTAL_MOVE`."""
+        """Fill one element of an array of `ElementalMove`."""
         record["id"] = self.id
         record["action"] = self.action
         record["verb"] = self.verb
@@ -58,7 +58,7 @@ class Move(NamedTuple):
 
 
 def read_move(record: Any) -> Move:
-    """Return a copy of the move in one element of an array of `ELEMENTAL_MOVE`."""
+    """Return a copy of the move in one element of an array of `ElementalMove`."""
     row = int(record["object"])
     return Move(
         id=int(record["id"]),

@@ -80,7 +80,7 @@ class TaskPlanner(Planner):
         return bool(np.all(speeds < MAX_REST_M_S))
 
     def plan(self, tick: int) -> None:
-        """Decompose the whole program into `write`, or refuse it; a plan that was lost is published
+        """Decompose the whole program into `output`, or refuse it; a lost plan is published
         again."""
         self._visible_at = tick + self._slice
         if self._plan is not None:

@@ -107,7 +107,7 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 
 class Poses:
-    """Writes `ARM_STATE`s as poses of all moving bodies, by MuJoCo's own kinematics, and the path
+    """Writes an `ArmState` as poses of all moving bodies, by MuJoCo's own kinematics, and the path
     of the tool."""
 
     def __init__(self, stream: Stream, cell: Cell) -> None:
@@ -154,7 +154,7 @@ class Poses:
 
 
 class Pushes:
-    """Writes the forces that the scene exerts on its objects, as `ARM_STATE`s have them."""
+    """Writes the forces that the scene exerts on its objects, as an `ArmState` has them."""
 
     def __init__(self, stream: Stream, cell: Cell) -> None:
         self._stream = stream
@@ -252,7 +252,7 @@ def floor_of(cell: Cell) -> float:
 
 
 class PlannedPath:
-    """Writes `MOVE_PLAN`s as a line of the tool point with its way points, from the tick at which
+    """Writes a `MovePlan` as a line of the tool point with its way points, from the tick at which
     they are visible."""
 
     def __init__(self, stream: Stream, cell: Cell) -> None:
@@ -298,7 +298,7 @@ def in_pieces(corners: Array) -> Array:
 
 
 class Goals:
-    """Writes the places where a `TASK_PLAN` puts its objects down, and the goal of the current
+    """Writes the places where a `TaskPlan` puts its objects down, and the goal of the current
     move."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
@@ -329,7 +329,7 @@ class Goals:
             self._stream.at(block.visible(row), GOALS, points)
 
     def write_status(self, block: RowBlock) -> None:
-        """Write the goal of the move that each `MOVE_STATUS` names."""
+        """Write the goal of the move that each `MoveStatus` names."""
         for row in self._current.rows(block.messages["current"]):
             current = int(block.messages["current"][row])
             goals = [self._goals[current]] if current in self._goals else []

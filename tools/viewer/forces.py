@@ -92,7 +92,7 @@ class ContactArrows:
 
 
 class TaskForces:
-    """Writes `FORCE_STATUS`es: what the tool exerts along each axis of the task frame, and what is
+    """Writes a `ForceStatus`: what the tool exerts along each axis of the task frame, and what is
     wanted of it."""
 
     def __init__(self, stream: Stream) -> None:
@@ -111,7 +111,7 @@ class TaskForces:
 
 
 class ContactForces:
-    """Writes `WRENCH`es as the size of force and torque, with the arm's limits."""
+    """Writes a `Wrench` as the size of force and torque, with the arm's limits."""
 
     def __init__(self, stream: Stream, most: tuple[float, float]) -> None:
         self._stream = stream

@@ -19,7 +19,7 @@ TIPS = (HAND, "tip_forces")
 
 
 class HandCurves:
-    """Writes `HAND_STATUS`es: a finger's joints, tensions as sensed and as commanded, and the force
+    """Writes a `HandStatus`: a finger's joints, tensions as sensed and as commanded, and the force
     on its tip."""
 
     def __init__(self, stream: Stream, names: tuple[str, ...], hand: Hand) -> None:
