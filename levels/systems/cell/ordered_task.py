@@ -174,7 +174,7 @@ class OrderedTaskExecutor(TaskExecutor):
         self._waits = self._not_ready()
         if self._waits:
             return
-        order = self.ports["order"].message
+        order: CellOrder = self.ports["order"].message
         # The coordinator's simulated time less that here.
         ahead_s = float(self.ports["peer"].message.ahead) if self._table.coordinator else 0.0
         now_s = tick * self.context.tick_s
