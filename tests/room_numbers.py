@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rack.backplane.message import MessageType
+from rack.backplane.message_type import MessageType
 from tests.snapshots import ROOT, Snapshots, digest
 
 KINDS = (bool, int, float, str, tuple, frozenset, dict, MessageType)

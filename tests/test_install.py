@@ -21,19 +21,20 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("backplane", "boards", "configs", "levels", "tools")
 FILES = ("pyproject.toml", "README.md", "LICENSE")
 LEVEL = """
-from rack.backplane.message import Field, State, status
-from rack.levels.level import Executor
+from rack.backplane.message import State, Status, field
+from rack.levels.level import Executor, Output
 from tools.numbers import THREE
 
-COUNT = status("count", 1, Field("count", "u4", "1", "cycles so far"))
+class Count(Status, version=1):
+    count: int = field("u4", unit="1", doc="cycles so far")
 
 
 class Counter(Executor):
-    outputs = {"status": COUNT}
+    status = Output(Count)
 
-    def process(self, read, write, tick):
-        write.status.state = State.EXECUTING
-        write.status.count += THREE
+    def process(self, tick):
+        self.status.state = State.EXECUTING
+        self.status.count += THREE
 """
 CONFIG = """
 format = 2

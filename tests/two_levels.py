@@ -8,9 +8,21 @@ from typing import Any
 import numpy as np
 import pydantic
 
-from rack.backplane.message import Command, Field, Message, MessageType, State, Status, field
+from rack.backplane.message import Command, Message, State, Status, field
 from rack.levels.level import Executor, Input, Output, Planner, Program
 from rack.levels.tables import RobotConfig, SceneConfig
+
+
+class Bare(Message, version=1):
+    """A status without a state."""
+
+    fired: bool = field(doc="1: it has")
+
+
+class Terse(Message, version=1):
+    """A status without a reason."""
+
+    state: State = field(doc="of the level")
 
 
 class CountCommand(Command, version=1):
@@ -52,15 +64,13 @@ class Upper(Executor):
 class Stateless(Upper):
     """Has a status of its own, without a state or a reason."""
 
-    command = Output(CountCommand)
-    status = MessageType("bare", 1, (Field("fired", "u1", "1", "1: it has"),))
+    status = Output(Bare, rests_on=Upper.below)
 
 
 class Reasonless(Upper):
     """Holds, and has no field for the reason."""
 
-    command = Output(CountCommand)
-    status = MessageType("terse", 1, (Field("state", "u1", State, "of the level"),))
+    status = Output(Terse, rests_on=Upper.below)
 
     def process(self, tick: int) -> None:
         """Hold."""

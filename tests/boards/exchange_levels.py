@@ -6,12 +6,12 @@ import numpy as np
 from wave_levels import Wave
 
 from rack.backplane.message import State, Status, field
-from rack.levels.level import Executor, Input, Output
+from rack.levels.level import Executor, Input, Output, Reading
 
 PORTS = ("plain", "sparse", "early")
 
 
-class Notes(Status, version=1):
+class Noted(Status, version=1, message="notes"):
     """Notes."""
 
     value: np.ndarray = field(unit="1", doc="value that each port showed", shape=len(PORTS))
@@ -24,14 +24,16 @@ class Notes(Status, version=1):
 class Notes(Executor):
     """Reads one status by three ports, and notes what they show."""
 
-    inputs = {port: Input(Wave, "below.status") for port in PORTS}
-    status = Output(Notes)
+    plain = Input(Wave, "below.status")
+    sparse = Input(Wave, "below.status")
+    early = Input(Wave, "below.status")
+    status = Output(Noted)
 
     def process(self, tick: int) -> None:
         self.status.state = State.EXECUTING
         for at, port in enumerate(PORTS):
-            reading = getattr(port)
-            self.status.message[at] = reading.message.value
+            reading: Reading[Wave] = getattr(self, port)
+            self.status.value[at] = reading.message.value
             self.status.verdict[at] = reading.verdict
             self.status.lost[at] = reading.is_lost
 
@@ -39,5 +41,5 @@ class Notes(Executor):
 class Exchanging(Notes):
     """A level that has taken the exchange's name."""
 
-    status = Output(Notes)
-    exchange = Output(Notes)
+    status = Output(Noted)
+    exchange = Output(Noted)

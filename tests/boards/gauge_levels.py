@@ -6,13 +6,13 @@ from enum import IntEnum
 
 from wave_levels import Watch
 
-from rack.backplane.message import Field, State, status
+from rack.backplane.message import State, Status, field
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults import drawing as draw
 from rack.boards.faults.bounds import DELIVERY, writes
 from rack.boards.faults.messages import MessageStep, Outgoing
-from rack.levels.level import Executor
+from rack.levels.level import Executor, Output
 
 OPENS_AT = 40
 
@@ -51,12 +51,17 @@ KINDS.add(
 )
 
 
+class GaugeStatus(Status, version=1, message="gauge"):
+    """Status of a gauge."""
+
+    valve: Valve = field(doc="its valve")
+    value: float = field(unit="1", doc="0")
+
+
 class Gauge(Executor):
     """Opens its valve at a tick."""
 
-    status = status(
-        "gauge", 1, Field("valve", "u1", Valve, "its valve"), Field("value", "f8", "1", "0")
-    )
+    status = Output(GaugeStatus)
 
     def process(self, tick: int) -> None:
         self.status.state = State.EXECUTING

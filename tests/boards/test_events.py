@@ -10,7 +10,7 @@ import pytest
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.message import Field, Message, MessageType, State, Status, field
+from rack.backplane.message import Message, State, Status, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.config.layout import field_specs
@@ -59,7 +59,13 @@ class Order(Message, version=1):
 TICK_MS = CLOCK_NS * 1e-6
 
 
-def box(name: str, kind: MessageType, writer: str) -> MailboxSpec:
+class Told(Message, version=1, message="command"):
+    """A command."""
+
+    id: int = field("u4", unit="1", doc="serial")
+
+
+def box(name: str, kind: type[Message], writer: str) -> MailboxSpec:
     """Return a mailbox of a type, as a level's."""
     return MailboxSpec(
         name=name,
@@ -69,10 +75,10 @@ def box(name: str, kind: MessageType, writer: str) -> MailboxSpec:
         every=1,
         delay=1,
         depth=8,
-        message=kind.name,
-        version=kind.version,
-        size=kind.dtype({}).itemsize,
-        fields=field_specs(kind, {}),
+        message=kind.message_type.name,
+        version=kind.message_type.version,
+        size=kind.message_type.dtype({}).itemsize,
+        fields=field_specs(kind.message_type, {}),
     )
 
 
@@ -84,9 +90,7 @@ def bus(make_bus: MakeBus) -> Segment:
         box("upper.status", LevelStatus, "upper"),
         box("lower.status", Braked, "lower"),
         box("lower.scene", Scene, "lower"),
-        box(
-            "lower.command", MessageType("command", 1, (Field("id", "u4", "1", "serial"),)), "lower"
-        ),
+        box("lower.command", Told, "lower"),
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field as Key
 
-from rack.backplane.message import Command, State, command, field
+from rack.backplane.message import Command, State, field
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Output
 from rack.levels.operator import RESTS_ON, AnsweringStatus, Operation, OperatorCommand, Orders
 from rack.levels.tables import Table, read_params
@@ -76,7 +76,7 @@ class JointLevel(Executor):
 
     above = Input(TestPath, "above.command")
     below = Input(TestSeen, "below.status")
-    part = Output(TestPart, rests_on=command)
+    part = Output(TestPart, rests_on=above)
     status = Output(TestSeen, rests_on=below)
     params = JointParams
 

@@ -76,7 +76,9 @@ class Task:
         self._has = dict.fromkeys(self._inputs, False)
         self._outputs = outputs
         kinds = {port: kind.message for port, kind in {**level.outputs, **outputs_of(spec)}.items()}
-        self.written = {port: kinds[port](box.dtype) for port, box in outputs.items()}
+        self.written: dict[str, Any] = {
+            port: kinds[port](box.dtype) for port, box in outputs.items()
+        }
         for port, message in self.written.items():
             level.place_output(port, message)
 

@@ -33,7 +33,7 @@ class WorldRig:
 
     @property
     def model(self) -> Message:
-        return cast(Message, self.rack.tasks["world"].write.model)
+        return cast(Message, self.rack.tasks["world"].written["model"])
 
     def run(self, seconds: float, poses: Poses | None) -> list[int]:
         """Run for `seconds`, with a scene every tick while `poses` is given; return the revisions

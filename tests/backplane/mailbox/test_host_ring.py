@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.host_ring import HostReader, HostWriter, is_proper
-from rack.backplane.message import Field, Message, MessageType
+from rack.backplane.message import AnyMessage
+from rack.backplane.message_type import Field, MessageType
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 from tests.backplane.bus import NAME, mailbox, message_address
@@ -101,7 +102,7 @@ def test_lengths_beyond_those_declared_and_text_beyond_ascii_are_improper_empty_
         1,
         (Field("ones", one, "1", "them", (3,)), Field("far", "f4", "m", "", (), (0.0, 5.0))),
     )
-    fields, message = field_specs(kind, {}), Message(kind.dtype({}))
+    fields, message = field_specs(kind, {}), AnyMessage(kind.dtype({}))
     assert is_proper(message.record, fields)
     for far, permitted in ((5.0, True), (-5.0, True), (5.1, False), (-5.1, False), (0.0, True)):
         message.far = far

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import Field, Message, MessageType
+from rack.backplane.message import AnyMessage, Message
+from rack.backplane.message_type import Field, MessageType
 from rack.boards.lan.config import ImportConfig
 from rack.levels.level import Executor, LevelContext, MadePorts, Output
 
@@ -29,9 +30,9 @@ class Extremes(Executor):
         ]
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, MessageType]) -> MadePorts:
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
         """Return the port that sends."""
-        return MadePorts(outputs={params["port"]: Output(message_type(params["type"]))})
+        return MadePorts(outputs={params["port"]: Output(message_class(params["type"]))})
 
     def process(self, tick: int) -> None:
         """Write the next one."""
@@ -39,20 +40,20 @@ class Extremes(Executor):
         getattr(self.context.params["port"]).raw[:] = self._rows[at]
 
 
-def message_type(name: str) -> MessageType:
-    """Return a message type by its name in a config."""
+def message_class(name: str) -> type[Message]:
+    """Return a message class by its name in a config."""
     table = {"from": "x/x.x", "type": name, "rate_hz": 1, "max_age_ms": 1}
-    return ImportConfig.model_validate(table).message_type()
+    return ImportConfig.model_validate(table).message_class()
 
 
 def cases(
-    kind: MessageType, base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
+    kind: type[Message], base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
 ) -> Iterator[Case]:
     """Yield the base itself, and the base with each field at each of its extremes. A group's are
     those of its first."""
     plain = filled(kind, base, sizes)
     yield "plain", bytes(plain.raw), True
-    for path, field in _leaves(kind.fields):
+    for path, field in _leaves(kind.message_type.fields):
         for value in _extremes(field, plain.record.dtype, path):
             message = filled(kind, base, sizes)
             message.record[path[0]][...] = message.record[path[0]]
@@ -70,10 +71,10 @@ def cases(
 
 
 def filled(
-    kind: MessageType, base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
+    kind: type[Message], base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
 ) -> Message:
     """Return a message with these fields."""
-    message = Message(kind.dtype(sizes or {}))
+    message = AnyMessage(kind.message_type.dtype(sizes or {}))
     for name, value in base.items():
         if isinstance(value, Mapping):
             for inner, number in value.items():

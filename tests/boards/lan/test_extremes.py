@@ -30,7 +30,7 @@ from rack.levels.systems.cell.messages import (
 )
 from rack.levels.systems.cell.shared_bodies import SharedBodies
 from rack.tools.viewer.window import free_port
-from tests.boards.lan.extreme_levels import Case, cases, message_type
+from tests.boards.lan.extreme_levels import Case, cases, message_class
 from tests.boards.lan.racks import Ended, run_together
 from tests.test_brown_network import configs
 
@@ -266,9 +266,9 @@ def rows_of(kind: str, bases: Iterable[Mapping[str, Any]], sizes: Mapping[str, i
     it."""
     given = iter(bases)
     found = []
-    for number, _ in enumerate(cases(message_type(kind), next(given), sizes)):
-        found.append(list(cases(message_type(kind), next(given), sizes))[number])
-        found.append(next(cases(message_type(kind), next(given), sizes)))
+    for number, _ in enumerate(cases(message_class(kind), next(given), sizes)):
+        found.append(list(cases(message_class(kind), next(given), sizes))[number])
+        found.append(next(cases(message_class(kind), next(given), sizes)))
     return found
 
 

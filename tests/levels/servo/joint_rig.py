@@ -70,7 +70,7 @@ class JointRig:
     @property
     def status(self) -> Message:
         """The status that the board of the arm wrote last."""
-        return cast(Message, self.rack.tasks["arm"].write.status)
+        return cast(Message, self.rack.tasks["arm"].written["status"])
 
     def run(self, ticks: int) -> None:
         for _ in range(ticks):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from rack.backplane.message import Message, MessageType
+from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS
 from rack.levels.algebra import Array
@@ -50,7 +50,7 @@ class ServoRig:
     function of time."""
 
     executor: type[ServoExecutor] = ServoExecutor
-    outside: Mapping[str, MessageType] = {"primitive.command": JointCommand}
+    outside: Mapping[str, type[Message]] = {"primitive.command": JointCommand}
     """Mailboxes that the test writes."""
 
     def __init__(
@@ -76,12 +76,12 @@ class ServoRig:
     @property
     def status(self) -> Message:
         """The status that the executor wrote last."""
-        return cast(Message, self.rack.tasks["servo"].write.status)
+        return cast(Message, self.rack.tasks["servo"].written["status"])
 
     @property
     def state(self) -> Message:
         """The arm's state that the executor wrote last."""
-        return cast(Message, self.rack.tasks["servo"].write.state)
+        return cast(Message, self.rack.tasks["servo"].written["state"])
 
     def set_point(self, position: Array, velocity: Array, due: int) -> None:
         self.command.id += 1

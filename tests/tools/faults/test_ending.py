@@ -8,7 +8,7 @@ from dataclasses import replace
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.message import MessageType, State
+from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 from rack.boards.faults.kind import KINDS
@@ -30,15 +30,15 @@ JOINTS = ("shoulder", "elbow")
 TASKS = task("task"), task("servo", slot=3), task("arm", slot=4)
 
 
-def box(message: MessageType, name: str) -> MailboxSpec:
+def box(kind: type[Message], name: str) -> MailboxSpec:
     """Return the spec of a board's mailbox."""
     return replace(
         mailbox(name=name, writer=name.partition(".")[0]),
         readers=(),
-        message=message.name,
-        version=message.version,
-        size=message.dtype(SIZES).itemsize,
-        fields=field_specs(message, SIZES),
+        message=kind.message_type.name,
+        version=kind.message_type.version,
+        size=kind.message_type.dtype(SIZES).itemsize,
+        fields=field_specs(kind.message_type, SIZES),
     )
 
 

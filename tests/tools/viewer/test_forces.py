@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rerun.blueprint as rrb
 
-from rack.backplane.message import MessageType
+from rack.backplane.message import Message
 from rack.backplane.segment import Launch
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.systems.force.messages import ForceStatus, Wrench
@@ -35,9 +35,13 @@ class Written:
         self._times = Timelines(CLOCK_NS, Launch(0, 0))
         self.stream = Stream(recording, self._times)
 
-    def write(self, kind: MessageType, cell: Cell, write: ViewPart, **fields: np.ndarray) -> None:
+    def write(self, kind: type[Message], cell: Cell, write: ViewPart, **fields: np.ndarray) -> None:
         """Write `ROWS` messages with these fields, one a tick."""
-        dtype = [("tick", "i8"), ("stamp_ns", "i8"), ("message", kind.dtype(sizes(cell)))]
+        dtype = [
+            ("tick", "i8"),
+            ("stamp_ns", "i8"),
+            ("message", kind.message_type.dtype(sizes(cell))),
+        ]
         rows = np.zeros(ROWS, dtype=dtype)
         rows["tick"] = rows["stamp_ns"] = np.arange(ROWS)
         for name, values in fields.items():

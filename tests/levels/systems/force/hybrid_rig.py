@@ -97,8 +97,8 @@ class HybridRig:
         arm = self.rack.tasks["arm"]
         for _ in range(round(seconds * 1e9 / CLOCK_NS)):
             self.rack.step()
-            self.forces.append(arm.write.wrench.wrench.copy())
-            self.targets.append(arm.write.status.target.copy())
+            self.forces.append(arm.written["wrench"].wrench.copy())
+            self.targets.append(arm.written["status"].target.copy())
 
     @property
     def tool(self) -> Array:

@@ -46,7 +46,7 @@ class ServerRig(TrajectoryRig):
 
     @property
     def status(self) -> Message:
-        return self.write.status
+        return self.written["status"]
 
     @property
     def mode(self) -> Mode:
@@ -74,8 +74,8 @@ class ServerRig(TrajectoryRig):
 
     def obey(self) -> None:
         command, wanted, force, status = (
-            self.write.command,
-            self.write.compliance,
+            self.written["command"],
+            self.written["compliance"],
             self.force,
             self.statuses["joints0"],
         )

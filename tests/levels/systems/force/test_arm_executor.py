@@ -65,11 +65,11 @@ class PressRig:
 
     @property
     def status(self) -> Message:
-        return cast(Message, self.rack.tasks["arm"].write.status)
+        return cast(Message, self.rack.tasks["arm"].written["status"])
 
     @property
     def wrench(self) -> Message:
-        return cast(Message, self.rack.tasks["arm"].write.wrench)
+        return cast(Message, self.rack.tasks["arm"].written["wrench"])
 
     def go(self, x: float, seconds: float) -> None:
         """Move the tool to `x`, m, along the world's x axis, at a constant velocity."""

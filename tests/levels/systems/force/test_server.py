@@ -115,10 +115,10 @@ def test_a_restarted_server_goes_on_with_the_same_contact() -> None:
     rig = pressing()
     along = rig.line((X, EDGE + 0.05, HEIGHT), 2.0)
     rig.run(0.5)
-    before = rig.write.compliance.id
+    before = rig.written["compliance"].id
     rig.restart()
     rig.run(3.5)
     assert rig.ends()[along] == RequestEnd.DONE
-    assert (rig.write.compliance.id, rig.mode) == (before, Mode.FORCE)
+    assert (rig.written["compliance"].id, rig.mode) == (before, Mode.FORCE)
     assert abs(rig.pressed[-1] - 15.0) < 1.0
     assert rig.places[-1][1] == pytest.approx(EDGE + 0.05, abs=1e-3)

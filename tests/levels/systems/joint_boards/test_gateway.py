@@ -3,17 +3,21 @@ frozen, and back."""
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, MessageType, State
+from rack.backplane.message import Message, State
 from rack.levels.level import LevelContext, Pace
 from rack.levels.messages import Error
 from rack.levels.robot.cell import sizes
 from rack.levels.systems.joint_boards.gateway import JointGateway
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from tests.levels.arms import cell, config
+
+M = TypeVar("M", bound=Message)
 
 TICK_S = 0.001
 PERIOD, EVERY, DELAY, MISSING = 10, 2, 2, 5
@@ -24,8 +28,8 @@ BOARDS = ("near", "far")
 SIZES = sizes(cell("puma560"))
 
 
-def message(kind: MessageType) -> Message:
-    return Message(kind.dtype(SIZES))
+def message(kind: type[M]) -> M:
+    return kind.zeros(SIZES)
 
 
 class GatewayRig:
@@ -114,7 +118,7 @@ def test_after_too_many_missing_the_arm_is_left_to_the_boards_and_then_joined_ag
     rig = GatewayRig()
     # A level above that wants no motion is obeyed without extrapolation.
     rig.run(200, missing=True)
-    assert (rig.given, rig.write.command.due, rig.status.reason) == ([], 0, "")
+    assert (rig.given, rig.gateway.command.due, rig.status.reason) == ([], 0, "")
     rig.run(100)
     newest = rig.made + 2 * PERIOD + LATENCY
     rig.run(150, missing=True)
@@ -124,7 +128,7 @@ def test_after_too_many_missing_the_arm_is_left_to_the_boards_and_then_joined_ag
         "no reference from 'above': held after 5 extrapolated",
     )
     rig.run(50)
-    assert rig.write.command.due > rig.tick
+    assert rig.gateway.command.due > rig.tick
     assert rig.status.reason == ""
 
 

@@ -110,14 +110,14 @@ def test_a_motion_leads_straight_from_rest_to_rest(bench: Bench) -> None:
         arms.append(bench.look()["arm"])
         assert len(arms) < 10_000
         positions.append(bench.give().position.copy())
-        assert bench.write.status.moving == (arms[-1] == "moving")
+        assert bench.level.status.moving == (arms[-1] == "moving")
     assert arms[-1] == "arrived"
     np.testing.assert_allclose(positions[-1], goal, atol=1e-9)
-    assert (bench.write.command.velocity == 0).all()
+    assert (bench.level.command.velocity == 0).all()
     moved = np.array(positions) - bench.home
     np.testing.assert_allclose(moved, moved[:, :1] * np.ones(len(goal)), atol=1e-9)
     assert (np.diff(moved[:, 0]) >= -1e-12).all()
-    np.testing.assert_array_equal(bench.write.status.end, goal)
+    np.testing.assert_array_equal(bench.level.status.end, goal)
 
 
 def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: Bench) -> None:
@@ -148,7 +148,7 @@ def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: s
     for _ in range(10):
         bench.give()
         bench.look()
-    before = bench.write.command.position.copy()
+    before = bench.level.command.position.copy()
     getattr(bench.level, action)()
     cycles = 0
     while (arm := bench.look()["arm"]) == "moving":

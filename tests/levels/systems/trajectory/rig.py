@@ -52,7 +52,7 @@ class TrajectoryRig:
             params=params,
         )
         self.level = self.level_class(self.context)
-        self.written = {
+        self.written: dict[str, Any] = {
             port: self.message(kind.message) for port, kind in self.level.outputs.items()
         }
         self._connect()
@@ -154,7 +154,7 @@ class TrajectoryRig:
         return Reading(message, Verdict.OLD if there else Verdict.NONE)
 
     def obey(self) -> None:
-        before = self.write.command
+        before = self.written["command"]
         for status in self.statuses.values():
             if before.due and not status.stopped:
                 status.holding, status.target, status.target_velocity = (
@@ -171,20 +171,20 @@ class TrajectoryRig:
         self.read()
         self.level.process(self.tick)
         self.tick += EVERY
-        if self.write.command.due:
-            self.positions.append(self.write.command.position.copy())
-            self.velocities.append(self.write.command.velocity.copy())
-        return self.write.status
+        if self.written["command"].due:
+            self.positions.append(self.written["command"].position.copy())
+            self.velocities.append(self.written["command"].velocity.copy())
+        return self.written["status"]
 
     def run(self, seconds: float) -> Message:
         """Run for simulated `seconds`; return the status."""
         for _ in range(round(seconds / PERIOD_S)):
             self.cycle()
-        return self.write.status
+        return self.written["status"]
 
     def ends(self) -> dict[int, int]:
         """Return how the last requests ended, by id."""
-        status = self.write.status
+        status = self.written["status"]
         return {
             int(request): int(how)
             for request, how in zip(status.ended, status.ends, strict=True)

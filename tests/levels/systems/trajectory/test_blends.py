@@ -36,7 +36,7 @@ def test_no_chain_of_requests_exceeds_a_limit(chain: list, at: float, what: str)
     act(rig, what)
     rig.run(1.0)
     act(rig, "resume")
-    while rig.write.status.done < rig.ids and rig.tick < 60_000:
+    while rig.written["status"].done < rig.ids and rig.tick < 60_000:
         rig.cycle()
     status = rig.run(0.5)
     speed, acceleration = rig.excess()

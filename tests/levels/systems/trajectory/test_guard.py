@@ -22,7 +22,7 @@ def rig() -> TrajectoryRig:
     x, y, z = rig.run(0.2).tool
     rig.request(MotionKind.POSE, position=(x, y, z - 0.1), quaternion=DOWN, segment=4.0, touch=MOST)
     rig.run(1.0)
-    assert rig.write.status.current == 1
+    assert rig.written["status"].current == 1
     return rig
 
 
@@ -41,11 +41,11 @@ def end(rig: TrajectoryRig, seconds: float = 0.6) -> int:
 def test_a_touch_ends_the_line_and_the_next_request_goes_on_from_there(
     rig: TrajectoryRig, torque: float
 ) -> None:
-    height = float(rig.write.status.tool[2])
+    height = float(rig.written["status"].tool[2])
     press(rig, torque)
     assert end(rig) == RequestEnd.GUARDED
-    assert rig.write.status.resting
-    assert height - rig.write.status.tool[2] < 0.01
+    assert rig.written["status"].resting
+    assert height - rig.written["status"].tool[2] < 0.01
     rig.joints([0.1, 0, 0, 0, 0, 0])
     rig.run(4.0)
     assert rig.ends()[2] == RequestEnd.DONE
@@ -95,7 +95,7 @@ def test_the_guard_outlives_the_level(rig: TrajectoryRig) -> None:
     rig.brake()
     rig.tick += 2 * EVERY
     rig.run(1.5)
-    assert rig.write.status.current == 1
+    assert rig.written["status"].current == 1
     press(rig, TOUCH)
     assert end(rig) == RequestEnd.GUARDED
 
@@ -106,4 +106,4 @@ def test_a_guard_that_is_none_is_refused(most: float) -> None:
     place = rig.run(0.2).tool
     rig.request(MotionKind.POSE, position=place, quaternion=DOWN, touch=most)
     assert end(rig) == RequestEnd.REFUSED
-    assert "guard" in rig.write.status.reason
+    assert "guard" in rig.written["status"].reason

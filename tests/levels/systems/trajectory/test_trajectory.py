@@ -45,7 +45,7 @@ def test_the_tool_keeps_up_with_a_body_that_moves() -> None:
     rig.request(MotionKind.STAY, segment=3.0)
     rig.joints([0] * 6)
     rig.follow(3.5)
-    status = rig.write.status
+    status = rig.written["status"]
     assert status.current == 2
     assert 0.0 < status.astray < 1e-3
     # The set point is due two cycles later: the tool is where the body will be then.
@@ -118,10 +118,10 @@ def test_a_restarted_level_neither_repeats_nor_loses_a_request() -> None:
     rig.request(MotionKind.STAY, segment=0.5)
     rig.joints([0.2, 0, 0, 0, 0, 0])
     rig.run(2.0)
-    before, current = rig.write.status.done, rig.write.status.current
+    before, current = rig.written["status"].done, rig.written["status"].current
     rig.restart()
     rig.run(0.3)
-    assert (rig.write.status.done, rig.write.status.current) == (before, current)
+    assert (rig.written["status"].done, rig.written["status"].current) == (before, current)
     for _ in range(2):
         rig.run(1.7)
         rig.restart()
@@ -152,7 +152,7 @@ def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -
     rig.run(1.0)
     rig.lost.add("joints1")
     status = rig.run(0.2)
-    assert (rig.write.command.due, status.state) == (0, State.HOLDING)
+    assert (rig.written["command"].due, status.state) == (0, State.HOLDING)
     assert status.reason.startswith("waiting for joints1: no status for")
     rig.lost.clear()
     rig.brake()
@@ -160,7 +160,7 @@ def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -
     name, stopped = next(iter(rig.statuses.items()))
     stopped.stopped, stopped.reason = 1, "brakes engaged"
     status = rig.run(0.3)
-    assert rig.write.command.due == 0
+    assert rig.written["command"].due == 0
     assert status.state == State.HOLDING
     assert status.reason == f"waiting for {name}: brakes engaged"
     stopped.target[0] += 0.02  # it sagged meanwhile
@@ -168,7 +168,7 @@ def test_the_level_waits_for_every_board_and_continues_from_where_the_arm_is() -
 
     rig.cycle()
     rig.cycle()
-    assert abs(rig.write.command.position[0] - stopped.target[0]) < 1e-3
+    assert abs(rig.written["command"].position[0] - stopped.target[0]) < 1e-3
     status = rig.run(4.0)
     assert status.state == State.DONE
     assert np.allclose(rig.positions[-1][0] - rig.cell.home[0], 0.5, atol=1e-9)
@@ -184,7 +184,7 @@ def test_an_operator_holds_and_resumes() -> None:
     assert status.state == State.HOLDING
     assert "held by the operator" in status.reason
     assert status.answer == Answer.DONE
-    assert rig.write.command.operator == rig.order.id
+    assert rig.written["command"].operator == rig.order.id
     where = rig.positions[-1].copy()
     rig.run(0.5)
     assert np.array_equal(rig.positions[-1], where)
@@ -200,7 +200,7 @@ def test_set_points_are_due_two_cycles_later_with_the_load_of_the_motion() -> No
     rig = TrajectoryRig()
     rig.joints([0.5, 0.5, 0, 0, 0, 0])
     rig.run(1.0)
-    command = rig.write.command
+    command = rig.written["command"]
     assert command.due == rig.tick + EVERY
     terms = rig.level._dynamics.terms(command.position, command.velocity)
     assert np.array_equal(command.load, terms.bias)
@@ -214,7 +214,7 @@ def test_a_body_that_outruns_the_arm_fails_the_request_and_the_arm_ramps_to_rest
     rig.request(MotionKind.POSE, position=(0, 0, 0.1), quaternion=DOWN, body=POST, live=1)
     rig.request(MotionKind.STAY, segment=9.0)
     rig.follow(6.0)
-    status = rig.write.status
+    status = rig.written["status"]
     assert status.state == State.ERROR
     assert rig.ends()[2] == RequestEnd.FAILED
     assert "request 2: " in status.reason

@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 
 from rack.backplane.layout import PROTOCOLS
-from rack.backplane.message import Message
 from rack.backplane.segment import SHM_FOLDER
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import EXTRA, Absent, Sample, absent_package
-from rack.tools.lab.benches.mailbox import MESSAGE, Case, Exchange, compare, measure
+from rack.tools.lab.benches.mailbox import Bench, Case, Exchange, compare, measure
 from rack.tools.lab.benches.transports import PEERS, Peer, Transport, multiprocessing_pipe
 from tests.processes import BOUND_S
 from tests.tools.lab.benches.test_harness import Hidden
@@ -53,7 +52,7 @@ def test_every_reader_receives_every_message_and_nothing_is_left(
 def use(peer: Peer, folder: Path) -> None:
     tempfile.tempdir = str(folder)
     case = Case("2 kB", 3)
-    with peer.opened(MESSAGE.dtype(case.lengths), case.readers) as transport:
+    with peer.opened(Bench.message_type.dtype(case.lengths), case.readers) as transport:
         # No name is left even while messages pass.
         assert not list(folder.iterdir())
         assert not left_by(os.getpid())
@@ -73,8 +72,8 @@ def test_a_transport_that_loses_messages_is_noticed() -> None:
 
     @contextmanager
     def lossy() -> Iterator[Transport]:
-        with multiprocessing_pipe(MESSAGE.dtype(case.lengths), 1) as transport:
-            stale = Message(MESSAGE.dtype(case.lengths))
+        with multiprocessing_pipe(Bench.message_type.dtype(case.lengths), 1) as transport:
+            stale = Bench.zeros(case.lengths)
             yield transport._replace(readers=[*transport.readers, lambda tick: stale])
 
     with (

@@ -27,30 +27,32 @@ SECONDS = 0.7
 CHECKPOINTS = "record.checkpoint_s=0.25"
 OWN_LEVEL = """
 from time import monotonic_ns
-from rack.backplane.message import Field, MessageType
-from rack.levels.level import Executor, Input
+import numpy as np
+from rack.levels import Executor, Input, Message, Output, field
 
-SUM = MessageType("sum", 1, (Field("value", "f8", "1", "sum", (2,)),))
+
+class Sum(Message, version=1):
+    value: np.ndarray = field(unit="1", doc="sum", shape=2)
 
 
 class Summing(Executor):
-    outputs = {"sum": SUM}
+    sum = Output(Sum)
 
     def __init__(self, context):
         super().__init__(context)
         self._sum = 0.0
 
-    def process(self, read, write, tick):
+    def process(self, tick):
         self._sum += 1.0
-        write.sum.value[1] = self._sum if tick < 250 else AFTER
+        self.sum.value[1] = self._sum if tick < 250 else AFTER
 
 
 class Passing(Executor):
-    inputs = {"sum": Input(SUM, "below.sum")}
-    outputs = {"sum": SUM}
+    below = Input(Sum, "below.sum")
+    sum = Output(Sum, rests_on=below)
 
-    def process(self, read, write, tick):
-        write.sum.value[:] = read.sum.value.value
+    def process(self, tick):
+        self.sum.value[:] = self.below.message.value
 """
 SUMMING = """
 format = 2
