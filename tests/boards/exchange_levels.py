@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from wave_levels import Wave
+from wave_levels import WaveStatus
 
 from rack.backplane.message import State, Status, field
 from rack.levels.level import Executor, Input, Output, Reading
@@ -24,15 +24,15 @@ class Noted(Status, version=1, message="notes"):
 class Notes(Executor):
     """Reads one status by three ports, and notes what they show."""
 
-    plain = Input(Wave, "below.status")
-    sparse = Input(Wave, "below.status")
-    early = Input(Wave, "below.status")
+    plain = Input(WaveStatus, "below.status")
+    sparse = Input(WaveStatus, "below.status")
+    early = Input(WaveStatus, "below.status")
     status = Output(Noted)
 
     def process(self, tick: int) -> None:
         self.status.state = State.EXECUTING
         for at, port in enumerate(PORTS):
-            reading: Reading[Wave] = getattr(self, port)
+            reading: Reading[WaveStatus] = getattr(self, port)
             self.status.value[at] = reading.message.value
             self.status.verdict[at] = reading.verdict
             self.status.lost[at] = reading.is_lost

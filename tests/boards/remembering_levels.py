@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.level import Executor, LevelContext, Output
-from tests.boards.wave_levels import Wave
+from tests.boards.wave_levels import WaveStatus
 
 
 class Turn:
@@ -43,7 +43,7 @@ def counter() -> Callable[[], int]:
 class Rememberer(Executor):
     """Writes a number into which all of its past goes."""
 
-    status = Output(Wave)
+    status = Output(WaveStatus)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -89,7 +89,7 @@ class Rememberer(Executor):
 class Generator(Executor):
     """Remembers in something that nobody can copy."""
 
-    status = Output(Wave)
+    status = Output(WaveStatus)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)

@@ -17,8 +17,8 @@ from rack.levels.errors import LevelError
 from rack.levels.level import Executor, Input, LevelContext, Output, Planner
 
 
-class Wave(Status, version=1):
-    """Wave."""
+class WaveStatus(Status, version=1, message="wave"):
+    """Height of a wave."""
 
     value: float = field(unit="1", doc="height of the wave")
 
@@ -65,7 +65,7 @@ class Trouble:
 class Wave(Executor):
     """Writes a value that grows with time; done at tick `done_at`."""
 
-    status = Output(Wave)
+    status = Output(WaveStatus)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -109,7 +109,7 @@ class Steady(PlannedWave):
 class GainPlanner(Planner):
     """Plans the gain from the wave's status, every `plan_every` ticks."""
 
-    status = Input(Wave, "own.status")
+    status = Input(WaveStatus, "own.status")
     output = Output(Gain)
 
     def __init__(self, context: LevelContext) -> None:
@@ -136,8 +136,8 @@ class BadPlanner(GainPlanner):
 class Watch(Executor):
     """Repeats the wave's status."""
 
-    below = Input(Wave, "below.status")
-    status = Output(Wave, rests_on=below)
+    below = Input(WaveStatus, "below.status")
+    status = Output(WaveStatus, rests_on=below)
 
     def process(self, tick: int) -> None:
         self.status.state = self.below.message.state

@@ -18,7 +18,7 @@ from rack.boards.lan.config import LanTable
 from rack.boards.lan.envelope import Envelope, kind_of
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import LanLink
-from tests.boards.lan.lan_levels import Pulse
+from tests.boards.lan.lan_levels import PulseStatus
 
 LAUNCH = 7
 CALM_NS = 20_000_000
@@ -34,7 +34,7 @@ def main(name: str, endpoint: str, victim: str) -> None:
     )
     flood, calm = (link.publish(out_key(name, f"{port}.status")) for port in ("pulse", "calm"))
     dtype = message_dtype(
-        field_specs(Pulse.message_type, {}), Pulse.message_type.dtype({}).itemsize
+        field_specs(PulseStatus.message_type, {}), PulseStatus.message_type.dtype({}).itemsize
     )
     message, kind, number, due = Message(dtype), kind_of("pulse", 1, dtype), 0, 0
     link.declare_alive(LAUNCH)

@@ -7,8 +7,8 @@ from rack.backplane.message import Status, field
 from rack.levels.level import Executor, Input, Output
 
 
-class Pulse(Status, version=1):
-    """Pulse."""
+class PulseStatus(Status, version=1, message="pulse"):
+    """Count of cycles."""
 
     count: int = field(unit="1", doc="cycles so far")
 
@@ -25,7 +25,7 @@ class Heard(Status, version=1):
 class Pulse(Executor):
     """Counts its cycles."""
 
-    status = Output(Pulse)
+    status = Output(PulseStatus)
 
     def process(self, tick: int) -> None:
         self.status.count = tick // self.context.every
@@ -34,7 +34,7 @@ class Pulse(Executor):
 class Echo(Executor):
     """Adds up what it hears of another rack, `lan.other`."""
 
-    other = Input(Pulse, "lan.other")
+    other = Input(PulseStatus, "lan.other")
     status = Output(Heard)
 
     def process(self, tick: int) -> None:

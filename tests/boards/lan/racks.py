@@ -79,7 +79,7 @@ def rack_text(
     imported = f"""
 [adapter.lan.import.other]
 from = "{other}/pulse.status"
-type = "lan_levels:PULSE"
+type = "lan_levels:PulseStatus"
 rate_hz = 50
 max_age_ms = 100
 """

@@ -13,7 +13,7 @@ from rack.boards.lan.keys import alive_key, launch_and_cycle
 
 TLS, TCP = "tls/10.0.0.1:7447", "tcp/127.0.0.1:7447"
 QUERIES = ("query", "reply")
-ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
+ENTRY = {"type": "lan_levels:PulseStatus", "max_age_ms": 100.0}
 
 
 def rules(

@@ -120,7 +120,12 @@ class Sent(Message, version=1):
     value: float = field(unit="1", doc="a number")
 
 
-IMPORTED = {"from": "b/pulse.status", "type": "lan_levels:PULSE", "rate_hz": 50, "max_age_ms": 100}
+IMPORTED = {
+    "from": "b/pulse.status",
+    "type": "lan_levels:PulseStatus",
+    "rate_hz": 50,
+    "max_age_ms": 100,
+}
 
 
 def test_what_keeps_the_exchange_from_its_work_is_said(make: MakeAdapter) -> None:

@@ -189,7 +189,7 @@ def test_a_flood_costs_a_bounded_number_of_looks_and_other_entries_go_on(
     calm = """
 [adapter.lan.import.calm]
 from = "flood/calm.status"
-type = "lan_levels:PULSE"
+type = "lan_levels:PulseStatus"
 rate_hz = 50
 max_age_ms = 1000
 """

@@ -12,7 +12,7 @@ from rack.boards.lan.link import _settings
 from tests.snapshots import Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
-ENTRY = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
+ENTRY = {"type": "lan_levels:PulseStatus", "max_age_ms": 100.0}
 TABLES: dict[str, dict[str, Any]] = {
     "nothing": {},
     "loopback": {"listen": ("tcp/127.0.0.1:7447",), "export": {"a": {"from": "a.status"}}},

@@ -118,7 +118,7 @@ def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
         addresses = {name: ["127.0.0.1"] for name in ("home", *NAMES)}
         make_credentials(folder / each, {**addresses, "impostor": ["127.9.9.9"]}, 1)
     port, friends_port = free_port(), free_port()
-    entry = {"type": "lan_levels:PULSE", "max_age_ms": 100.0}
+    entry = {"type": "lan_levels:PulseStatus", "max_age_ms": 100.0}
     table = {
         "listen": [f"{protocol}/127.0.0.1:{port}"],
         # Over quic zenoh does one handshake at a time, and that to nobody takes 3 s.

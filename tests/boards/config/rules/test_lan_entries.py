@@ -70,7 +70,7 @@ MISTAKES = {
     ),
     "a rack itself": (
         [
-            "adapter.lan.import.own={ from = 'one/pulse.status', type = 'lan_levels:PULSE',"
+            "adapter.lan.import.own={ from = 'one/pulse.status', type = 'lan_levels:PulseStatus',"
             " max_age_ms = 500 }"
         ],
         (
@@ -116,7 +116,7 @@ MISTAKES = {
     ),
     "an import twice": (
         [
-            "adapter.lan.import.again={ from = 'two/pulse.status', type = 'lan_levels:PULSE',"
+            "adapter.lan.import.again={ from = 'two/pulse.status', type = 'lan_levels:PulseStatus',"
             " rate_hz = 50, max_age_ms = 500 }"
         ],
         (
@@ -126,7 +126,7 @@ MISTAKES = {
     ),
     "a port of the adapter's own": (
         [
-            "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PULSE', max_age_ms ="
+            "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PulseStatus',"
             " 500 }"
         ],
         "adapter.lan.import.status: the adapter writes its status under this name; rename the port",
