@@ -55,7 +55,7 @@ class NextCycle:
         self._spec = spec = segment.layout.task(task)
         self._words = segment.words
         self._block = segment.block(task)
-        self._semaphore = wake_semaphore(segment.rack, task)
+        self._semaphore = wake_semaphore(segment, task)
         self._segment = segment
         is_lockstep = bool(segment.words[System.LOCKSTEP])
         self._sleeps = spec.wake == "timer" and not is_lockstep
@@ -158,7 +158,12 @@ class NextCycle:
         return self._look_around()
 
     def _await_post(self) -> bool:
-        return self._semaphore.await_post(CHECK_S) or self._look_around()
+        # The bound may be that of an earlier wait: a timeout that comes early costs one look
+        # around, no more.
+        if not self._semaphore.wait():
+            return True
+        self._semaphore.bind(monotonic_ns() + int(CHECK_S * 1e9))
+        return self._look_around()
 
     def _block_on_semaphore(self) -> bool:
         bound = int(CHECK_S * 1e9)

@@ -21,11 +21,11 @@ from contextlib import suppress
 from importlib import import_module
 from multiprocessing.connection import Connection
 
-from rack.backplane import semaphores
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import note_used_files
 from rack.backplane.process import adopt_orphans, children_of, refusal, set_priority
 from rack.backplane.segment import Segment
+from rack.backplane.semaphores import done_semaphore
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.classes import find_class
 from rack.boards.crate.line import received
@@ -114,7 +114,6 @@ class Crate:
                 self._preload(wanted)
             case Open(rack, priority):
                 self._segment = Segment.attach(rack)
-                semaphores.open_all(self._segment.layout)
                 note_used_files()
                 set_priority(priority)
                 self._line.send(Opened())
@@ -253,7 +252,7 @@ class Crate:
                 UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
             words[System.LOSSES] += 1
             # In lockstep the clock waits for this.
-            semaphores.done_semaphore(self._segment.rack, name).release()
+            done_semaphore(self._segment, name).release()
         return tick
 
     def _is_host(self, name: str) -> bool:
@@ -293,7 +292,6 @@ class Crate:
         if hasattr(self, "_segment"):
             self._segment.close()
             del self._segment
-        semaphores.close_all()
         self._poll.register(self._line, select.POLLIN)
         self._poll.register(self._launcher, select.POLLIN)
         # A Rack that is gone is noticed next.

@@ -15,7 +15,6 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Self
 
-from rack.backplane import semaphores
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import pick
 from rack.backplane.errors import DamageError, EmergencyStopError
@@ -197,15 +196,11 @@ class Rack:
         words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
         if self._origin is not None:
             import_module(RESTORING).continue_in(self.segment, self._origin)
-        semaphores.create(plan.layout)
         crate.send(Open(self.config.name, plan.crate_priority))
         self._journal.add(
             "launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes"
         )
         await_opened(crate, self._journal, LAUNCH_S)
-        # The crate has them open and every board inherits them. Without names nothing can be left
-        # behind.
-        semaphores.unlink(plan.layout, kept=[host.board for host in plan.hosts if host.is_external])
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
         self._await_ready()

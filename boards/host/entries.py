@@ -186,7 +186,7 @@ class Outward:
         self._source = open_observer(segment, table.source)
         readers = self._writer.spec.readers
         self._readers = [
-            (segment.block(name), wake_semaphore(segment.rack, name)) for name in readers
+            (segment.block(name), wake_semaphore(segment, name)) for name in readers
         ]
 
     def exchange(self, read: Ports, write: Ports, tick: int) -> None:

@@ -37,7 +37,7 @@ def serve(
         time.sleep(work_s)
         log.append(("end", name, tick))
         block[Block.DONE] = tick
-        done_semaphore(segment.rack, name).release()
+        done_semaphore(segment, name).release()
 
 
 def lockstep(
@@ -417,6 +417,6 @@ def test_a_restarted_clock_waits_for_the_batch_of_its_predecessor(make_bus: Make
     driver = LockstepDriver(segment, ended, False, HISTORY)
     with in_thread(driver.run):
         block[Block.DONE] = 6
-        done_semaphore(segment.rack, "fast").release()
+        done_semaphore(segment, "fast").release()
     assert asked
     assert set(asked) == {6}

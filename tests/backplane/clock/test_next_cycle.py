@@ -49,7 +49,7 @@ def start_grid(segment: Segment, passed_ns: int = 0, period_ns: int = PERIOD_NS)
 
 def release(segment: Segment, tick: int) -> None:
     segment.block("level")[Block.RELEASED] = tick
-    wake_semaphore(segment.rack, "level").release()
+    wake_semaphore(segment, "level").release()
 
 
 def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
@@ -152,7 +152,7 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     )
     thread.start()
     bus.words[System.STATE] = Run.STOPPED
-    wake_semaphore(bus.rack, "level").release()
+    wake_semaphore(bus, "level").release()
     thread.join(BOUND_S)
     assert found == [-1, None]
 
@@ -203,7 +203,7 @@ def test_a_clock_without_ticks_is_stopped_only_when_it_could_not_run(
             # The checks a tenth of a second apart or more.
             wait_until(lambda: len(looks) > 60)
             bus.words[System.STATE] = Run.STOPPED
-            wake_semaphore(bus.rack, "level").release()
+            wake_semaphore(bus, "level").release()
     assert [Alarm(code) for code in alarm_ring(bus, "level").drain().rows["code"]] == rung
 
 
@@ -233,7 +233,7 @@ def test_posts_that_a_task_does_not_wait_for_do_not_add_up(bus: Segment) -> None
         release(bus, tick)
         if tick % 3:
             assert cycle.wait() == tick
-    assert wake_semaphore(bus.rack, "level").value < 100 // 3 + 2
+    assert wake_semaphore(bus, "level").value < 100 // 3 + 2
 
 
 def publish(segment: Segment, tick: int) -> None:
@@ -342,7 +342,7 @@ def test_a_task_that_sleeps_before_the_clock_starts_is_woken_to_sleep_by_its_gri
     thread = threading.Thread(target=lambda: found.append(cycle.wait()), daemon=True)
     thread.start()
     start_grid(bus, -4 * PERIOD_NS)
-    wake_semaphore(bus.rack, "level").release()
+    wake_semaphore(bus, "level").release()
     publish(bus, 0)
     thread.join(BOUND_S / 2)
     assert found == [0]
@@ -373,4 +373,4 @@ def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: S
     block[Block.FIRST] = 24
     release(bus, 28)
     assert [(cycle.wait(), cycle.skipped) for _ in range(2)] == [(24, 2), (28, 0)]
-    assert wake_semaphore(bus.rack, "level").value == 0
+    assert wake_semaphore(bus, "level").value == 0

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from rack.backplane import semaphores
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import State
 from rack.backplane.segment import Segment, unlink
@@ -98,9 +97,6 @@ def make_site(config: MakeConfig) -> Iterator[MakeSite]:
             segment = Segment.create(plan.layout, "")
             stack.callback(unlink, plan.layout.rack)
             stack.callback(segment.close)
-            semaphores.create(plan.layout)
-            stack.callback(semaphores.unlink_all, plan.layout.rack)
-            semaphores.open_all(plan.layout)
             return Site(plan, segment)
 
         yield make
@@ -223,7 +219,7 @@ def test_a_restarted_bridge_counts_on_and_repeats_what_it_said(
 def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: OpenBus) -> None:
     site = make_site()
     bus = open_bus(site)
-    semaphore = wake_semaphore(site.segment.rack, "program")
+    semaphore = wake_semaphore(site.segment, "program")
     site.cycle()
     assert (semaphore.value, site.count("sum")) == (0, {"arrived": NEVER, "age": NEVER})
     level = OutputPorts(
