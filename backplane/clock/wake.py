@@ -79,8 +79,8 @@ class NextCycle:
         self.hold_until(self._due)
         self._slack = 0
         self.skipped = 0
-        self.save: Callable[[], None] | None = None
-        """Called when the clock wants the state of the task, between two cycles."""
+        self.copy: Callable[[], None] | None = None
+        """Called when the clock wants a copy of the task, between two cycles."""
 
     def wait(self) -> int | None:
         """Wait for the next release and return its tick; None when the run is over and every
@@ -109,8 +109,8 @@ class NextCycle:
                     self._semaphore.take()
                 self._newest = newest
                 return self._take(newest)
-            if block[Block.SAVE] and self.save is not None:
-                self.save()
+            if block[Block.COPY] > 0 and self.copy is not None:
+                self.copy()
             if is_over or not self._pause():
                 return None
             is_posted = False
