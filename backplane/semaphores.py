@@ -84,9 +84,7 @@ class Semaphore:
         return True
 
 
-def initialize(
-    memory: memoryview, wake_and_done: Iterable[int], locks: Iterable[int]
-) -> None:
+def initialize(memory: memoryview, wake_and_done: Iterable[int], locks: Iterable[int]) -> None:
     """Make the semaphores of a rack at these bus addresses: locks are free, wake-ups unsent."""
     for value, addresses in ((0, wake_and_done), (1, locks)):
         for address in addresses:

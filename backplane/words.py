@@ -99,7 +99,7 @@ class System:
     FOLLOWER_DRAINED = 57
     # 1 + tick before which lockstep takes a snapshot; 0: none is wanted. Written by the Rack
     SNAPSHOT_AT = 58
-    # snapshots cost lockstep one part in so many of its time; 0: only that one is taken. By the Rack
+    # snapshots cost one part in so many of lockstep's time; 0: there is only that one. By the Rack
     SNAPSHOT_PART = 59
     SNAPSHOTS = 60  # held by the crate, of this rack or of those before it; written by the crate
     SNAPSHOT_BYTES = 61  # the memory that they have for themselves; written by the crate

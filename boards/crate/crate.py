@@ -142,7 +142,7 @@ class Crate:
                 self._kill(name)
             case Show(tick, name):
                 snapshot = self._shelf.nearest(tick)
-                text = "" if snapshot is None else self._shelf.show(snapshot, name)
+                text = "" if snapshot is None or not name else self._shelf.show(snapshot, name)
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
     def _fill_segment(self, before: int) -> int:

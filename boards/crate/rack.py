@@ -94,8 +94,8 @@ class Rack:
     adapter and port, host boards are not started, and other racks not met: what a recorded run
     wrote there enters instead. `snapshots`: those that it takes in lockstep. `continues`: the
     snapshot of its `crate` from which it goes on. `requests`: an operator's commands besides the
-    config's, and those that wait in the snapshot, by their ticks. `repeats`: the rack whose run this repeats under a name
-    of its own; levels see the name of that.
+    config's, and those that wait in the snapshot, by their ticks. `repeats`: the rack whose run
+    this repeats under a name of its own; levels see the name of that.
     """
 
     def __init__(

@@ -121,22 +121,22 @@ class SnapshotShelf:
         self._held.append(snapshot)
         snapshot.private_bytes = os.fstat(snapshot.memory).st_size
         while len(self._held) > MOST_SNAPSHOTS or (
-            len(self._held) > 1 and self.private_bytes > self._most_bytes
+            len(self._held) > 2 and self.private_bytes > self._most_bytes
         ):
             self.drop(self._most_dispensable())
 
     def _most_dispensable(self) -> HeldSnapshot:
         """Return the snapshot of the older half, in the order in which they were taken, that leaves
-        the smallest gap between its neighbours; never the newest."""
+        the smallest gap between its neighbours; never the newest, or the one of the first tick."""
         ticks = sorted(snapshot.tick for snapshot in self._held)
-        older = self._held[: max(1, len(self._held) // 2)]
+        older = self._held[: max(2, len(self._held) // 2)]
+        candidates = [one for one in older if one.tick != ticks[0] and one is not self._held[-1]]
 
         def gap(snapshot: HeldSnapshot) -> int:
             at = ticks.index(snapshot.tick)
-            before = ticks[at - 1] if at else 0
-            return (ticks[at + 1] if at + 1 < len(ticks) else ticks[at]) - before
+            return ticks[min(at + 1, len(ticks) - 1)] - ticks[at - 1]
 
-        return min(older, key=gap)
+        return min(candidates, key=gap, default=self._held[0])
 
     def __len__(self) -> int:
         return len(self._held)

@@ -4,7 +4,7 @@ changed since the level was built. Programs, configs and views of shared memory 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from enum import Enum
 from math import isfinite
 from types import ModuleType
@@ -94,7 +94,7 @@ class _Reading:
                 return self._array(thing, depth)
             case Mapping() | list() | deque() | tuple() | set() | frozenset():
                 return self._items(thing, depth)
-        if isinstance(thing, OMITTED) or isinstance(thing, Callable):  # type: ignore[arg-type]
+        if callable(thing) or isinstance(thing, OMITTED):
             return _NOTHING
         has_any = hasattr(thing, "__dict__") or hasattr(type(thing), "__slots__")
         if not has_any or id(thing) in self._seen or not depth:

@@ -139,9 +139,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         level.close()
 
 
-def run_clock_board(
-    segment: Segment, wiring: ClockWiring, attention: int, copies: socket
-) -> int:
+def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
     """Take the processor and run the system clock."""
     copier = Copier(segment, CLOCK, copies) if wiring.is_copied else None
     take_core(wiring.core, wiring.priority, wiring.reservation)

@@ -17,10 +17,11 @@ import random
 import stat
 from array import array
 from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fcntl import F_GETFL, fcntl
 from pathlib import Path
-from socket import AF_UNIX, SCM_RIGHTS, SOCK_SEQPACKET, SOL_SOCKET, CMSG_LEN, socket, socketpair
+from socket import AF_UNIX, CMSG_LEN, SCM_RIGHTS, SOCK_SEQPACKET, SOL_SOCKET, socket, socketpair
 from typing import Any
 
 from rack.backplane import copies
@@ -162,9 +163,10 @@ class Copier:
             and not os.path.samestat(os.fstat(fd), segment)
             and not _is_only_read(fd)
         ]
-        threads = {int(entry) for entry in os.listdir(_THREADS)} - {os.getpid()}
-        names = [(_THREADS / str(thread) / "comm").read_text().strip() for thread in threads]
-        return found + [f"it has the thread {name}" for name in names]
+        threads = [path for path in _THREADS.iterdir() if path.name != str(os.getpid())]
+        return found + [
+            f"it has the thread {(path / 'comm').read_text().strip()}" for path in threads
+        ]
 
 
 def _fork() -> int:
@@ -178,11 +180,10 @@ def _fork() -> int:
 def _open_files() -> dict[int, str]:
     """Return the open files of this process, with what each is."""
     found = {}
-    for entry in os.listdir(_DESCRIPTORS):
-        try:
-            found[int(entry)] = os.readlink(_DESCRIPTORS / entry)
-        except FileNotFoundError:  # of the listing itself
-            continue
+    for entry in [*_DESCRIPTORS.iterdir()]:
+        # That of the listing itself is gone.
+        with suppress(FileNotFoundError):
+            found[int(entry.name)] = str(entry.readlink())
     return found
 
 

@@ -19,7 +19,7 @@ from rack.backplane.semaphores import done_semaphore, lock_semaphore, wake_semap
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
-from tests.processes import BOUND_S, FORKS, exit_status, fork, forked, wait_until
+from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
 
 FUTEX_WAIT_BITSET, FUTEX_CLOCK_REALTIME = 9, 256
 """From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the

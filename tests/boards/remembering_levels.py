@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+import random
 from collections import deque
 from collections.abc import Callable
 from itertools import count
+from pathlib import Path
+from select import epoll
+from socket import socket
+from threading import Event, Thread
+from typing import Any
 
 import numpy as np
 
@@ -86,29 +93,63 @@ class Rememberer(Executor):
         )
 
 
-class Generator(Executor):
-    """Remembers in something that nobody can copy."""
+class Holder(Executor):
+    """Writes a number that depends on what no program can copy piece by piece: a file that it
+    reads, generators of numpy, Python and the C library, an iterator, and a closure."""
 
     outputs = {"status": WAVE}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
+        self._file = Path(__file__).open("rb")  # noqa: SIM115  closed in `close`
+        self._generator = np.random.default_rng(7)
+        random.seed(8)
+        self._libc = ctypes.CDLL(None)
+        self._libc.srand(9)
         self._count = count()
+        self._numbers = (number * number for number in range(1 << 40))
+        self._call = counter()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
         """Write the next number."""
-        write.status.value = float(next(self._count))
+        if not (line := self._file.readline()):
+            self._file.seek(0)
+        drawn = self._generator.random() + random.random() + self._libc.rand() % 1000
+        counted = next(self._count) + next(self._numbers) + self._call()
+        write.status.state = State.EXECUTING
+        write.status.value = len(line) + drawn + counted
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
-class LateGenerator(Generator):
-    """The same, but it makes that only while it runs."""
+class Uncopied(Executor):
+    """Has what no copy can have: a file that it writes, a socket, an epoll object or a thread."""
+
+    outputs = {"status": WAVE}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        del self._count
+        self._ends = Event()
+        self._thread = Thread(target=self._ends.wait, args=(60.0,), daemon=True)
+        self._held: Any = None
+        match context.params["holds"]:
+            case "file":
+                self._held = Path(context.params["path"]).open("a")  # noqa: SIM115
+            case "socket":
+                self._held = socket()
+            case "epoll":
+                self._held = epoll()
+            case "thread":
+                self._thread.start()
 
     def process(self, read: Ports, write: Ports, tick: int) -> None:
-        """Write the next number."""
-        if tick == 10:
-            self._count = (number for number in range(1 << 40))  # type: ignore[assignment]
+        """Write the tick."""
         write.status.value = float(tick)
+
+    def close(self) -> None:
+        """Let go of all."""
+        self._ends.set()
+        if self._held is not None:
+            self._held.close()

@@ -53,8 +53,7 @@ def rewind(run: RunFolder, as_json: Json = False) -> None:
 
     A tick is shown as it is before its tasks begin: messages are those that they then read.
     Messages and events come from the recording. For the objects of levels, and branches, the rack
-    goes on unchanged from the checkpoint or the state shown before, or from its beginning. RUN is
-    only read.
+    runs again unchanged, from the beginning or from where it was before. RUN is only read.
 
     Exit status: 0 the prompt was left; of commands from stdin or with --json: 0 all worked, 2 one
     failed; 2 RUN is not a run.

@@ -17,7 +17,7 @@ from rack.tools.live import continued
 from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
 from rack.tools.recording.recording import Recording
-from tests.boards.checkpoint.test_keeping import REMEMBERING
+from tests.boards.remembering_racks import REMEMBERING
 from tests.processes import descriptors
 from tests.tools.command_line import rack
 

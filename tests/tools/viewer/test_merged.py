@@ -19,7 +19,7 @@ from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.viewer.merged import write_merged
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
-from tests.boards.checkpoint.test_keeping import REMEMBERING
+from tests.boards.remembering_racks import REMEMBERING
 from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
 from tests.tools.machines import CLOCK_NS, MS, TICKS, A, B, S, recorded

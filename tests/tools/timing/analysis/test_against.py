@@ -18,8 +18,8 @@ from rack.tools.recording.checksums import checked_line, read_line
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.against import compared
 from rack.tools.timing.analysis.report import OtherRun
-from tests.boards.checkpoint.test_keeping import REMEMBERING
 from tests.boards.commanded_racks import COMMANDED, commands
+from tests.boards.remembering_racks import REMEMBERING
 from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
