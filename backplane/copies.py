@@ -11,6 +11,8 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
+from contextlib import suppress
+from pathlib import Path
 
 from rack.backplane import byte_lock
 from rack.backplane.mailbox.mailbox import claim_again
@@ -70,8 +72,13 @@ def leave(segment: Segment) -> None:
     its locks. The fork must not use it before `enter`."""
     byte_lock.close_all()
     _map(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)
+    file = os.fstat(segment.fd)
     nothing = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nothing, segment.fd)
+    # Python's `mmap` has it open, too.
+    for fd in [int(entry.name) for entry in Path("/proc/self/fd").iterdir()]:
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(fd), file):
+                os.dup2(nothing, fd)
     os.close(nothing)
 
 

@@ -42,7 +42,7 @@ class SnapshotPolicy:
     """Snapshots that a rack in lockstep takes: the standstill for them is one part in `part` of its
     time; 0: there is only the one before the tick `at`, if that is given."""
 
-    part: int = 50
+    part: int = 40
     at: int | None = None
 
 

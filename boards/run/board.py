@@ -128,7 +128,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
             else PlannerLoop(segment, wiring, level, attention)
         )
         if copier is not None:
-            task.next_cycle.copy = TaskCopies(task, level, copier)
+            task.next_cycle.copy = TaskCopies(task, level, copier, attention)
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)
         task.stopwatch.notify_clock()

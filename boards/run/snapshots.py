@@ -31,8 +31,11 @@ REFUSED = -1
 class TaskCopies:
     """Forks a copy of one task, between two of its cycles, when the clock wants it."""
 
-    def __init__(self, task: Task, level: Executor | Planner, copier: Copier) -> None:
+    def __init__(
+        self, task: Task, level: Executor | Planner, copier: Copier, attention: int
+    ) -> None:
         self._block = task.block
+        self._attention = attention
         self._stopwatch = task.stopwatch
         self._copier = copier
         copier.attributes = AttributeView(level).show
@@ -50,6 +53,7 @@ class TaskCopies:
                 block[Block.PID] = os.getpid()
                 block[Block.STATE] = TaskState.RUNNING
                 self._stopwatch.begin()
+                os.eventfd_write(self._attention, 1)
             block[Block.COPY] = 0
         self._stopwatch.notify_clock()
 
