@@ -51,8 +51,8 @@ class Continuation:
     """Where a rack in lockstep goes on from: the last snapshot of its crate at `tick` or before.
 
     The snapshot has the first `faults` and `commands` of the config in its tables. `losses` are
-    the boards lost in the run that it continues, and when. A task goes on as it is there if it is
-    wired as it was; else it starts anew, as after a loss, from what its mailboxes hold.
+    the boards lost in the run that it continues, and when. A task goes on as it is there, with
+    other settings perhaps. If it is wired otherwise it starts anew, from what its mailboxes hold.
     """
 
     tick: int

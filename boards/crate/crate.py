@@ -50,7 +50,7 @@ from rack.boards.crate.requests import (
     Show,
     Shown,
 )
-from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
+from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy, can_go_on
 from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import hog
 from rack.boards.run.board import enter, run_clock_board, run_task_board
@@ -160,9 +160,9 @@ class Crate:
         """Fork a task or the clock, or let its copy go on."""
         self._wirings[name] = wiring
         copy = self._to_go_on.pop(name, None)
-        if copy is not None and copy.wiring == wiring:
+        if copy is not None and can_go_on(copy, wiring):
             try:
-                self._watch(name, self._shelf.go_on(copy, self._segment.fd))
+                self._watch(name, self._shelf.go_on(copy, wiring, self._segment.fd))
             except OSError:
                 self._fail_to_fork(name, "its copy in the snapshot is gone")
             return

@@ -9,15 +9,18 @@ it holds the only other end of each copy's socket.
 from __future__ import annotations
 
 import os
+import pickle
 import re
 import signal
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, field
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from socket import AF_UNIX, SOCK_SEQPACKET, socket, socketpair
+from tempfile import TemporaryFile
 
 from rack.backplane.process import readable
+from rack.backplane.segment import SHM_FOLDER
 from rack.boards.run.copying import CopyNote, CopyRequest, receive, send
 from rack.boards.wiring import ClockWiring, TaskWiring
 
@@ -161,12 +164,21 @@ class SnapshotShelf:
             self.drop(snapshot)
         return None
 
-    def go_on(self, copy: WaitingCopy, segment: int) -> int:
-        """Let a copy go on in a segment, open as `segment`, as a child of this process; return its
-        process. Its successor's note follows. Raises `OSError` if it is gone."""
+    def go_on(self, copy: WaitingCopy, wiring: Wiring, segment: int) -> int:
+        """Let a copy go on in a segment, open as `segment`, as a child of this process, with the
+        context in `wiring`; return its process. Its successor's note follows. Raises `OSError` if
+        it is gone."""
         pid = copy.pid
         copy.pid = 0
-        send(copy.control, CopyRequest(os.getpid()), segment)
+        with ExitStack() as stack:
+            contexts = []
+            if copy.wiring != wiring and isinstance(wiring, TaskWiring):
+                file = stack.enter_context(TemporaryFile(dir=SHM_FOLDER))
+                file.write(pickle.dumps(wiring.context))
+                file.seek(0)
+                contexts.append(file.fileno())
+            request = CopyRequest(os.getpid(), has_context=bool(contexts))
+            send(copy.control, request, segment, *contexts)
         return pid
 
     def show(self, snapshot: HeldSnapshot, name: str) -> str:
@@ -204,6 +216,15 @@ class SnapshotShelf:
         if self._taking is not None:
             self._taking.end()
             self._taking = None
+
+
+def can_go_on(copy: WaitingCopy, wiring: Wiring) -> bool:
+    """Say whether a copy can be the board of a wiring: it is that of its own, but for the settings
+    of its level."""
+    before = copy.wiring
+    if isinstance(before, TaskWiring) and isinstance(wiring, TaskWiring):
+        return replace(before, context=wiring.context) == wiring
+    return before == wiring
 
 
 def _is_there(copy: WaitingCopy) -> bool:

@@ -7,24 +7,22 @@ from collections import deque
 from collections.abc import Mapping
 from enum import Enum
 from math import isfinite
-from types import ModuleType
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Layout
 from rack.backplane.message import Message, text_of
 from rack.backplane.segment import Segment
-from rack.levels.level import LevelContext
+from rack.boards.run.settings import attribute_names, has_attributes
 
 MOST = 24
 """Numbers of an array, or items, that are shown; of larger ones the size."""
 DEPTH = 5
 """Objects within objects, at most."""
-OMITTED = (BaseModel, ByteLock, Layout, LevelContext, ModuleType, Segment, memoryview, type)
-"""What is never shown, besides functions and what has no attributes in Python."""
+OMITTED = (ByteLock, Layout, Segment)
+"""Objects that are never shown."""
 _NOTHING = object()
 
 
@@ -69,9 +67,7 @@ class _Reading:
     def attributes(self, thing: object, depth: int) -> ObjectAttributes:
         """Return the attributes of an object as plain data."""
         self._seen.add(id(thing))
-        slots = [getattr(kind, "__slots__", ()) for kind in type(thing).__mro__]
-        names = [*vars(thing)] if hasattr(thing, "__dict__") else []
-        names += [name for found in slots for name in found if hasattr(thing, name)]
+        names = attribute_names(thing)
         plain = {name: self._plain(getattr(thing, name), depth) for name in names}
         return ObjectAttributes(
             (name, value) for name, value in plain.items() if value is not _NOTHING
@@ -94,10 +90,8 @@ class _Reading:
                 return self._array(thing, depth)
             case Mapping() | list() | deque() | tuple() | set() | frozenset():
                 return self._items(thing, depth)
-        if callable(thing) or isinstance(thing, OMITTED):
-            return _NOTHING
-        has_any = hasattr(thing, "__dict__") or hasattr(type(thing), "__slots__")
-        if not has_any or id(thing) in self._seen or not depth:
+        is_omitted = isinstance(thing, OMITTED) or not has_attributes(thing)
+        if is_omitted or id(thing) in self._seen or not depth:
             return _NOTHING
         return self.attributes(thing, depth - 1) or _NOTHING
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import random
 import stat
 from array import array
@@ -29,6 +30,7 @@ from rack.backplane.json_text import encode_json
 from rack.backplane.process import die_with_parent, name_process
 from rack.backplane.segment import Segment
 from rack.boards.errors import SnapshotError
+from rack.levels.level import LevelContext
 
 MOST_BYTES = 4096
 """Largest note or request on a socket of copies."""
@@ -53,9 +55,11 @@ class CopyNote:
 @dataclass(frozen=True)
 class CopyRequest:
     """The crate's request to a copy: go on, in the segment and as a child of the crate `crate`; or
-    write the attributes of the level as JSON, if that is 0. The file for either comes with it."""
+    write the attributes of the level as JSON, if that is 0. The file for either comes with it, and
+    one with another context of the level, if that `has_context`."""
 
     crate: int = 0
+    has_context: bool = False
 
 
 def send(line: socket, record: CopyNote | CopyRequest, *files: int) -> None:
@@ -74,13 +78,15 @@ def receive(line: socket) -> tuple[dict[str, Any], list[int]] | None:
 
 
 class Copier:
-    """Forks copies of this process. `attributes` returns what a copy shows of its level.
+    """Forks copies of this process. `attributes` returns what a copy shows of its level,
+    `change_settings` gives that another context.
 
     Make it before the level: what is open by then is not the level's.
     """
 
     def __init__(self, segment: Segment, name: str, line: socket) -> None:
         self.attributes: Callable[[], Mapping[str, Any]] = dict
+        self.change_settings: Callable[[LevelContext], None] = _refuse_settings
         self._segment = segment
         self._name = name
         self._line = line
@@ -134,7 +140,7 @@ class Copier:
             asked = receive(control)
             if asked is None:
                 os._exit(0)
-            request, (file, *_) = CopyRequest(**asked[0]), asked[1]
+            request, (file, *contexts) = CopyRequest(**asked[0]), asked[1]
             if not request.crate:
                 with os.fdopen(file, "w") as shown:
                     shown.write(encode_json(self.attributes()))
@@ -142,13 +148,18 @@ class Copier:
             elif successor := _fork():
                 break
             else:
-                os.close(file)
+                for fd in (file, *contexts):
+                    os.close(fd)
         control.close()
         die_with_parent(request.crate)
         copies.enter(self._segment, file)
         send(self._line, CopyNote(tick, self._name, successor))
         self._copies = [successor]
         name_process(f"{self._segment.rack}:{self._name}")
+        for fd in contexts:
+            # From the crate's own process, as is all that a board is told when it is forked.
+            with os.fdopen(fd, "rb") as context:
+                self.change_settings(pickle.load(context))
 
     def _refused(self, memory: Collection[int]) -> list[str]:
         """Return what the process has that no copy can have; `memory`: files that are the
@@ -167,6 +178,11 @@ class Copier:
         return found + [
             f"it has the thread {(path / 'comm').read_text().strip()}" for path in threads
         ]
+
+
+def _refuse_settings(context: LevelContext) -> None:
+    """Refuse another context: only levels have one."""
+    raise TypeError("this process has no level")
 
 
 def _fork() -> int:

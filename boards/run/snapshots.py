@@ -19,6 +19,7 @@ from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.errors import UNKEPT, SnapshotError
 from rack.boards.run.attributes import AttributeView
 from rack.boards.run.copying import Copier
+from rack.boards.run.settings import change_settings
 from rack.boards.run.task import Task
 from rack.levels.level import Executor, Planner
 
@@ -39,6 +40,7 @@ class TaskCopies:
         self._stopwatch = task.stopwatch
         self._copier = copier
         copier.attributes = AttributeView(level).show
+        copier.change_settings = partial(change_settings, level)
 
     def __call__(self) -> None:
         """Fork it, and go on; in the copy, go on when a rack does."""
@@ -82,10 +84,13 @@ class ClockCopies:
             tasks = self._driver.tasks
             self._driver.settle()
             if all(task.is_settled() and not task.is_lost | task.is_stopped for task in tasks):
-                self._take(tick)
+                if self._take(tick):
+                    # What the rack wants that goes on from here.
+                    return self(tick)
         return wanted if wanted > tick else sys.maxsize
 
-    def _take(self, tick: int) -> None:
+    def _take(self, tick: int) -> bool:
+        """Take a snapshot; return whether this is a copy in it that goes on."""
         started_s = time.monotonic()
         tasks = self._driver.tasks
         for task in tasks:
@@ -98,7 +103,7 @@ class ClockCopies:
             for task in tasks:
                 task.block[Block.COPY] = 0
             self._not_before_s = float("inf")
-            return
+            return False
         memory = copy_memory(self._segment)
         try:
             goes_on = self._copier.copy(tick, memory)
@@ -115,6 +120,7 @@ class ClockCopies:
         if not goes_on:
             self.cost_s = now_s - started_s
         self._not_before_s = now_s + self.cost_s * words[System.SNAPSHOT_PART]
+        return goes_on
 
 
 def _is_copied(block: memoryview) -> bool:

@@ -117,7 +117,7 @@ def run(
 
     With --from, the rack first runs again, unchanged, from the beginning to TIME. What operators
     commanded in that run, before TIME and after it, is repeated; stops and faults by hand are not.
-    A level with other settings begins anew at TIME, as after a loss. Host boards and other racks
+    Host boards and other racks
     are not started then: what they sent enters again at the same ticks.
     --seconds counts from the beginning of the run that is continued, as there.
 

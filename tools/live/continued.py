@@ -96,6 +96,9 @@ class RunAgain:
     def reach(self, tick: int) -> None:
         """Have a snapshot before `tick`, in which all is as it was in the run then; note on stderr
         what is not. Raises `Failure`."""
+        if not self._has_begun and self._branched_at not in (None, tick):
+            # From here on all snapshots are of this run, not of the one that it continues.
+            self.reach(self._branched_at or 0)
         if self._has_begun and self._nearest(tick) == tick:
             return
         with self.rack_at(tick, SnapshotPolicy(at=tick)) as rack:
@@ -155,8 +158,7 @@ class RunAgain:
         if branched_at is None or self._parent is None:
             if ticks_of(run)[0] > max(task.every for task in run.layout.tasks):
                 raise Failure(f"{self._asked}: its beginning was not kept", 2)
-            requests = recorded_commands(run)
-            return Beginning(requests=requests, entries=self.entries)
+            return Beginning(requests=recorded_commands(run), entries=self.entries)
         self._parent.reach(branched_at)
         return Beginning(
             continues=self._parent._continuation(branched_at),
@@ -166,13 +168,15 @@ class RunAgain:
 
     def _continuation(self, tick: int) -> Continuation:
         """Return the snapshot at `tick` or before, with what the tables hold there."""
-        parent = self._parent
-        if parent is not None and self._nearest(tick) == self._branched_at:
-            return parent._continuation(tick)
         ran = self.recording.rack_config
+        return Continuation(tick, len(ran.fault), len(ran.command), self._losses)
+
+    @cached_property
+    def _losses(self) -> tuple[tuple[str, int], ...]:
         died = (event for event in self.recording.events if event["kind"] == "died")
-        losses = tuple((one["board"], one["tick"]) for one in died)
-        return Continuation(tick, len(ran.fault), len(ran.command), losses)
+        earlier = () if self._parent is None else self._parent._losses
+        before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
+        return (*before, *((one["board"], one["tick"]) for one in died))
 
     def _nearest(self, tick: int) -> int:
         return self.crate.show(tick, "").tick

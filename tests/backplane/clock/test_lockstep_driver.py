@@ -371,10 +371,10 @@ def test_a_batch_ends_before_what_the_clock_must_do(make_bus: MakeBus) -> None:
     driver._begins(1)
     due = driver.due(1, 0)
     assert driver._batch_end(due, 1) == 7
-    driver.keep = lambda tick: 4
+    driver.snapshot = lambda tick: 4
     driver._begins(1)
     assert driver._batch_end(due, 1) == 4
-    driver.keep = lambda tick: tick
+    driver.snapshot = lambda tick: tick
     driver._begins(1)
     assert driver._batch_end(due, 1) == 2
 

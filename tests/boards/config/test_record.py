@@ -16,10 +16,8 @@ def test_durations_are_text_or_seconds_and_survive_the_config_of_a_run(small: Pa
     assert loads(config.text()).record == config.record
 
 
-def test_by_default_everything_is_kept_with_a_checkpoint_each_5_s(small: Path) -> None:
-    record = load(small, []).record
-    assert (record.keep, record.checkpoint_s) == (None, 5.0)
-    assert load(small, ["record.checkpoint_s=0"]).record.checkpoint_s == 0.0
+def test_by_default_everything_is_kept(small: Path) -> None:
+    assert load(small, []).record.keep is None
 
 
 @pytest.mark.parametrize(
@@ -28,8 +26,8 @@ def test_by_default_everything_is_kept_with_a_checkpoint_each_5_s(small: Path) -
         ("{ keep = '-3 s' }", 'record.keep = "-3 s": should be a time'),
         ("{ keep = 0.5 }", "record.keep = 0.5: should be greater than or equal to 1"),
         ("{ keep = '10 s', before = -1 }", "record.before = -1: should be greater"),
-        ("{ checkpoint_s = -1 }", "record.checkpoint_s = -1: should be greater than or equal to 0"),
-        ("{ checkpoint_s = 'nan s' }", 'record.checkpoint_s = "nan s": should be a time'),
+        ("{ before = 'nan s' }", 'record.before = "nan s": should be a time'),
+        ("{ checkpoint_s = 5.0 }", "record.checkpoint_s = 5.0: unknown key"),
         ("{ keep = '8 s' }", "record: keep = 8 s is shorter than before + after = 10 s"),
         ("{ keep = '1 h' }", 'record.keep = "1 h": should be a time, as in "0.5s", "20ms"'),
         ("{ keep = '1 min', befor = 1 }", "record.befor = 1: unknown key; did you mean 'before'?"),

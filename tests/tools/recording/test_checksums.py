@@ -17,9 +17,7 @@ import pytest
 
 from rack.backplane.words import System
 from rack.boards import Rack
-from rack.boards.checkpoint.format import read as read_checkpoint
 from rack.boards.config import RackConfig, load
-from rack.boards.errors import CheckpointError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, checked_line, read_line
@@ -292,15 +290,6 @@ def test_a_report_reads_regular_files_only(
     else:
         assert done.returncode == 2
         assert f"{name}: not a regular file" in done.stderr
-
-
-@pytest.mark.parametrize("take_place", [take_fifo, take_device])
-def test_a_checkpoint_is_read_from_a_regular_file_only(
-    tmp_path: Path, take_place: Callable[[Path], None]
-) -> None:
-    take_place(tmp_path / "400.checkpoint")
-    with bounded(), pytest.raises(CheckpointError, match="not a regular file"):
-        read_checkpoint(tmp_path / "400.checkpoint")
 
 
 def test_a_damaged_file_of_the_viewer_is_named(damaged: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load
-from rack.tools.live.continued import branched, state_at
+from rack.tools.live.continued import RunAgain, branched
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.checksums import checked_line, read_line
@@ -24,7 +24,6 @@ from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
 SECONDS = 1.0
-CHECKPOINTS = "record.checkpoint_s=0.25"
 OWN_LEVEL = """
 from time import monotonic_ns
 from rack.backplane.message import Field, MessageType
@@ -84,7 +83,7 @@ def run_in(folder: Path, rack_name: str) -> Run:
         script = folder / f"{name}-faults.toml"
         script.write_text(faults)
         given = str(script) if faults else None
-        config = load(file, [f"name={rack_name}", CHECKPOINTS, *settings], given)
+        config = load(file, [f"name={rack_name}", *settings], given)
         run_rack(config, SECONDS, folder / name, Display())
         return Recording(folder / name)
 
@@ -148,8 +147,8 @@ def test_of_a_branch_the_level_is_shown_at_the_tick_where_it_branches_off(
 ) -> None:
     _, one, _ = runs
     config = branched(one, ["board.wave.params.factor=2"], None)
-    with state_at(one, 150) as state:
-        run_rack(config, SECONDS, tmp_path / "two", Display(), begins=state.begins)
+    with RunAgain(one) as again:
+        run_rack(config, SECONDS, tmp_path / "two", Display(), begins=again.beginning(150))
     found = why(Recording(tmp_path / "two"), one)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"]) == (150, "wave.status")
