@@ -92,6 +92,8 @@ class Writer:
         """Messages of a queue that this writer has refused because it was full."""
         self.intruder = 0
         """Another process that has published since this writer's last message but one; 0: none."""
+        # In the segment, whatever the slots publish to.
+        self._claimed = segment.box(name)
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
         self.claim()
         self._slots.resume(self._slots.signature)
@@ -99,7 +101,7 @@ class Writer:
 
     def claim(self) -> None:
         """Claim the mailbox, in a new epoch. Raises `MailboxError` when it has another writer."""
-        box = self._slots.box
+        box = self._claimed
         if not self._claim.take():
             pid = box[Box.WRITER_PID]
             self._claim.close()

@@ -83,10 +83,10 @@ class ClockCopies:
         if tick == wanted or (part and time.monotonic() >= self._not_before_s):
             tasks = self._driver.tasks
             self._driver.settle()
-            if all(task.is_settled() and not task.is_lost | task.is_stopped for task in tasks):
-                if self._take(tick):
-                    # What the rack wants that goes on from here.
-                    return self(tick)
+            are_there = [task.is_settled() and not task.is_lost | task.is_stopped for task in tasks]
+            if all(are_there) and self._take(tick):
+                # What the rack wants that goes on from here.
+                return self(tick)
         return wanted if wanted > tick else sys.maxsize
 
     def _take(self, tick: int) -> bool:
