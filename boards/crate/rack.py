@@ -94,7 +94,8 @@ class Rack:
     adapter and port, host boards are not started, and other racks not met: what a recorded run
     wrote there enters instead. `snapshots`: those that it takes in lockstep. `continues`: the
     snapshot of its `crate` from which it goes on. `requests`: an operator's commands besides the
-    config's, and those that wait in the snapshot, by their ticks. `repeats`: the rack whose run
+    config's, and those that wait in the snapshot, by their ticks. `begins_at`: the tick of that
+    snapshot; -1 without one. `repeats`: the rack whose run
     this repeats under a name of its own; levels see the name of that.
     """
 
@@ -116,7 +117,7 @@ class Rack:
         self._entries = entries
         self._snapshots = snapshots
         self._continues = continues
-        self._begins_at = -1
+        self.begins_at = -1
         self._share = share
         self.segment: Segment
         self.outcome: Outcome | None = None
@@ -200,8 +201,8 @@ class Rack:
         self._journal.add(
             "launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes"
         )
-        self._begins_at = await_opened(crate, self._journal, LAUNCH_S)
-        if before is not None and self._begins_at < 0:
+        self.begins_at = await_opened(crate, self._journal, LAUNCH_S)
+        if before is not None and self.begins_at < 0:
             raise SnapshotError(f"rack '{self.config.name}': no snapshot before tick {before}")
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
@@ -256,14 +257,14 @@ class Rack:
         clock = self._plan.clock(seconds)
         if self._snapshots is not None or self._continues is not None:
             # Not in the clock's wiring: what goes on from a snapshot may end at another tick.
-            stop = max(clock.stop_tick, self._begins_at) if clock.stop_tick else 0
+            stop = max(clock.stop_tick, self.begins_at) if clock.stop_tick else 0
             self.segment.words[System.STOP_TICK] = stop
             clock = replace(clock, stop_tick=0, is_copied=self._snapshots is not None)
         self._ending = Ending(self.segment, clock.ends_run, clock.silent)
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
         supervision = Supervision(self.config, self._plan.layout)
         for board, tick in (self._continues or Continuation(0)).losses:
-            if tick < self._begins_at:
+            if tick < self.begins_at:
                 supervision.admit(board, tick)
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
         self._hosts = HostBoards(
@@ -279,7 +280,7 @@ class Rack:
             # The latch is as it was, and what was raised before is in the other run's events.
             self._is_armed = True
             self._alarms.drain()
-            tick = self._begins_at
+            tick = self.begins_at
             self._journal.add("launch", "", f"continues before tick {tick}", CONTINUES, tick=tick)
         self._line.ask(PowerOn(CLOCK, clock))
         self._hosts.start()

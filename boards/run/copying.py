@@ -27,7 +27,7 @@ from typing import Any
 
 from rack.backplane import copies
 from rack.backplane.json_text import encode_json
-from rack.backplane.process import die_with_parent, name_process
+from rack.backplane.process import COPY, die_with_parent, name_process
 from rack.backplane.segment import Segment
 from rack.boards.errors import SnapshotError
 from rack.levels.level import LevelContext
@@ -131,7 +131,7 @@ class Copier:
 
     def _wait(self, control: socket, tick: int, offsets: Mapping[int, int], seeds: Any) -> None:
         """Wait until a rack goes on from here; end with the crate."""
-        name_process(f"copy:{self._name}")
+        name_process(f"{COPY}{self._name}")
         while True:
             for fd, offset in offsets.items():
                 _open_again(fd, offset)
