@@ -165,10 +165,6 @@ class Message:
         """Return how many messages the queue still takes in this cycle; raises as `send` does."""
         raise MailboxError(NOT_SENT)
 
-    def __reduce__(self) -> tuple[Callable[..., Message], tuple[np.dtype, bytes]]:
-        """Make it again from type and bytes: its class has no name."""
-        return _again, (self.record.dtype, bytes(self.raw))
-
     if TYPE_CHECKING:
         # Field names come from the layout: a type checker cannot know them.
         def __setattr__(self, name: str, value: Any) -> None: ...
@@ -214,10 +210,6 @@ def copied(message: Message) -> Message:
     copy = Message(message.record.dtype)
     copy.copy_from(message)
     return copy
-
-
-def _again(dtype: np.dtype, content: bytes) -> Message:
-    return Message(dtype, memoryview(bytearray(content)))
 
 
 def fill_counts(record: Any, counts: Iterable[float]) -> None:

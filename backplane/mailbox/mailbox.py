@@ -193,8 +193,6 @@ class Reader:
     """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the
     mailbox's depth."""
 
-    found_again = ("_places", "_heads")
-
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
         self.slots = slots = Slots(segment, self.spec)

@@ -16,13 +16,12 @@ import os
 import pickle
 import random
 import stat
-from array import array
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fcntl import F_GETFL, fcntl
 from pathlib import Path
-from socket import AF_UNIX, CMSG_LEN, SCM_RIGHTS, SOCK_SEQPACKET, SOL_SOCKET, socket, socketpair
+from socket import AF_UNIX, SOCK_SEQPACKET, recv_fds, send_fds, socket, socketpair
 from typing import Any
 
 from rack.backplane import copies
@@ -64,17 +63,13 @@ class CopyRequest:
 
 def send(line: socket, record: CopyNote | CopyRequest, *files: int) -> None:
     """Send a record and open files. Raises `OSError` when the other end is gone."""
-    rights = [(SOL_SOCKET, SCM_RIGHTS, array("i", files))] if files else []
-    line.sendmsg([encode_json(asdict(record)).encode()], rights)
+    send_fds(line, [encode_json(asdict(record)).encode()], files)
 
 
 def receive(line: socket) -> tuple[dict[str, Any], list[int]] | None:
     """Return the next record, as plain data, and the files that came with it; None at the end."""
-    data, rights, *_ = line.recvmsg(MOST_BYTES, CMSG_LEN(MOST_FILES * array("i").itemsize))
-    files = array("i")
-    for _, _, content in rights:
-        files.frombytes(content)
-    return (json.loads(data), list(files)) if data else None
+    data, files, *_ = recv_fds(line, MOST_BYTES, MOST_FILES)
+    return (json.loads(data), files) if data else None
 
 
 class Copier:

@@ -36,8 +36,7 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
-from rack.tools.recording.causes import Divergence
-from rack.tools.recording.divergence import other_run, ticks_of
+from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
 from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
 from rack.tools.recording.origin import Origin, continued_at
 from rack.tools.recording.parquet import CONFIG
@@ -200,9 +199,20 @@ class RunAgain:
             entries=self.entries,
         )
         run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), begins=begins)
-        cycle = Divergence(self.recording, Recording(folder)).chain()[0]
-        fields = ", ".join(f"{one.name} was {one.here}, is {one.there}" for one in cycle.fields)
-        return f"first {cycle.mailbox} at tick {cycle.tick}, {fields}"
+        again = Recording(folder)
+        unlike = unlike_messages(self.recording, again)[0]
+        box = again.layout.mailbox(unlike.mailbox)
+        was, now = (row_of(run, box, unlike.serial) for run in (self.recording, again))
+        where = f"first {box.name} at tick {unlike.tick}"
+        if was is None or now is None:
+            return f"{where}, which one of the two lacks"
+        was, now = was["message"], now["message"]
+        names = [
+            field.name
+            for field in box.fields
+            if not np.array_equal(was[field.name], now[field.name])
+        ]
+        return f"{where}, " + ", ".join(f"{n} was {was[n]}, is {now[n]}" for n in names)
 
 
 def run_of(origin: str) -> Path:

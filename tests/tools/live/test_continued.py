@@ -139,7 +139,7 @@ def test_a_state_that_is_not_as_recorded_is_noted(
     assert not rack(*again).stderr
     levels.write_text(code.replace(".count + 1", ".count + 1 + 1"))
     done = rack(*again)
-    first = r"first upper\.command at tick 0, upper\.command\.goal was 1, is 2"
+    first = r"first upper\.command at tick 0, goal was 1, is 2"
     why = f"upper.command, .* are not as recorded: {first}: the code of a level has changed since"
     assert re.search(why, done.stderr), done.stderr
 

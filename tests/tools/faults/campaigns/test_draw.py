@@ -165,7 +165,7 @@ def test_a_trial_with_room_left_begins_anywhere_in_the_task(course: RackUnderTes
     assert len(plans) == 40
     assert min(begins) < 0.2 * TICKS
     assert max(begins) > 0.7 * TICKS
-    # One follows the other closely, so that the trial can go on from a late checkpoint.
+    # One follows the other closely, so that the trial can go on from a late snapshot.
     assert all(plan.faults[1]["tick"] - plan.first < 3 * SECOND for plan in plans)
 
 

@@ -173,7 +173,7 @@ def test_no_run_goes_on_for_ever(
     now = [100.0]
     monkeypatch.setattr(trial, "time", SimpleNamespace(monotonic=lambda: now[0]))
     run = Run(pace, now)
-    _watch(run, NO_KILLS, ticks, seconds)  # type: ignore[arg-type]
+    _watch(run, NO_KILLS, ticks, seconds, None)  # type: ignore[arg-type]
     assert run.stopped == [LONG]
     assert run.seconds == seconds
     # The look after it is the first beyond.
@@ -187,7 +187,7 @@ def test_a_run_that_stands_still_is_stopped_and_left_if_it_is_stuck(
     now = [100.0]
     monkeypatch.setattr(trial, "time", SimpleNamespace(monotonic=lambda: now[0]))
     run = Run(0, now, stuck)
-    _watch(run, NO_KILLS, 1000, None)  # type: ignore[arg-type]
+    _watch(run, NO_KILLS, 1000, None, None)  # type: ignore[arg-type]
     assert run.stopped == [LONG]
     # Two minutes of half seconds, and twenty seconds more if it does not end.
     assert run.looks in (range(280, 286) if stuck else range(240, 246))
