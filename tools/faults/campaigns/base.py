@@ -61,9 +61,10 @@ class BaseRack:
         is_base = plan.purpose == "nominal" and plan.lockstep and not self._why_none
         return SNAPSHOTS if is_base else None
 
-    def start_of(self, plan: Plan, crate: WarmCrate | None) -> Start:
-        """Return where the trial of a plan starts; run the base if this crate has none."""
-        if plan.purpose == "nominal":
+    def start_of(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
+        """Return where the trial of a plan starts; run the base, for `seconds` where no task ends
+        it, if this crate has none."""
+        if not (plan.faults or plan.kills):
             return Start()
         if not plan.lockstep or crate is None:
             return Start(whole="real time")
@@ -73,7 +74,7 @@ class BaseRack:
             nominal = Plan(0, "nominal", lockstep=True)
             config = nominal.config(self._config, self.name)
             with Rack(config, crate=crate, snapshots=SNAPSHOTS) as rack:
-                rack.run()
+                rack.run(seconds)
             self.keep(crate, rack.events)
         if self._why_none:
             return Start(whole=f"{UNKEPT}{self._why_none}")

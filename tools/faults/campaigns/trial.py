@@ -169,7 +169,7 @@ def run_trial(
     soon as the verdict on each of its faults is certain.
     Raises `ConfigError` for a plan that does not fit the config.
     """
-    start = Start(whole="as asked") if base is None else base.start_of(plan, crate)
+    start = Start(whole="as asked") if base is None else base.start_of(plan, crate, seconds)
     before = children()
     started = time.monotonic()
     snapshots = None if base is None else base.snapshots_for(plan)

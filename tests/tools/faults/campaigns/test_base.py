@@ -139,8 +139,10 @@ def test_kills_from_outside_are_made_to_the_end_of_the_run(bench: Bench) -> None
 def test_what_cannot_go_on_from_a_snapshot_says_why(bench: Bench) -> None:
     soon = Plan(1, "faults", True, (MUTE,))
     early = Plan(1, "faults", True, ({"kind": "self-test", "board": "lower"},))
-    assert bench.base.start_of(replace(soon, lockstep=False), None) == Start(whole="real time")
-    assert bench.base.start_of(early, bench.crate).whole == "a fault prevents the launch"
+    assert bench.base.start_of(replace(soon, lockstep=False), None, SECONDS) == Start(
+        whole="real time"
+    )
+    assert bench.base.start_of(early, bench.crate, SECONDS).whole == "a fault prevents the launch"
 
 
 @pytest.mark.slow
