@@ -29,7 +29,13 @@ _MAP_FIXED = 0x10
 OF_LAUNCH = (
     *(System.STATE, System.EPOCH_NS, System.PERIOD_NS, System.LOCKSTEP, System.STOP_REQUEST),
     *(System.STOP_TICK, System.FOLLOWER_PID, System.TICK_NS, System.CLOCK_PID, System.HOLD_AT),
-    *(System.HELD, System.SNAPSHOT_AT, System.SNAPSHOT_PART, System.SNAPSHOTS),
+    *(
+        System.HELD,
+        System.SNAPSHOT_AT,
+        System.SNAPSHOT_PART,
+        System.SNAPSHOT_EVERY,
+        System.SNAPSHOTS,
+    ),
     System.SNAPSHOT_BYTES,
 )
 """Words that each launch has of its own."""

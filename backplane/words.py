@@ -101,8 +101,9 @@ class System:
     SNAPSHOT_AT = 58
     # snapshots cost one part in so many of lockstep's time; 0: there is only that one. By the Rack
     SNAPSHOT_PART = 59
-    SNAPSHOTS = 60  # held by the crate, of this rack or of those before it; written by the crate
-    SNAPSHOT_BYTES = 61  # the memory that they have for themselves; written by the crate
+    SNAPSHOT_EVERY = 60  # ticks between two that are taken besides; 0: none. Written by the Rack
+    SNAPSHOTS = 61  # held by the crate, of this rack or of those before it; written by the crate
+    SNAPSHOT_BYTES = 62  # the memory that they have for themselves; written by the crate
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 

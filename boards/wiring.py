@@ -40,9 +40,11 @@ class BusTimes:
 @dataclass(frozen=True)
 class SnapshotPolicy:
     """Snapshots that a rack in lockstep takes: the standstill for them is one part in `part` of its
-    time; 0: there is only the one before the tick `at`, if that is given."""
+    time; 0: it does not matter. Besides, there is one each `every` ticks, unless that is 0, and one
+    before the tick `at`, if that is given."""
 
     part: int = 40
+    every: int = 0
     at: int | None = None
 
 

@@ -195,6 +195,7 @@ class Rack:
         words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
         wanted = self._snapshots or SnapshotPolicy(part=0)
         words[System.SNAPSHOT_PART] = wanted.part
+        words[System.SNAPSHOT_EVERY] = wanted.every
         words[System.SNAPSHOT_AT] = 0 if wanted.at is None else wanted.at + 1
         before = None if self._continues is None else self._continues.tick
         crate.send(Open(self.config.name, plan.crate_priority, before))

@@ -73,21 +73,25 @@ class ClockCopies:
         self._driver = driver
         self._copier = copier
         self._not_before_s = 0.0
+        self._taken_at = -sys.maxsize
 
     def __call__(self, tick: int) -> int:
         """Take a snapshot before `tick`, if one is due and every process is there; return the next
         tick before which one is."""
         words = self._segment.words
         wanted = words[System.SNAPSHOT_AT] - 1
-        part = words[System.SNAPSHOT_PART]
-        if tick == wanted or (part and time.monotonic() >= self._not_before_s):
+        part, every = words[System.SNAPSHOT_PART], words[System.SNAPSHOT_EVERY]
+        is_due = every and tick >= self._taken_at + every
+        is_due |= part and time.monotonic() >= self._not_before_s
+        if tick == wanted or is_due:
             tasks = self._driver.tasks
             self._driver.settle()
             are_there = [task.is_settled() and not task.is_lost | task.is_stopped for task in tasks]
             if all(are_there) and self._take(tick):
                 # What the rack wants that goes on from here.
                 return self(tick)
-        return wanted if wanted > tick else sys.maxsize
+        ahead = wanted if wanted > tick else sys.maxsize
+        return min(ahead, max(self._taken_at + every, tick + 1)) if every else ahead
 
     def _take(self, tick: int) -> bool:
         """Take a snapshot; return whether this is a copy in it that goes on."""
@@ -104,6 +108,7 @@ class ClockCopies:
                 task.block[Block.COPY] = 0
             self._not_before_s = float("inf")
             return False
+        self._taken_at = tick
         memory = copy_memory(self._segment)
         try:
             goes_on = self._copier.copy(tick, memory)

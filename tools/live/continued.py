@@ -200,19 +200,16 @@ class RunAgain:
         )
         run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), begins=begins)
         again = Recording(folder)
-        unlike = unlike_messages(self.recording, again)[0]
-        box = again.layout.mailbox(unlike.mailbox)
-        was, now = (row_of(run, box, unlike.serial) for run in (self.recording, again))
-        where = f"first {box.name} at tick {unlike.tick}"
+        first = unlike_messages(self.recording, again)[0]
+        box = again.layout.mailbox(first.mailbox)
+        was, now = (row_of(run, box, first.serial) for run in (self.recording, again))
+        where = f"first {box.name} at tick {first.tick}"
         if was is None or now is None:
             return f"{where}, which one of the two lacks"
         was, now = was["message"], now["message"]
-        names = [
-            field.name
-            for field in box.fields
-            if not np.array_equal(was[field.name], now[field.name])
-        ]
-        return f"{where}, " + ", ".join(f"{n} was {was[n]}, is {now[n]}" for n in names)
+        names = [field.name for field in box.fields]
+        unlike = [name for name in names if not np.array_equal(was[name], now[name])]
+        return ", ".join((where, *(f"{name} was {was[name]}, is {now[name]}" for name in unlike)))
 
 
 def run_of(origin: str) -> Path:

@@ -18,8 +18,8 @@ from rack.boards.events import Event
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.faults.campaigns.plan import Plan
 
-SNAPSHOTS = SnapshotPolicy(part=4)
-"""Many snapshots: each trial saves half of the distance between two."""
+EVERY_S = 2.0
+"""Simulated time between two snapshots: a trial goes through half of it, on the average, again."""
 OF_LAUNCH = ("launch", "ready", "start")
 """Kinds of events that each launch has anew."""
 
@@ -52,6 +52,8 @@ class BaseRack:
     def __init__(self, config: RackConfig, name: str) -> None:
         self.name = name
         self._config = config
+        every = max(1, round(EVERY_S * 1e9 / config.clock_ns))
+        self._snapshots = SnapshotPolicy(part=0, every=every)
         self._crate: WarmCrate | None = None
         self._events: Sequence[Event] = ()
         self._why_none = outside(config)
@@ -59,7 +61,7 @@ class BaseRack:
     def snapshots_for(self, plan: Plan) -> SnapshotPolicy | None:
         """Return the snapshots that a trial takes: the faultless run is the base of the others."""
         is_base = plan.purpose == "nominal" and plan.lockstep and not self._why_none
-        return SNAPSHOTS if is_base else None
+        return self._snapshots if is_base else None
 
     def start_of(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
         """Return where the trial of a plan starts; run the base, for `seconds` where no task ends
@@ -73,7 +75,7 @@ class BaseRack:
         if not self._why_none and self._crate is not crate:
             nominal = Plan(0, "nominal", lockstep=True)
             config = nominal.config(self._config, self.name)
-            with Rack(config, crate=crate, snapshots=SNAPSHOTS) as rack:
+            with Rack(config, crate=crate, snapshots=self._snapshots) as rack:
                 rack.run(seconds)
             self.keep(crate, rack.events)
         if self._why_none:
