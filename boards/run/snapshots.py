@@ -81,8 +81,9 @@ class ClockCopies:
         words = self._segment.words
         wanted = words[System.SNAPSHOT_AT] - 1
         part, every = words[System.SNAPSHOT_PART], words[System.SNAPSHOT_EVERY]
-        is_due = every and tick >= self._taken_at + every
-        is_due |= part and time.monotonic() >= self._not_before_s
+        is_due = (every > 0 and tick >= self._taken_at + every) or (
+            part > 0 and time.monotonic() >= self._not_before_s
+        )
         if tick == wanted or is_due:
             tasks = self._driver.tasks
             self._driver.settle()

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from multiprocessing import active_children, get_context
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any
 
 from rack.backplane.process import die_with_parent
 from rack.boards.config.schema import RackConfig
@@ -76,7 +75,7 @@ class Workers:
         boards hand messages to each other sooner.
         """
         waiting = list(jobs)
-        busy = dict[Future[None], TrialJob]()
+        busy = dict[Future[str], TrialJob]()
         most = 1 if alone else self._most
         while (waiting or busy) and not INTERRUPT.number:
             while waiting and len(busy) < most:
@@ -85,10 +84,12 @@ class Workers:
             done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
             for future in done:
                 job = busy.pop(future)
-                if (error := future.exception()) is not None:
-                    is_gone = isinstance(error, BrokenProcessPool)
-                    why = "the process that made it ended" if is_gone else _text(error)
-                    raise Failure(f"trial {job.plan.number}: {why}")
+                try:
+                    wrong = future.result()
+                except BrokenProcessPool:
+                    wrong = "the process that made it ended"
+                if wrong:
+                    raise Failure(f"trial {job.plan.number}: {wrong}")
                 yield job
         if busy:
             self._stop()
@@ -98,10 +99,6 @@ class Workers:
         not stopped."""
         for process in active_children():
             process.terminate()
-
-
-def _text(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
 
 
 class TrialMaker:
@@ -152,5 +149,10 @@ def _begin(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int
     _maker = TrialMaker(config, whole, cores.get())
 
 
-def _make(job: TrialJob) -> Any:
-    _maker.make(job)
+def _make(job: TrialJob) -> str:
+    """Make a trial; return what went wrong, if anything."""
+    try:
+        _maker.make(job)
+    except Exception as error:  # whatever it is, the campaign must hear of it
+        return f"{type(error).__name__}: {error}"
+    return ""
