@@ -18,7 +18,7 @@ from rack.boards.errors import one_line
 from rack.levels.tables import LAST_TICK
 from rack.tools.console.answer import MAX_LINE, Failure, as_failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.parameters import Anyway, Json, RunFolder
 from rack.tools.live.display import display_for
 from rack.tools.scripting.rewound import Glance, RewoundRun
 
@@ -35,7 +35,7 @@ USAGE = {
 MOST_S = 1e9
 
 
-def rewind(run: RunFolder, as_json: Json = False) -> None:
+def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> None:
     """Go back to any tick of a recorded run, see what was in force there and what the levels held
     in their own objects, and branch off.
 
@@ -63,7 +63,7 @@ def rewind(run: RunFolder, as_json: Json = False) -> None:
       rack rewind runs/whole
       printf 'goto 12.5\\nshow servo.status\\n' | rack rewind runs/whole --json
     """
-    with INTERRUPT.raising(), RewoundRun(run) as rewound:
+    with INTERRUPT.raising(), RewoundRun(run, anyway) as rewound:
         prompt = RewindPrompt(rewound, as_json)
         if sys.stdin.isatty() and not as_json:
             with suppress(ImportError):

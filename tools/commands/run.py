@@ -15,7 +15,7 @@ from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.requests import Preload
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Faults, Json, Settings, View, config_names
+from rack.tools.console.parameters import Anyway, Faults, Json, Settings, View, config_names
 
 if TYPE_CHECKING:
     from rack.boards.config.schema import RackConfig
@@ -102,6 +102,7 @@ def run(
     faults: Faults = None,
     entries: FromRun = None,
     origin: Origin = None,
+    anyway: Anyway = False,
     out: Out = None,
     no_record: NoRecord = False,
     view: View = False,
@@ -174,7 +175,7 @@ def run(
     with ExitStack() as stack:
         if origin is not None:
             warm = crate if isinstance(crate, WarmCrate) else None
-            begins = stack.enter_context(beginning(found, origin, warm))
+            begins = stack.enter_context(beginning(found, origin, warm, anyway))
         # From the start of the run to the end of its report; during the launch a signal ends the
         # command at once.
         unfinished = NO_TIME.format(folder) if folder else ""

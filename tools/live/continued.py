@@ -36,6 +36,7 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
+from rack.tools.recording.code import check_code
 from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
 from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
 from rack.tools.recording.origin import Origin, continued_at
@@ -53,16 +54,26 @@ class RunAgain:
     end with it, and with its `crate`.
 
     Each tick that was reached has a snapshot, from which later ones are near. A run that continues
-    another one begins with that. `asked` begins what goes wrong, which is a `Failure`.
+    another one begins with that. `asked` begins what goes wrong, which is a `Failure`. `anyway`: run
+    it even if its code or files have changed since.
     """
 
-    def __init__(self, recording: Recording, asked: str = "", crate: WarmCrate | None = None):
+    def __init__(
+        self,
+        recording: Recording,
+        asked: str = "",
+        crate: WarmCrate | None = None,
+        anyway: bool = False,
+    ) -> None:
         self.recording = recording
-        self.crate = crate or WarmCrate()
         self._asked = asked or str(recording.folder)
+        self._anyway = anyway
         ran = recording.rack_config
         # The rack is about to run again, with the levels that its config names.
         extend_path(ran.python_path)
+        for note in check_code(recording, self._asked, anyway):
+            print(note, file=sys.stderr)
+        self.crate = crate or WarmCrate()
         # It imports while this process reads the run.
         self.crate.ask(Preload(classes(ran), tuple(sys.path), cell_of(ran)))
         self._has_begun = False
@@ -79,7 +90,7 @@ class RunAgain:
         if self._branched_at is None:
             return None
         folder = other_run(self.recording.folder, Path("origin"), self._asked)
-        return RunAgain(Recording(folder), self._asked, self.crate)
+        return RunAgain(Recording(folder), self._asked, self.crate, self._anyway)
 
     @cached_property
     def _branched_at(self) -> int | None:
@@ -225,7 +236,7 @@ def run_of(origin: str) -> Path:
 
 @contextmanager
 def beginning(
-    config: RackConfig, origin: str, crate: WarmCrate | None = None
+    config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
 ) -> Iterator[Beginning]:
     """Yield what a rack with this config, a branch perhaps, goes on from at RUN@TIME, for as long
     as it runs. A `crate` that was started earlier saves time. Raises `Failure`."""
@@ -236,7 +247,7 @@ def beginning(
     if injected > 0:
         why = "faults were injected while it ran, which is not repeated"
         print(f"{asked}: {injected} {why}", file=sys.stderr)
-    with RunAgain(recording, asked, crate) as again:
+    with RunAgain(recording, asked, crate, anyway) as again:
         if again.entries is not None:
             lan = config.adapter.lan
             senders = ", ".join(map(repr, (*config.host, *(() if lan is None else lan.racks))))

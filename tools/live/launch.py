@@ -28,6 +28,7 @@ from rack.tools.live.other_racks import OtherEnd, OtherRacks
 from rack.tools.live.queues import queue_fills
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.live.verdict import list_failures
+from rack.tools.recording.code import write_code
 from rack.tools.recording.origin import Origin
 from rack.tools.recording.recorder_process import RecorderProcess
 
@@ -155,6 +156,7 @@ def run_rack(
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
                     (folder / "config.toml").write_text(config.text())
+                    write_code(config, folder)
                     if begins.origin is not None:
                         begins.origin.write(folder)
                     log.open(folder / "events.jsonl")

@@ -37,7 +37,7 @@ from rack.backplane.trace import RECORD, trace_ring
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import Checksums, check_file
 from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder_process import ORIGIN, SPOOL
+from rack.tools.recording.recorder_process import CODE, ORIGIN, SPOOL
 
 MAGIC = b"RACKSPL4"
 """First bytes of a spool."""
@@ -112,7 +112,7 @@ class Spool:
                 raise Failure(f"{self.path}: another recorder is running there")
             if not self.path.stat().st_size:
                 # The config and the origin of the run are written before its recorder begins.
-                Checksums(folder).store(CONFIG, ORIGIN)
+                Checksums(folder).store(CONFIG, ORIGIN, CODE)
                 _write(self._file, MAGIC + _pack({"layout": asdict(layout), "launch": launch}))
             if (found := read_head(self._file, self.path)) != (layout, launch):
                 raise Failure(

@@ -8,6 +8,7 @@ read in copies of their processes, of which the rack that runs again leaves some
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -43,7 +44,8 @@ class RewoundRun:
     """A run, and the `tick` at which one looks at it. Use it as a context: it repeats the run, and
     keeps snapshots of it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, anyway: bool = False) -> None:
+        self._anyway = anyway
         self.recording = Recording(folder)
         self._layout = self.recording.layout
         self._first, self._end = ticks_of(self.recording)
@@ -56,8 +58,10 @@ class RewoundRun:
         self._again: RunAgain | None = None
 
     def __enter__(self) -> Self:
-        # Its crate imports while the user types.
-        self._ready()
+        # Its crate imports while the user types. What keeps a run from being repeated is said when
+        # that is asked for.
+        with suppress(Failure):
+            self._ready()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -67,7 +71,7 @@ class RewoundRun:
     def _ready(self) -> RunAgain:
         """Return the run that is repeated; anew after its crate was lost."""
         if self._again is None or self._again.crate.is_over:
-            self._again = RunAgain(self.recording)
+            self._again = RunAgain(self.recording, anyway=self._anyway)
         return self._again
 
     @property

@@ -138,7 +138,11 @@ def test_a_state_that_is_not_as_recorded_is_noted(
     again = ("run", "--from", f"{one}@1.2", "--seconds", SECONDS, "--no-record", "--json")
     assert not rack(*again).stderr
     levels.write_text(code.replace(".count + 1", ".count + 1 + 1"))
-    done = rack(*again)
+    refused = rack(*again)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert f"since it was recorded, these have changed: {levels}; --anyway" in refused.stderr
+    done = rack(*again, "--anyway")
+    assert f"these have changed: {levels}; digests may differ" in done.stderr
     first = r"first upper\.command at tick 0, goal was 1, is 2"
     why = f"upper.command, .* are not as recorded: {first}: the code of a level has changed since"
     assert re.search(why, done.stderr), done.stderr
@@ -182,3 +186,18 @@ def test_what_is_no_run_is_refused(arguments: tuple[object, ...], why: str, tmp_
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
     assert why in refused.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_run_of_an_older_version_is_refused_unless_it_is_wanted_anyway(
+    run: Path, tmp_path: Path
+) -> None:
+    (run / "code.json").unlink()
+    again = ("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--no-record", "--json")
+    refused = rack(*again)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    assert "an older version recorded it: it has no code.json" in refused.stderr
+    done = rack(*again, "--anyway")
+    assert (
+        json.loads(done.stdout)["digest"] == json.loads((run / "report.json").read_text())["digest"]
+    )

@@ -83,7 +83,7 @@ def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
 def _again(run: Recording, cycle: UnlikeCycle, until: int) -> tuple[_Again, bool]:
     """Repeat a cycle of a run until what it writes is visible; return what it did, and whether it
     does that each time."""
-    with RunAgain(run, f"{run.folder} at tick {cycle.tick}") as again:
+    with RunAgain(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
         attributes = again.levels(cycle.tick)[cycle.writer]
         found = []
         for _ in range(TIMES):
