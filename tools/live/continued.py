@@ -54,8 +54,8 @@ class RunAgain:
     end with it, and with its `crate`.
 
     Each tick that was reached has a snapshot, from which later ones are near. A run that continues
-    another one begins with that. `asked` begins what goes wrong, which is a `Failure`. `anyway`: run
-    it even if its code or files have changed since.
+    another one begins with that. `asked` begins what goes wrong, which is a `Failure`. `anyway`:
+    even if its code or files have changed since.
     """
 
     def __init__(

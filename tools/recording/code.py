@@ -32,12 +32,13 @@ FLOORS = Path(__file__).resolve().parents[2]
 
 def write_code(config: RackConfig, folder: Path) -> None:
     """Write with what a run is made, after its levels have been loaded. Raises `OSError`."""
-    own = [Path(found) for module in [*sys.modules.values()] if (found := _file_of(module))]
+    files = [getattr(module, "__file__", None) for module in [*sys.modules.values()]]
+    own = [Path(file) for file in files if file]
     paths = [path for path in own if any(path.is_relative_to(p) for p in config.python_path)]
     paths += [] if config.robot is None else [config.robot.model.parent]
     names = ["version", "python", PROGRAM, *map(str, sorted({*paths}))]
-    found = {name: _state_of(name) for name in names}
-    (folder / CODE).write_text(encode_json(found) + "\n")
+    states = {name: _state_of(name) for name in names}
+    (folder / CODE).write_text(encode_json(states) + "\n")
 
 
 def check_code(recording: Recording, asked: str, anyway: bool) -> Iterator[str]:
@@ -55,10 +56,6 @@ def check_code(recording: Recording, asked: str, anyway: bool) -> Iterator[str]:
         raise Failure(f"{asked}: {why}; --anyway continues it: digests may differ", 2)
     if why:
         yield f"{asked}: {why}; digests may differ"
-
-
-def _file_of(module: object) -> str | None:
-    return getattr(module, "__file__", None)
 
 
 def _state_of(name: str) -> str:
