@@ -13,10 +13,11 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.process import children_of, is_alive
+from rack.backplane.process import children_of, is_alive, readable
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
+from rack.boards.crate.clean import remove_dead
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import UNKEPT, SnapshotError
 from rack.boards.events import Event, Outcome
@@ -24,7 +25,7 @@ from rack.boards.faults.config import FaultConfig
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from tests.boards.conftest import LOOSE, MakeConfig
 from tests.boards.remembering_racks import REMEMBERING
-from tests.processes import wait_until
+from tests.processes import BOUND_S, FORKS, forked, wait_until
 
 pytestmark = pytest.mark.slow
 SECONDS = 1.0
@@ -284,3 +285,30 @@ def test_a_running_rack_states_how_many_snapshots_there_are(
         segment = len(rack.segment.bytes)
     assert count >= 1
     assert size >= count * segment // 2
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_nothing_is_left_of_snapshots_whose_launcher_is_killed(config: MakeConfig) -> None:
+    rack = config()
+    begun, begins = os.pipe()
+
+    def launch() -> None:
+        with WarmCrate() as crate:
+            taken(rack, crate, SnapshotPolicy(part=0, at=100))
+            # The rack that goes on runs until it is killed.
+            with Rack(rack, crate=crate, continues=Continuation(100)) as again:
+                again.start(1e6)
+                os.write(begins, crate.pid.to_bytes(4, "little"))
+                while again.watch(1.0):
+                    continue
+
+    with forked(launch) as launcher:
+        assert readable(begun, BOUND_S)
+        crate = int.from_bytes(os.read(begun, 4), "little")
+        family = {crate, *children_of(crate)}
+        for child in [*family]:
+            family |= children_of(child)
+        os.kill(launcher, signal.SIGKILL)
+        wait_until(lambda: not any(map(is_alive, family)))
+    assert len(family) > 2 * (len(rack.board) + 2)
+    remove_dead(rack.name)
