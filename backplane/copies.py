@@ -2,8 +2,8 @@
 another.
 
 A process has thousands of views of its segment. They stay valid: the memory of another segment is
-mapped at the address of the one before (`mmap` with `MAP_FIXED`). What a process holds besides, the
-kernel's locks and its claims on mailboxes, it takes again there.
+mapped at the address of the one before (`mmap` with `MAP_FIXED`). The kernel's locks are of the
+other segment, too: what a process holds, it takes again there.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from rack.backplane import byte_lock
-from rack.backplane.mailbox.mailbox import claim_again
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Box, System, TaskState
 
@@ -90,12 +89,11 @@ def leave(segment: Segment) -> None:
 
 def enter(segment: Segment, fd: int) -> None:
     """Let the views of `segment` be of another one of the same layout, open as `fd`, which is
-    closed; claim its mailboxes."""
+    closed. No lock is taken there, and no mailbox claimed."""
     os.dup2(fd, segment.fd)
     os.close(fd)
     _map(segment, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, segment.fd)
     byte_lock.reopen_all(segment.fd)
-    claim_again()
 
 
 def _map(segment: Segment, flags: int, rights: int, fd: int) -> None:

@@ -14,10 +14,9 @@ import ctypes
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from rack.backplane.segment import Segment
+from rack.backplane.address_map import AddressMap
 
 _libc = ctypes.CDLL(None)
 # Calls that never block keep the interpreter's lock: that makes them faster.
@@ -31,6 +30,13 @@ _sem_clockwait.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p
 _sem_init.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint
 _sem_post.argtypes = _sem_trywait.argtypes = (ctypes.c_void_p,)
 _sem_getvalue.argtypes = ctypes.c_void_p, ctypes.c_void_p
+
+
+class MappedMemory(Protocol):
+    """The memory of a segment, and the addresses in it."""
+
+    bytes: memoryview
+    map: AddressMap
 
 
 class Semaphore:
@@ -91,17 +97,17 @@ def initialize(memory: memoryview, wake_and_done: Iterable[int], locks: Iterable
             Semaphore(memory, address).initialize(value)
 
 
-def wake_semaphore(segment: Segment, task: str) -> Semaphore:
+def wake_semaphore(segment: MappedMemory, task: str) -> Semaphore:
     """Return the semaphore that wakes a task."""
     return Semaphore(segment.bytes, segment.map.wake[task])
 
 
-def done_semaphore(segment: Segment, task: str) -> Semaphore:
+def done_semaphore(segment: MappedMemory, task: str) -> Semaphore:
     """Return the semaphore on which lockstep waits for a task's reports, or for the crate to report
     its loss."""
     return Semaphore(segment.bytes, segment.map.done[task])
 
 
-def lock_semaphore(segment: Segment, mailbox: str) -> Semaphore:
+def lock_semaphore(segment: MappedMemory, mailbox: str) -> Semaphore:
     """Return the semaphore that guards a mailbox."""
     return Semaphore(segment.bytes, segment.map.locks[mailbox])

@@ -26,6 +26,7 @@ from typing import Any
 
 from rack.backplane import copies
 from rack.backplane.json_text import encode_json
+from rack.backplane.mailbox.mailbox import claim_again
 from rack.backplane.process import COPY, die_with_parent, name_process
 from rack.backplane.segment import Segment
 from rack.boards.errors import SnapshotError
@@ -148,6 +149,7 @@ class Copier:
         control.close()
         die_with_parent(request.crate)
         copies.enter(self._segment, file)
+        claim_again()
         send(self._line, CopyNote(tick, self._name, successor))
         self._copies = [successor]
         name_process(f"{self._segment.rack}:{self._name}")
