@@ -46,7 +46,7 @@ def check_code(recording: Recording, asked: str, anyway: bool) -> Iterator[str]:
     `Failure`, which begins with what was `asked`, if it is not."""
     path = recording.folder / CODE
     if not path.exists():
-        why = f"an older version recorded it: it has no {CODE}"
+        why = f"it has no {CODE}: 'rack record' or an older version recorded it"
     else:
         recording.checksums.verify(CODE)
         recorded: dict[str, str] = json.loads(read_file(path))

@@ -59,22 +59,28 @@ class RecordedMoment:
             if self._in_force.row(name, self.tick) is not None
         }
 
-    def levels(self) -> dict[str, Document]:
-        """Return the attributes of the levels' own objects, by task, in plain data."""
-        with as_failure(), RunAgain(self._recording) as again:
+    def levels(self, anyway: bool = False) -> dict[str, Document]:
+        """Return the attributes of the levels' own objects, by task, in plain data; `anyway`: even
+        if the code or the files of the run have changed since."""
+        with as_failure(), RunAgain(self._recording, anyway=anyway) as again:
             return again.levels(self.tick)
 
     def resume(
-        self, *settings: str, faults: str | None = None, seconds: float | None = None
+        self,
+        *settings: str,
+        faults: str | None = None,
+        seconds: float | None = None,
+        anyway: bool = False,
     ) -> Rack:
         """Return a rack in the background that goes on from here in lockstep; with `settings`, as
         in "board.servo.params.bandwidth=80", or `faults` it is a branch.
 
-        Close it, or use it as a context. `seconds` counts from the beginning of the recorded run.
+        Close it, or use it as a context. `seconds` counts from the beginning of the recorded run;
+        `anyway` is as in `levels`.
         """
         with as_failure():
             config = branched(self._recording, settings, faults)
-            again = RunAgain(self._recording)
+            again = RunAgain(self._recording, anyway=anyway)
             try:
                 begins = again.beginning(self.tick)
                 rack = Rack(
