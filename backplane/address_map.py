@@ -62,7 +62,21 @@ class AddressMap:
         address = end
         for board in dict.fromkeys(task.board for task in layout.processes):
             address = self._place_board(board, layout, address)
-        self.size = address
+        self.wake: dict[str, int] = {}
+        self.done: dict[str, int] = {}
+        self.locks: dict[str, int] = {}
+        self.size = pages(self._place_semaphores(layout, address))
+
+    def _place_semaphores(self, layout: Layout, start: int) -> int:
+        """Place the semaphores after all windows, each in a cache line of its own."""
+        names = [task.name for task in layout.processes]
+        locked = [box.name for box in layout.mailboxes if box.protocol == "lock"]
+        address = start
+        for places, of in ((self.wake, names), (self.done, names), (self.locks, locked)):
+            for name in of:
+                places[name] = address
+                address += LINE
+        return address
 
     def _place_board(self, board: str, layout: Layout, start: int) -> int:
         address = start

@@ -14,8 +14,10 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from weakref import WeakSet
 
 _HELD: set[ProcessLock] = set()
+_OPEN: WeakSet[ByteLock] = WeakSet()
 _FLOCK = struct.Struct("hhqqi4x")
 """`struct flock` of 64-bit Linux: type, whence, start, length, pid (0: locks of a file description
 have none)."""
@@ -25,9 +27,14 @@ class ByteLock:
     """The lock on the byte at a bus address of an open segment."""
 
     def __init__(self, fd: int, address: int) -> None:
-        self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
+        self.reopen(fd)
+        _OPEN.add(self)
         self._take = _one_byte(fcntl.F_WRLCK, address)
         self._unlock = _one_byte(fcntl.F_UNLCK, address)
+
+    def reopen(self, fd: int) -> None:
+        """Use another segment, open as `fd`; the lock is not taken there."""
+        self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
 
     def take(self) -> bool:
         """Take the lock; False when it is held already."""
@@ -43,6 +50,12 @@ class ByteLock:
 
     def close(self) -> None:
         """Release the lock and its descriptor; may be called again."""
+        _OPEN.discard(self)
+        self.close_file()
+
+    def close_file(self) -> None:
+        """Close the descriptor until `reopen`. A process from which this one was forked keeps the
+        lock."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -81,6 +94,18 @@ def _close_inherited() -> None:
 
 
 os.register_at_fork(after_in_child=_close_inherited)
+
+
+def close_all() -> None:
+    """Close the descriptors of all locks of this process, a fork, until `reopen_all`."""
+    for lock in _OPEN:
+        lock.close_file()
+
+
+def reopen_all(fd: int) -> None:
+    """Let all locks be those of another segment, open as `fd`; none is taken there."""
+    for lock in _OPEN:
+        lock.reopen(fd)
 
 
 def is_locked(fd: int, address: int) -> bool:

@@ -209,6 +209,10 @@ def set_priority(priority: int) -> bool:
     return True
 
 
+COPY = "copy:"
+"""Begins the names of processes that are part of a snapshot."""
+
+
 def name_process(name: str) -> None:
     """Set the name of the calling process in `top` and `ps`, 15 characters."""
     _libc.prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)

@@ -25,13 +25,14 @@ from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout, TaskSpec
+from rack.backplane.semaphores import initialize
 from rack.backplane.words import Block, Head, Run, System
 
 if TYPE_CHECKING:
     from rack.backplane.message import Message
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 16
+VERSION = 17
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 """Words with the addresses of the texts; the word after each has its size."""
 PREFIX = "nasrem-rack."
@@ -173,6 +174,7 @@ class Segment:
             block[Block.RELEASED] = block[Block.DONE] = -1
         for task in self.layout.tasks:
             self.words[System.SYSFAIL + task.slot] = 1
+        self.initialize_semaphores()
         self.words[Head.VERSION] = VERSION
         self.words[Head.SIZE] = len(self.bytes)
         self.words[Head.LAUNCHER_PID] = os.getpid()
@@ -181,6 +183,13 @@ class Segment:
         self.words[Head.CREATED_MONOTONIC_NS] = time.monotonic_ns()
         # Last, so that no process attaches to half a segment.
         self.words[Head.MAGIC] = MAGIC
+
+    def initialize_semaphores(self) -> None:
+        """Make the semaphores, on which no process may wait."""
+        places = self.map
+        initialize(
+            self.bytes, (*places.wake.values(), *places.done.values()), places.locks.values()
+        )
 
     @classmethod
     def attach(cls, rack: str) -> Self:

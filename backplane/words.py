@@ -97,6 +97,13 @@ class System:
     SKIPPED_FROM = 56  # first of the ticks that the clock skipped last
     # the recorder has taken everything up to here, whether or not it is in its files
     FOLLOWER_DRAINED = 57
+    # 1 + tick before which lockstep takes a snapshot; 0: none is wanted. Written by the Rack
+    SNAPSHOT_AT = 58
+    # snapshots cost one part in so many of lockstep's time; 0: there is only that one. By the Rack
+    SNAPSHOT_PART = 59
+    SNAPSHOT_EVERY = 60  # ticks between two that are taken besides; 0: none. Written by the Rack
+    SNAPSHOTS = 61  # held by the crate, of this rack or of those before it; written by the crate
+    SNAPSHOT_BYTES = 62  # the memory that they have for themselves; written by the crate
     SYSFAIL = 64  # one word per slot, 22 of them: 1 until the board's self-test has passed
 
 
@@ -157,9 +164,9 @@ class Block:
     CLOCK_SKIPPED = 25  # ticks skipped by the clock that this task has reported
     # of a host board in lockstep: tick until which its program waits; 0: a message has come
     WAITS_UNTIL = 26
-    # 1 + tick before which the task is to save its state; 0: it is not, or has. Set by the clock
-    SAVE = 27
-    TRACE_FIRST = 28  # trace records before this run, which continues another; written by the Rack
+    # 1 + tick before which the task is to fork a copy; 0: it is not, or has. Set by the clock
+    COPY = 27
+    TRACE_FIRST = 28  # trace records before this run, which continues another; written by the crate
     FIRST = 29  # in lockstep, first of the releases given together with RELEASED; by the clock
     FAILED = 30  # where in its code the last process of the task failed, and how often in a row
 

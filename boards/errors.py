@@ -4,7 +4,7 @@
 
 - `ConfigError`: a config with mistakes, all of them at once, before any process starts.
 - `LaunchError`: a board that did not start: its self-test failed, or it was not ready in time.
-- `CheckpointError`: a state that cannot be kept, or a checkpoint that cannot be continued.
+- `SnapshotError`: a process that cannot be copied, or a snapshot from which a rack cannot go on.
 """
 
 from __future__ import annotations
@@ -18,10 +18,8 @@ LONGEST_PLACE = 120
 LONGEST_REASON = 1000
 CANNOT_GO_ON = 4
 """Exit status of a board that a restart would not help."""
-CANNOT_KEEP = 5
-"""Exit status of a board that has no checkpoint, or cannot continue from the one it is given."""
 
-UNKEPT = "no checkpoints: "
+UNKEPT = "no snapshots: "
 """Begins the note of a run that takes none, with the reason after it."""
 
 
@@ -33,8 +31,8 @@ class LaunchError(BoardError):
     """A rack with a correct config that cannot be launched."""
 
 
-class CheckpointError(BoardError):
-    """A state that cannot be kept in a checkpoint, or a checkpoint that cannot be continued."""
+class SnapshotError(BoardError):
+    """A process that cannot be copied, or a snapshot from which a rack cannot go on."""
 
 
 @dataclass(frozen=True)

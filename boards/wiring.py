@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.process import Reservation
 from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
-KEEPING = "rack.boards.checkpoint.keeping"
-"""What takes checkpoints, by name: a rack that takes none does not load it."""
 Source = str | Mapping[str, str]
 """What a port reads: a mailbox, or mailboxes by board."""
 
@@ -41,22 +38,26 @@ class BusTimes:
 
 
 @dataclass(frozen=True)
-class Keeping:
-    """Checkpoints of a run: into which folder, every how many ticks; 0: none.
+class SnapshotPolicy:
+    """Snapshots that a rack in lockstep takes: the standstill for them is one part in `part` of its
+    time; 0: it does not matter. Besides, there is one each `every` ticks, unless that is 0, and one
+    before the tick `at`, if that is given."""
 
-    `at`: the tick of the first one, in place of the next multiple of `every`. `shows`: each task
-    leaves the attributes of its level next to each. `origin`: the file of the one that the run
-    continues from. Classes in it are those of the rack, or of modules in `packages`. It has the
-    first `faults` and `commands` of the config in its tables; `losses` are the boards that were
-    lost before it, and when.
-    """
-
-    folder: Path = Path()
+    part: int = 40
     every: int = 0
     at: int | None = None
-    shows: bool = False
-    origin: Path | None = None
-    packages: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """Where a rack in lockstep goes on from: the last snapshot of its crate at `tick` or before.
+
+    The snapshot has the first `faults` and `commands` of the config in its tables. `losses` are
+    the boards lost in the run that it continues, and when. A task goes on as it is there, with
+    other settings perhaps. If it is wired otherwise it starts anew, from what its mailboxes hold.
+    """
+
+    tick: int
     faults: int = 0
     commands: int = 0
     losses: tuple[tuple[str, int], ...] = ()
@@ -71,6 +72,7 @@ class TaskWiring:
     messages the level sends itself. `fails_self_test`: a fault in the config. `entries`: for an
     adapter in a replay. `exchange`: the ports that are not simply read in every cycle; it makes the
     task write its mailbox `<board>.exchange`. `reservation`: asked for in place of a priority.
+    `is_copied`: the rack takes snapshots.
     """
 
     task: str
@@ -87,7 +89,7 @@ class TaskWiring:
     exchange: Mapping[str, ExchangeSpec]
     reservation: Reservation | None
     # Of one run, no part of how a rack is wired.
-    keeping: Keeping | None = field(default=None, repr=False)
+    is_copied: bool = field(default=False, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ class ClockWiring:
     mailbox `ends_run` reports done or error, or if its writer, not lost, has written nothing for
     `silent`. In lockstep the clock is at most `history` ahead of a recorder, and a lost board
     rejoins `restart_ticks` after its loss. `on_loss`: the demand on the arm while a task is lost.
-    `keeps_awake`: no core sleeps while it is idle. `reservation`: as of a task.
+    `keeps_awake`: no core sleeps while it is idle. `reservation`, `is_copied`: as of a task.
     """
 
     lockstep: bool
@@ -132,4 +134,4 @@ class ClockWiring:
     restart_ticks: int
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
-    keeping: Keeping | None = field(default=None, repr=False)
+    is_copied: bool = field(default=False, repr=False, compare=False)

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from time import monotonic_ns
 from typing import NamedTuple
 
-from rack.backplane import semaphores
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.history import MailboxRing
@@ -211,13 +210,11 @@ def links(rack: str) -> Iterator[MakeLink]:
         box = mailbox(protocol, every=cycles * rates[0], delay=rates[0], depth=depth)
         tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
         segment = Segment.create(layout(f"{rack}-{len(made)}", [box], tasks), "")
-        semaphores.create(segment.layout)
         made.append(Link(segment, reader_first))
         return made[-1]
 
     yield make
     for found in made:
         found.close()
-        semaphores.unlink_all(found.segment.rack)
         unlink(found.segment.rack)
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack in path.name]

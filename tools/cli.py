@@ -346,10 +346,10 @@ def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | 
         or COMPLETION in os.environ
     ):
         return nullcontext()
-    from rack.boards.crate.line import NO_WINDOWS, SINGLE_THREADED, CrateLine
+    from rack.boards.crate.line import NO_WINDOWS, SINGLE_THREADED, CrateLine, WarmCrate
 
     os.environ.update(SINGLE_THREADED | NO_WINDOWS)
-    return CrateLine()
+    return WarmCrate() if any(one.startswith("--from") for one in arguments) else CrateLine()
 
 
 def commands() -> TyperGroup:

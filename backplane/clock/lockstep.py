@@ -37,15 +37,15 @@ LOOK_S = 0.001
 disturb the clock."""
 
 
-def _keep_nothing(tick: int) -> int:
-    """Take no checkpoint."""
+def _take_none(tick: int) -> int:
+    """Take no snapshot."""
     return sys.maxsize
 
 
 class LockstepDriver(ClockDriver):
     """The driver of the clock in lockstep.
 
-    `keep` is called before every tick, or batch, to take a checkpoint when one is due; it returns
+    `snapshot` is called before every tick, or batch, to take a snapshot when one is due; it returns
     the next tick before which it must be called.
 
     `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for
@@ -65,8 +65,8 @@ class LockstepDriver(ClockDriver):
         self._one_at_a_time = one_at_a_time
         self._history_ticks = history_ticks
         self._last_first = list(reversed(self.tasks))
-        self.keep: Callable[[int], int] = _keep_nothing
-        self._kept_until = 0
+        self.snapshot: Callable[[int], int] = _take_none
+        self._snapshot_at = 0
         self._next = self.first_tick
         self._last = self._next - 1
 
@@ -80,7 +80,6 @@ class LockstepDriver(ClockDriver):
         self.words[System.STATE] = Run.RUNNING
         # A clock that was restarted does not know where a batch ends.
         self.settle()
-        # In attributes: a checkpoint keeps them.
         while self._begins(tick := self._next):
             if not self.begin(tick):
                 self._next = tick + 1
@@ -95,8 +94,8 @@ class LockstepDriver(ClockDriver):
 
     def _begins(self, tick: int) -> bool:
         """Say whether `tick` begins, after whatever must be waited for before it."""
-        # Nothing has looked at this tick yet: who continues from here begins with it.
-        self._kept_until = self.keep(tick)
+        # Nothing has looked at this tick yet: what goes on from here begins with it.
+        self._snapshot_at = self.snapshot(tick)
         return (
             self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
         )
@@ -112,7 +111,7 @@ class LockstepDriver(ClockDriver):
         if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
             return tick + 1
         words = self.words
-        end = min(tick + BATCH, self._kept_until, controller.rests_until(tick))
+        end = min(tick + BATCH, self._snapshot_at, controller.rests_until(tick))
         if stop := words[System.STOP_TICK]:
             end = min(end, stop)
         if (hold := words[System.HOLD_AT]) > 0:

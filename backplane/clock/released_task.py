@@ -49,8 +49,8 @@ class ReleasedTask:
         self._phase = spec.phase
         self._early = spec.every - segment.layout.due(spec)
         self._done = self.block[Block.DONE]
-        self.wake: Callable[[], None] = wake_semaphore(segment.rack, spec.name).release
-        self.done = done_semaphore(segment.rack, spec.name)
+        self.wake: Callable[[], object] = wake_semaphore(segment, spec.name).release
+        self.done = done_semaphore(segment, spec.name)
 
     def is_free(self, release: int) -> bool:
         """Say whether the task can take a release; it cannot while it works on a plan or is

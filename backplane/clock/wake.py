@@ -55,7 +55,7 @@ class NextCycle:
         self._spec = spec = segment.layout.task(task)
         self._words = segment.words
         self._block = segment.block(task)
-        self._semaphore = wake_semaphore(segment.rack, task)
+        self._semaphore = wake_semaphore(segment, task)
         self._segment = segment
         is_lockstep = bool(segment.words[System.LOCKSTEP])
         self._sleeps = spec.wake == "timer" and not is_lockstep
@@ -79,8 +79,8 @@ class NextCycle:
         self.hold_until(self._due)
         self._slack = 0
         self.skipped = 0
-        self.save: Callable[[], None] | None = None
-        """Called when the clock wants the state of the task, between two cycles."""
+        self.copy: Callable[[], None] | None = None
+        """Called when the clock wants a copy of the task, between two cycles."""
 
     def wait(self) -> int | None:
         """Wait for the next release and return its tick; None when the run is over and every
@@ -109,8 +109,8 @@ class NextCycle:
                     self._semaphore.take()
                 self._newest = newest
                 return self._take(newest)
-            if block[Block.SAVE] and self.save is not None:
-                self.save()
+            if block[Block.COPY] > 0 and self.copy is not None:
+                self.copy()
             if is_over or not self._pause():
                 return None
             is_posted = False
@@ -158,7 +158,12 @@ class NextCycle:
         return self._look_around()
 
     def _await_post(self) -> bool:
-        return self._semaphore.await_post(CHECK_S) or self._look_around()
+        # The bound may be that of an earlier wait: a timeout that comes early costs one look
+        # around, no more.
+        if not self._semaphore.wait():
+            return True
+        self._semaphore.bind(monotonic_ns() + int(CHECK_S * 1e9))
+        return self._look_around()
 
     def _block_on_semaphore(self) -> bool:
         bound = int(CHECK_S * 1e9)

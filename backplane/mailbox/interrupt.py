@@ -71,8 +71,6 @@ class InterruptLine:
     """One mailbox that interrupts a board, as that board sees it: the serials served, and the
     number lost there."""
 
-    found_again = ("_heads",)
-
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.service_ns = how_sent(spec).service_ns
         self.lost = 0

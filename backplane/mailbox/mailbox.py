@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from struct import Struct
 from typing import Generic, NamedTuple, TypeVar
+from weakref import WeakSet
 
 from xxhash import xxh3_64_intdigest as xxh3
 
@@ -94,23 +95,26 @@ class Writer:
         """Messages of a queue that this writer has refused because it was full."""
         self.intruder = 0
         """Another process that has published since this writer's last message but one; 0: none."""
+        # In the segment, whatever the slots publish to.
+        self._claimed = segment.box(name)
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
+        self.claim()
+        self._slots.resume(self._slots.signature)
+        _WRITERS.add(self)
+
+    def claim(self) -> None:
+        """Claim the mailbox, in a new epoch. Raises `MailboxError` when it has another writer."""
+        box = self._claimed
         if not self._claim.take():
-            pid = self._slots.box[Box.WRITER_PID]
+            pid = box[Box.WRITER_PID]
             self._claim.close()
             raise MailboxError(
-                f"mailbox '{name}' has a writer already, process {pid}; permitted: one"
+                f"mailbox '{self.spec.name}' has a writer already, process {pid}; permitted: one"
             )
-        box = self._slots.box
         box[Box.WRITER_PID] = os.getpid()
         box[Box.EPOCH] = epoch = epoch_of(box[Box.EPOCH] + 1)
         # One store: no reader sees half a claim.
-        box[Box.CLAIMANT] = claim(epoch, os.getpid())
-        self._slots.resume(box[Box.CLAIMANT])
-
-    def sign(self) -> None:
-        """Sign with this process's claim: the local record has come from another process."""
-        self._slots.signature = self._slots.box[Box.CLAIMANT]
+        box[Box.CLAIMANT] = self._slots.signature = claim(epoch, os.getpid())
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`, released at `tick`; return False when it is too late.
@@ -161,7 +165,18 @@ class Writer:
 
     def close(self) -> None:
         """Release the claim."""
+        _WRITERS.discard(self)
         self._claim.close()
+
+
+_WRITERS: WeakSet[Writer] = WeakSet()
+"""The writers of this process that have their mailboxes claimed."""
+
+
+def claim_again() -> None:
+    """Claim the mailboxes of this process in a segment that has taken the place of another."""
+    for writer in _WRITERS:
+        writer.claim()
 
 
 @dataclass(slots=True)
@@ -180,8 +195,6 @@ class ReadStatistics:
 class Reader:
     """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the
     mailbox's depth."""
-
-    found_again = ("_places", "_heads")
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)

@@ -41,10 +41,9 @@ class MailboxLock:
     """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
-        self._semaphore = lock_semaphore(segment.rack, name)
+        self._semaphore = lock_semaphore(segment, name)
         self._owner = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.OWNER)
         self._box = segment.box(name)
-        self._pid = os.getpid()
         self._wait_s = wait_s
         self.held_up = 0
 
@@ -60,7 +59,7 @@ class MailboxLock:
         # between the two steps and is the owner.
         if not self._owner.take():
             return False
-        self._box[Box.OWNER] = self._pid
+        self._box[Box.OWNER] = os.getpid()
         return True
 
     def release(self) -> None:

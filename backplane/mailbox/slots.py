@@ -98,8 +98,6 @@ class Slots:
     serial = Word(Slot.SERIAL)
     tick = Word(Slot.TICK)
     visible = Word(Slot.VISIBLE_AT)
-    # Thousands of views, which no checkpoint needs to look at: they never change.
-    found_again = ("places", "heads")
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.spec = spec

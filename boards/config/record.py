@@ -1,4 +1,4 @@
-"""`[record]`: what is kept of a run; by default everything, with checkpoints in lockstep."""
+"""`[record]`: what is kept of a run; by default everything."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ Stretch = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False), BeforeValid
 
 
 class RecordConfig(Table):
-    """`[record]`: checkpoints and, with `keep`, a flight recorder, which keeps the last stretch of
-    a run, and for good what surrounds a fault, a detection, a miss, a hold, a restart or a lost
-    row."""
+    """`[record]`: with `keep`, a flight recorder, which keeps the last stretch of a run, and for
+    good what surrounds a fault, a detection, a miss, a hold, a restart or a lost row."""
 
-    checkpoint_s: Span = 5.0
-    """between checkpoints in lockstep, s; simulated time; 0: none are taken"""
     keep: Stretch | None = None
     """last stretch kept, s; simulated time; also as in "10 min" or "30 s"; default: all"""
     before: Span = 5.0

@@ -47,7 +47,6 @@ from rack.boards.wiring import (
     ClockWiring,
     Entries,
     HostWiring,
-    Keeping,
     TaskWiring,
     mailboxes_of,
 )
@@ -148,20 +147,20 @@ class Resolved:
     goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
     def for_run(
-        self, repeats: str, entries: Mapping[str, Entries] | None, keeping: Keeping | None
+        self, repeats: str, entries: Mapping[str, Entries] | None, is_copied: bool
     ) -> Resolved:
         """Return the rack for one run.
 
         `repeats`: the name that its levels see, which may stand in their messages; empty: its own.
         `entries`: of a replay, which has no host boards and other racks, but what each adapter
-        wrote in the recorded run. `keeping`: its checkpoints, or the one that it continues from.
+        wrote in the recorded run. `is_copied`: it takes snapshots.
         """
         tasks = tuple(
             replace(
                 task,
                 context=replace(task.context, rack=repeats or self.config.name),
                 entries=None if entries is None else entries.get(task.task),
-                keeping=keeping,
+                is_copied=is_copied,
             )
             for task in self.tasks
         )

@@ -6,7 +6,6 @@ import os
 from collections.abc import Collection
 from contextlib import suppress
 
-from rack.backplane import semaphores
 from rack.backplane.address_map import HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import RackInUseError, SegmentError
@@ -60,7 +59,6 @@ def _remove(segment: Segment) -> bool:
         # would remove the rack that the faster one has meanwhile launched under the same name.
         if not removal.take() or not segment.has_its_name:
             return False
-        semaphores.unlink_all(rack)
         unlink(rack)
         return True
     finally:
@@ -76,7 +74,6 @@ def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
             if segment.launcher in killed or (
                 segment.launcher_is_alive and segment.launcher == os.getpid()
             ):
-                semaphores.unlink_all(name)
                 unlink(name)
             segment.close()
 

@@ -21,11 +21,13 @@ from contextlib import suppress
 from importlib import import_module
 from multiprocessing.connection import Connection
 
-from rack.backplane import semaphores
+from rack.backplane.address_map import CLOCK
+from rack.backplane.copies import fill_memory
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import note_used_files
-from rack.backplane.process import adopt_orphans, children_of, refusal, set_priority
+from rack.backplane.process import adopt_orphans, children_of, readable, refusal, set_priority
 from rack.backplane.segment import Segment
+from rack.backplane.semaphores import done_semaphore
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.classes import find_class
 from rack.boards.crate.line import received
@@ -45,11 +47,14 @@ from rack.boards.crate.requests import (
     Preload,
     PreloadFailed,
     Preloading,
+    Show,
+    Shown,
 )
+from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy, can_go_on
 from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import hog
 from rack.boards.run.board import enter, run_clock_board, run_task_board
-from rack.boards.wiring import KEEPING, ClockWiring, HostWiring, TaskWiring
+from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
@@ -75,11 +80,15 @@ class Crate:
         self._attention = attention
         self._segment: Segment  # from the Rack's request to open it on
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
+        self._shelf = SnapshotShelf()
+        self._wirings: dict[str, TaskWiring | ClockWiring] = {}
+        self._to_go_on: dict[str, WaitingCopy] = {}
         self._preloaded: set[str] = set()
         self._outputs: dict[str, HostOutput] = {}
         self._resting: list[HostOutput] = []
         self._poll = select.poll()
         self._poll.register(line, select.POLLIN)
+        self._poll.register(self._shelf.line, select.POLLIN)
         # The line alone does not show that the launcher is gone: a process that it forked may hold
         # its end open.
         self._launcher = os.pidfd_open(os.getppid())
@@ -95,12 +104,17 @@ class Crate:
             for fd, _ in ready:
                 if fd in self._boards:
                     self._reap(fd)
+                elif fd == self._shelf.line.fileno():
+                    self._take_note()
                 elif fd in printing:
                     printing[fd].pass_on()
                     self._poll.unregister(fd)
                     self._resting.append(printing[fd])
                 elif fd == self._launcher or (request := received(self._line)) is None:
                     self._leave()
+                    had_any = len(self._shelf) > 0
+                    self._shelf.clear()
+                    self._reap_copies(are_all=had_any)
                     return
                 elif isinstance(request, Leave):
                     self._leave_for_another()
@@ -112,19 +126,13 @@ class Crate:
         match request:
             case Preload() as wanted:
                 self._preload(wanted)
-            case Open(rack, priority):
+            case Open(rack, priority, before):
                 self._segment = Segment.attach(rack)
-                semaphores.open_all(self._segment.layout)
                 note_used_files()
                 set_priority(priority)
-                self._line.send(Opened())
-            case PowerOn(name, TaskWiring() as task):
-                if task.keeping is not None:
-                    # Here, once for all boards.
-                    import_module(KEEPING)
-                self._fork(name, lambda segment: run_task_board(segment, task, self._attention))
-            case PowerOn(name, ClockWiring() as clock):
-                self._fork(name, lambda segment: run_clock_board(segment, clock, self._attention))
+                self._line.send(Opened(-1 if before is None else self._fill_segment(before)))
+            case PowerOn(name, TaskWiring() | ClockWiring() as wiring):
+                self._power_on(name, wiring)
             case PowerOn(name, HostWiring() as host):
                 output = self._output(name).writer
                 self._fork(name, lambda segment: self._run_host_board(segment, host, output))
@@ -132,6 +140,52 @@ class Crate:
                 self._fork(name, lambda segment: hog(segment, entry))
             case PowerOff(name):
                 self._kill(name)
+            case Show(tick, name):
+                snapshot = self._shelf.nearest(tick)
+                text = "" if snapshot is None or not name else self._shelf.show(snapshot, name)
+                self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
+
+    def _fill_segment(self, before: int) -> int:
+        """Fill the segment from the last snapshot at that tick or before; return its tick, -1
+        without one."""
+        snapshot = self._shelf.nearest(before)
+        if snapshot is None:
+            return -1
+        fill_memory(self._segment, snapshot.memory, snapshot.tick)
+        self._to_go_on = {**snapshot.copies}
+        self._state_snapshots()
+        return snapshot.tick
+
+    def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
+        """Fork a task or the clock, or let its copy go on."""
+        self._wirings[name] = wiring
+        copy = self._to_go_on.pop(name, None)
+        if copy is not None and can_go_on(copy, wiring):
+            try:
+                self._watch(name, self._shelf.go_on(copy, wiring, self._segment.fd))
+            except OSError:
+                self._fail_to_fork(name, "its copy in the snapshot is gone")
+            return
+        lines = self._attention, self._shelf.boards_line
+        if isinstance(wiring, TaskWiring):
+            self._fork(name, lambda segment: run_task_board(segment, wiring, *lines))
+            return
+        if copy is not None:
+            # As after the loss of a clock: it continues the run.
+            self._segment.words[System.STATE] = Run.RUNNING
+        self._fork(name, lambda segment: run_clock_board(segment, wiring, *lines))
+
+    def _take_note(self) -> None:
+        """Take the note of a board about its copy."""
+        names = {task.name for task in self._segment.layout.tasks} | {CLOCK}
+        self._shelf.take_note({name: self._wirings[name] for name in names & {*self._wirings}})
+        self._state_snapshots()
+
+    def _state_snapshots(self) -> None:
+        """State on the backplane how many snapshots there are, and how large."""
+        words = self._segment.words
+        words[System.SNAPSHOTS] = len(self._shelf)
+        words[System.SNAPSHOT_BYTES] = self._shelf.private_bytes
 
     def _preload(self, wanted: Preload) -> None:
         """Load what boards share with the crate. Mistakes in the config are left for the Rack to
@@ -186,21 +240,27 @@ class Crate:
         try:
             pid = os.fork()
         except OSError as error:
-            end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
             needed = f"the rack needs {len(self._segment.layout.processes) + HOST_PROCESSES}"
-            with suppress(OSError):
-                self._line.send(
-                    ForkFailed(end, f"board '{name}' cannot be forked: {refusal(error)}; {needed}")
-                )
+            self._fail_to_fork(name, f"{refusal(error)}; {needed}")
             return
         if pid == 0:
             self._line.close()
+            self._shelf.close_inherited()
             # The only exit of the child: the crate's own code must not run twice.
             status = os.EX_SOFTWARE
             try:
                 status = enter(crate, name, self._segment, board)
             finally:
                 os._exit(status)
+        self._watch(name, pid)
+
+    def _fail_to_fork(self, name: str, why: str) -> None:
+        end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
+        with suppress(OSError):
+            self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {why}"))
+
+    def _watch(self, name: str, pid: int) -> None:
+        """Watch a process that has become a board."""
         pidfd = os.pidfd_open(pid)
         self._boards[pidfd] = name, pid
         self._poll.register(pidfd, select.POLLIN)
@@ -226,7 +286,8 @@ class Crate:
         of the crate."""
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
-            orphans = children_of(os.getpid()) - {pid for _, pid in self._boards.values()}
+            boards = {pid for _, pid in self._boards.values()}
+            orphans = children_of(os.getpid()) - boards - self._shelf.pids
             if not orphans:
                 return
             for pid in orphans:
@@ -253,7 +314,7 @@ class Crate:
                 UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
             words[System.LOSSES] += 1
             # In lockstep the clock waits for this.
-            semaphores.done_semaphore(self._segment.rack, name).release()
+            done_semaphore(self._segment, name).release()
         return tick
 
     def _is_host(self, name: str) -> bool:
@@ -282,6 +343,16 @@ class Crate:
         self._kill()
         while self._boards:
             self._reap_ended(None)
+        # What boards wrote of their copies before they ended.
+        while hasattr(self, "_segment") and readable(self._shelf.line.fileno(), 0):
+            self._take_note()
+        self._reap_copies()
+
+    def _reap_copies(self, are_all: bool = False) -> None:
+        """Reap the copies that have ended since; wait for their end if `are_all` to end."""
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, 0 if are_all else os.WNOHANG)[0]:
+                continue
 
     def _leave_for_another(self) -> None:
         """Leave this rack, and wait for the requests of another one."""
@@ -290,10 +361,10 @@ class Crate:
             output.close()
         self._outputs.clear()
         self._resting.clear()
+        self._to_go_on.clear()
         if hasattr(self, "_segment"):
             self._segment.close()
             del self._segment
-        semaphores.close_all()
         self._poll.register(self._line, select.POLLIN)
         self._poll.register(self._launcher, select.POLLIN)
         # A Rack that is gone is noticed next.
@@ -301,8 +372,11 @@ class Crate:
             self._line.send(Left())
 
     def _reap_ended(self, timeout_ms: int | None) -> None:
-        for pidfd, _ in self._poll.poll(timeout_ms):
-            self._reap(pidfd)
+        for fd, _ in self._poll.poll(timeout_ms):
+            if fd in self._boards:
+                self._reap(fd)
+            else:
+                self._take_note()
 
 
 def main() -> None:

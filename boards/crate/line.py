@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection
 from typing import Self
 
 from rack.boards.crate.output import lines_of
-from rack.boards.crate.requests import Leave, Left
+from rack.boards.crate.requests import Leave, Left, Show, Shown
 from rack.boards.errors import LaunchError
 
 SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -30,6 +30,8 @@ SAME_LIBM = "glibc.cpu.hwcaps=-FMA,-FMA4"
 It selects one by processor, and they differ in the last bit. MuJoCo, OMPL, ruckig and Python's
 `math` call them. Boards use the version without, which runs on every processor. The choice is made
 at process start, so it must be in the environment."""
+END_S = 1.0
+"""Time for a crate to end its snapshots and itself, before it is killed."""
 LEAVE_S = 10.0
 """Longest time that a crate takes to leave a rack: it may still be importing."""
 NO_WINDOWS = {"MUJOCO_GL": "disable"}
@@ -125,8 +127,13 @@ class WarmCrate(CrateLine):
     """A crate for several racks, one after the other: what it has imported and compiled stays.
 
     A Rack that closes it makes it leave the rack. Its owner ends it, or the context does.
-    `is_over`: it was ended, or did not leave a rack in time, and serves no more.
+    `is_over`: it was ended, or did not leave a rack in time, and serves no more. It ends with its
+    present rack if that `is_last`.
     """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.is_last = False
 
     def __exit__(self, *error: object) -> None:
         self.end()
@@ -140,6 +147,9 @@ class WarmCrate(CrateLine):
         """Have it end the boards of the rack, and wait until none is left."""
         if self._is_closed:
             return
+        if self.is_last:
+            super().close(timeout_s)
+            return
         self.ask(Leave())
         deadline = time.monotonic() + LEAVE_S
         answer: object = self
@@ -152,9 +162,18 @@ class WarmCrate(CrateLine):
                 return
         self.end()
 
+    def show(self, tick: int, task: str) -> Shown:
+        """Return the tick of the last snapshot at `tick` or before, -1 without one, and the
+        attributes of the level of a task there; none without a task."""
+        self.ask(Show(tick, task))
+        answer: object = self
+        while answer is not None and not isinstance(answer, Shown):
+            answer = self.receive()
+        return answer or Shown(-1, "")
+
     def end(self) -> None:
-        """End the crate."""
-        super().close(0)
+        """End the crate, and its snapshots."""
+        super().close(END_S)
 
 
 def environment() -> dict[str, str]:

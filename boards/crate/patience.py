@@ -76,9 +76,9 @@ class RackAwaited:
             self._patience.report(f"'{board}' {why}")
 
 
-def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
+def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> int:
     """Wait until the crate has preloaded the levels and opened the segment; `limit_s` is for each
-    class.
+    class. Return the tick of the snapshot from which the rack goes on, -1 without one.
 
     Raises `LaunchError` if a class cannot be preloaded, and when the time limit is exceeded.
     """
@@ -89,8 +89,8 @@ def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> None:
             patience.report(doing)
             continue
         match crate.receive():
-            case Opened():
-                return
+            case Opened(tick):
+                return tick
             case Preloading(kind):
                 patience = Patience(journal, limit_s)
                 doing = f"preloading '{kind}'"

@@ -9,13 +9,11 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from importlib import import_module
 from multiprocessing.connection import wait
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
-from rack.backplane import semaphores
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import pick
 from rack.backplane.errors import DamageError, EmergencyStopError
@@ -27,6 +25,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.config.commands import asked, request
+from rack.boards.config.outside import outside
 from rack.boards.config.resolved import classes, load, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch
@@ -50,10 +49,10 @@ from rack.boards.crate.requests import (
 )
 from rack.boards.errors import (
     UNKEPT,
-    CheckpointError,
     ConfigError,
     LaunchError,
     Mistake,
+    SnapshotError,
 )
 from rack.boards.events import (
     CONTINUES,
@@ -66,13 +65,8 @@ from rack.boards.events import (
     brakings,
 )
 from rack.boards.faults.kind import KINDS
-from rack.boards.wiring import Entries, Keeping
+from rack.boards.wiring import Continuation, Entries, SnapshotPolicy
 
-if TYPE_CHECKING:
-    from rack.boards.checkpoint.format import Checkpoint
-
-RESTORING = "rack.boards.checkpoint.restoring"
-"""What a rack with checkpoints loads, by name."""
 LAUNCH_S = 60.0
 """Time limit of each step of the launch: to preload one class, which may compile code, or to ready
 all boards."""
@@ -98,10 +92,11 @@ class Rack:
     its thread. Without `share`, a launch is refused if another rack's real-time boards occupy a
     core that this one requests. A `crate` that was started earlier saves time. With `entries`, by
     adapter and port, host boards are not started, and other racks not met: what a recorded run
-    wrote there enters instead. `keeping`: the checkpoints that it takes in lockstep, and the one
-    that it continues from. `requests`: an operator's commands besides the config's, and those that
-    wait in the checkpoint, by their ticks. `repeats`: the rack whose run this repeats under a name
-    of its own; levels see the name of that.
+    wrote there enters instead. `snapshots`: those that it takes in lockstep. `continues`: the
+    snapshot of its `crate` from which it goes on. `requests`: an operator's commands besides the
+    config's, and those that wait in the snapshot, by their ticks. `begins_at`: the tick of that
+    snapshot; -1 without one. `repeats`: the rack whose run
+    this repeats under a name of its own; levels see the name of that.
     """
 
     def __init__(
@@ -111,7 +106,8 @@ class Rack:
         share: bool = True,
         crate: CrateLine | None = None,
         entries: Mapping[str, Entries] | None = None,
-        keeping: Keeping | None = None,
+        snapshots: SnapshotPolicy | None = None,
+        continues: Continuation | None = None,
         requests: Sequence[Request] = (),
         repeats: str = "",
     ) -> None:
@@ -119,8 +115,9 @@ class Rack:
         self._repeats = repeats
         self._requests = requests
         self._entries = entries
-        self._keeping = keeping
-        self._origin: Checkpoint | None = None
+        self._snapshots = snapshots
+        self._continues = continues
+        self.begins_at = -1
         self._share = share
         self.segment: Segment
         self.outcome: Outcome | None = None
@@ -180,10 +177,11 @@ class Rack:
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
         # A level's module may have ended it: then resolving says which.
         crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
-        plan = resolve(self.config).for_run(self._repeats, self._entries, self._keeping)
+        is_copied = self._snapshots is not None
+        plan = resolve(self.config).for_run(self._repeats, self._entries, is_copied)
         self._plan = plan
-        if self._keeping is not None:
-            self._origin = import_module(RESTORING).origin(plan, self._keeping)
+        if is_copied and (why := self._why_without_snapshots()):
+            raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
         plan.check_files()
         remove_dead(self.config.name)
         self.segment = self._journal.segment = Segment.create(
@@ -195,17 +193,18 @@ class Rack:
         words[System.EMERGENCY_STOP] = 1
         words[System.LOCKSTEP] = clock.mode == "lockstep"
         words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
-        if self._origin is not None:
-            import_module(RESTORING).continue_in(self.segment, self._origin)
-        semaphores.create(plan.layout)
-        crate.send(Open(self.config.name, plan.crate_priority))
+        wanted = self._snapshots or SnapshotPolicy(part=0)
+        words[System.SNAPSHOT_PART] = wanted.part
+        words[System.SNAPSHOT_EVERY] = wanted.every
+        words[System.SNAPSHOT_AT] = 0 if wanted.at is None else wanted.at + 1
+        before = None if self._continues is None else self._continues.tick
+        crate.send(Open(self.config.name, plan.crate_priority, before))
         self._journal.add(
             "launch", "", f"{len(plan.tasks)} tasks, segment of {len(self.segment.bytes)} bytes"
         )
-        await_opened(crate, self._journal, LAUNCH_S)
-        # The crate has them open and every board inherits them. Without names nothing can be left
-        # behind.
-        semaphores.unlink(plan.layout, kept=[host.board for host in plan.hosts if host.is_external])
+        self.begins_at = await_opened(crate, self._journal, LAUNCH_S)
+        if before is not None and self.begins_at < 0:
+            raise SnapshotError(f"rack '{self.config.name}': no snapshot before tick {before}")
         for wiring in plan.tasks:
             crate.send(PowerOn(wiring.task, wiring))
         self._await_ready()
@@ -220,43 +219,54 @@ class Rack:
             self._listen(patience.left_s)
             if self._losses.faults:
                 printed = self._line.printed()
-                if self._losses.cannot_keep:
-                    raise CheckpointError(printed[0])
                 raise LaunchError("\n".join(printed) or self._losses.faults[0])
             if patience.is_over:
                 raise LaunchError(f"boards {', '.join(absent)}: not ready within {LAUNCH_S:g} s")
             patience.report(f"boards {', '.join(absent)} are starting")
 
+    def _why_without_snapshots(self) -> str:
+        """Return why this rack has none; empty: it has."""
+        if self.config.clock.mode != "lockstep":
+            return "they are taken in lockstep; add --lockstep"
+        # In a replay what came from outside is in the wiring.
+        return "" if self._plan.is_replay else outside(self.config)
+
     def _inject(self) -> None:
         """Fill the tables with the config's faults and commands; start the faults that are
         processes."""
         table = FaultTable(self.segment)
-        before = self._keeping or Keeping()
+        before = self._continues or Continuation(0)
         for injection in self._plan.faults[before.faults :]:
             entry = table.add(injection)
             if KINDS[injection.kind].where == "core":
                 self._line.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
-        # A checkpoint has those that waited, and leases, of which no client can be here.
+        # A snapshot has those that waited, and leases, of which no client can be here.
         for lease in desk.leased():
             desk.release(lease)
         for wanted in (*self._plan.commands[before.commands :], *desk.lacking(self._requests)):
             desk.add(wanted)
 
     def follow(self, events: Iterable[Event]) -> None:
-        """Take over the events of the run that this one continues, from before its checkpoint: the
+        """Take over the events of the run that this one continues, from before its snapshot: the
         outcome counts them."""
         self._journal.events.extend(events)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock, which begins the run. It lasts `seconds` of simulated time, or until
         the task ends."""
-        clock = replace(self._plan.clock(seconds), keeping=self._keeping)
+        clock = self._plan.clock(seconds)
+        if self._snapshots is not None or self._continues is not None:
+            # Not in the clock's wiring: what goes on from a snapshot may end at another tick.
+            stop = max(clock.stop_tick, self.begins_at) if clock.stop_tick else 0
+            self.segment.words[System.STOP_TICK] = stop
+            clock = replace(clock, stop_tick=0, is_copied=self._snapshots is not None)
         self._ending = Ending(self.segment, clock.ends_run, clock.silent)
         wirings = {wiring.task: wiring for wiring in self._plan.tasks}
         supervision = Supervision(self.config, self._plan.layout)
-        for board, tick in (self._keeping or Keeping()).losses:
-            supervision.admit(board, tick)
+        for board, tick in (self._continues or Continuation(0)).losses:
+            if tick < self.begins_at:
+                supervision.admit(board, tick)
         self._recovery = Recovery(self.segment, supervision, {**wirings, CLOCK: clock}, self._line)
         self._hosts = HostBoards(
             self.segment, self._plan.hosts, supervision, self._line, self._journal
@@ -265,13 +275,13 @@ class Rack:
         self._alarms = AlarmWatch(self.segment)
         self._heartbeat = Heartbeat(self.segment)
         self._awaited = RackAwaited(self.segment, self._journal)
-        if self._origin is None:
+        if self._continues is None:
             self._reset_latch()
         else:
             # The latch is as it was, and what was raised before is in the other run's events.
             self._is_armed = True
             self._alarms.drain()
-            tick = self._origin.tick
+            tick = self.begins_at
             self._journal.add("launch", "", f"continues before tick {tick}", CONTINUES, tick=tick)
         self._line.ask(PowerOn(CLOCK, clock))
         self._hosts.start()

@@ -19,7 +19,7 @@ from rack.backplane.words import Block, TaskState
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
-from rack.boards.errors import CANNOT_GO_ON, CANNOT_KEEP
+from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.events import Journal
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 
@@ -205,7 +205,6 @@ class LostBoards:
         self.faults: list[str] = []  # a line for each that was given up
         self.given_up = False  # a board, or all of them with the crate
         self.is_beyond_help = False  # the run cannot go on
-        self.cannot_keep = False  # a board ended because it has no checkpoint to give
         self._journal = journal
         self._recovery: Recovery | None = None  # None: the run has not begun
         self._hosts: HostBoards | None = None
@@ -227,12 +226,11 @@ class LostBoards:
                 )
             return
         text = f"board '{end.name}' ended: {how_ended(end.status)}"
-        self.cannot_keep |= end.status == CANNOT_KEEP
         self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
         if self._recovery is None or is_over:
             self._give_up(end.name, text)
             return
-        is_final = end.status in (CANNOT_GO_ON, CANNOT_KEEP)
+        is_final = end.status == CANNOT_GO_ON
         if is_final:
             record_printed()
             text = self._reason(end.name) or text

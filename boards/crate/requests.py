@@ -39,15 +39,15 @@ class Preload:
 
 @dataclass(frozen=True)
 class Open:
-    """Attach to a rack's segment and open its semaphores; take this SCHED_FIFO priority, if
-    permitted.
+    """Attach to a rack's segment; take this SCHED_FIFO priority, if permitted.
 
     The crate must notice deaths without waiting for planners to finish; no board waits for the
-    crate.
+    crate. With `before`, the rack goes on from the last snapshot at that tick or before.
     """
 
     rack: str
     priority: int
+    before: int | None = None
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,10 @@ class HogWiring:
 
 @dataclass(frozen=True)
 class PowerOn:
-    """Fork one board: a task, the clock, a host board, or a hog, which occupies a board's core."""
+    """Fork one board: a task, the clock, a host board, or a hog, which occupies a board's core.
+
+    In a rack that goes on from a snapshot, a board that is wired as it was then goes on.
+    """
 
     name: str
     wiring: TaskWiring | ClockWiring | HostWiring | HogWiring
@@ -106,7 +109,26 @@ class PreloadFailed:
 
 @dataclass(frozen=True)
 class Opened:
-    """Answer to `Open`."""
+    """Answer to `Open`: the `tick` of the snapshot from which the rack goes on; -1: there is none,
+    or none was wanted."""
+
+    tick: int = -1
+
+
+@dataclass(frozen=True)
+class Show:
+    """Show the attributes of the level of a task in the last snapshot at `tick` or before."""
+
+    tick: int
+    task: str
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Answer to `Show`: the tick of the snapshot, -1 without one, and the attributes as JSON."""
+
+    tick: int
+    attributes: str
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class HostBus:
         except MailboxError:
             self.close()
             raise
-        self._semaphore = wake_semaphore(segment.rack, wiring.board)
+        self._semaphore = wake_semaphore(segment, wiring.board)
         # Faults signal this process. From another PID namespace they would strike another one.
         self.block[Block.PID] = os.getpid() if segment.launcher else 0
         self.block[Block.WAITS_UNTIL] = 0
@@ -104,7 +104,7 @@ class HostBus:
         block = self.block
         block[Block.DEADLINE] = self.tick + self._wiring.computing
         block[Block.DONE] = block[Block.RELEASED]
-        done_semaphore(self._segment.rack, self._wiring.board).release()
+        done_semaphore(self._segment, self._wiring.board).release()
 
     def read(self, port: str) -> Reading[Any]:
         """Return the newest message; `earlier` holds the unread ones before it, as far as the

@@ -195,9 +195,7 @@ class Outward:
         self._count = count
         self._source = open_observer(segment, table.source)
         readers = self._writer.spec.readers
-        self._readers = [
-            (segment.block(name), wake_semaphore(segment.rack, name)) for name in readers
-        ]
+        self._readers = [(segment.block(name), wake_semaphore(segment, name)) for name in readers]
 
     def exchange(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int

@@ -7,9 +7,10 @@ import sys
 import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
-from importlib import import_module
+from socket import socket
 from zlib import crc32
 
+from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import hold_memory, touch_memory
@@ -24,11 +25,13 @@ from rack.backplane.process import (
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.classes import find_class
-from rack.boards.errors import CANNOT_GO_ON, CANNOT_KEEP, CheckpointError
+from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
+from rack.boards.run.copying import Copier
+from rack.boards.run.snapshots import TaskCopies
 from rack.boards.run.system_controller import run_clock
-from rack.boards.wiring import KEEPING, ClockWiring, TaskWiring
+from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 
@@ -49,10 +52,8 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
     name_process(f"{segment.rack}:{name}")
     try:
         return board(segment)
-    except (BackplaneError, LevelError, CheckpointError) as error:
+    except (BackplaneError, LevelError) as error:
         print(f"board '{name}': {error}", file=sys.stderr, flush=True)
-        if isinstance(error, CheckpointError):
-            return CANNOT_KEEP
         return CANNOT_GO_ON if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
     except Exception as error:
         print(_describe_failure(segment, name, error), file=sys.stderr, flush=True)
@@ -74,17 +75,17 @@ def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
     return f"board '{name}' failed:\n{traceback.format_exc().rstrip()}"
 
 
-def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
+def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> int:
     """Build a task's level, test it, take the processor, and cycle until the run is over.
 
     `attention` is an eventfd on which the Rack waits: a board writes to it when it is ready or
-    raises an alarm.
+    raises an alarm. `copies`: the line on which the crate is told of its copies.
     """
     block = segment.block(wiring.task)
     block[Block.PID] = os.getpid()
     block[Block.STATE] = TaskState.STARTING
     try:
-        _run_level(segment, wiring, attention)
+        _run_level(segment, wiring, attention, copies)
     except BaseException:
         block[Block.STATE] = TaskState.FAILED
         UtilityLines(segment).assert_sysfail(segment.layout.task(wiring.task).slot)
@@ -93,8 +94,9 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int) -> int:
     return 0
 
 
-def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
+def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
     spec = segment.layout.task(wiring.task)
+    copier = Copier(segment, wiring.task, copies) if wiring.is_copied else None
     block = segment.block(wiring.task)
     kind: type[Executor] | type[Planner]
     kind = (
@@ -125,8 +127,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
             if isinstance(level, Executor)
             else PlannerLoop(segment, wiring, level, attention)
         )
-        if wiring.keeping is not None:
-            import_module(KEEPING).keep_task(segment, task, wiring.keeping)
+        if copier is not None:
+            task.next_cycle.copy = TaskCopies(task, level, copier, attention)
         block[Block.STATE] = TaskState.READY
         os.eventfd_write(attention, 1)
         task.stopwatch.notify_clock()
@@ -137,12 +139,13 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int) -> None:
         level.close()
 
 
-def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int) -> int:
+def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
     """Take the processor and run the system clock."""
+    copier = Copier(segment, CLOCK, copies) if wiring.is_copied else None
     take_core(wiring.core, wiring.priority, wiring.reservation)
     # Not touched: every board waits for the clock's start, and its lead over the grid has room for
     # a page fault.
     hold_memory(wiring.lockstep)
     with cores_kept_awake() if wiring.keeps_awake else nullcontext():
-        run_clock(segment, wiring, attention)
+        run_clock(segment, wiring, attention, copier)
     return 0

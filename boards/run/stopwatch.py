@@ -46,9 +46,7 @@ class Stopwatch:
         self._reading = inputs.task
         self._state_at, self._status = _state_of(outputs)
         self._trace = TraceWriter(segment, task)
-        self._lockstep_done = (
-            done_semaphore(segment.rack, task) if self._clock.is_lockstep else None
-        )
+        self._lockstep_done = done_semaphore(segment, task) if self._clock.is_lockstep else None
         self._troubles = self._bus_errors = self._corrupt = 0
         self._cycles = self._block[Block.CYCLES]
         self._state = self._block[Block.LEVEL_STATE]

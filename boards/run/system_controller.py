@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from importlib import import_module
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named
@@ -30,7 +29,9 @@ from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
 from rack.backplane.words import Block, Demand, Run, System, is_on
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.operator import hold
-from rack.boards.wiring import KEEPING, ClockWiring
+from rack.boards.run.copying import Copier
+from rack.boards.run.snapshots import ClockCopies
+from rack.boards.wiring import ClockWiring
 from rack.levels.operator import DRIVES, SETTINGS, Answer
 
 HEAD_START_NS = 20_000_000
@@ -295,8 +296,13 @@ class EndOfRun:
         return self._task_ends if self._stop_tick is None else self._stop_tick
 
 
-def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:
-    """Run the clock until the run is over; a restarted clock continues on the existing grid."""
+def run_clock(
+    segment: Segment, wiring: ClockWiring, attention: int, copier: Copier | None = None
+) -> None:
+    """Run the clock until the run is over; a restarted clock continues on the existing grid.
+
+    With a `copier`, take snapshots.
+    """
     words = segment.words
     words[System.CLOCK_PID] = os.getpid()
     alarms = AlarmWriter(segment, CLOCK, attention)
@@ -309,12 +315,9 @@ def run_clock(segment: Segment, wiring: ClockWiring, attention: int) -> None:
     end_of_run = EndOfRun(segment, wiring)
     driver = driver_of_run(segment, wiring, end_of_run, alarms)
     driver.controller = SystemController(segment, wiring, driver, end_of_run)
-    if wiring.keeping is None:
-        driver.run()
-        return
-    finish = import_module(KEEPING).keep_clock(segment, driver, wiring.keeping)
+    if copier is not None and isinstance(driver, LockstepDriver):
+        driver.snapshot = ClockCopies(segment, driver, copier)
     driver.run()
-    finish()
 
 
 def driver_of_run(

@@ -104,7 +104,6 @@ class BlendedPath:
     def evaluate(self, s: float) -> PathPoint:
         """Return the point at `s`, clamped to the path. The next call overwrites its arrays."""
         set_point.load()(self._marks, self._table, min(max(s, 0.0), self.length), self._point)
-        # Not kept: in a path that comes from a checkpoint they would be copies.
         return PathPoint(*self._point)
 
     def pieces_at(self, s: ArrayLike) -> Ints:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from rack.backplane import semaphores
 from rack.backplane.layout import MailboxSpec, TaskSpec
 from rack.backplane.segment import SHM_FOLDER, Segment, unlink
 from tests.backplane.bus import layout
@@ -25,12 +24,10 @@ def make_bus(rack_name: str) -> Iterator[MakeBus]:
         tasks = [part for part in parts if isinstance(part, TaskSpec)]
         segment = Segment.create(layout(rack_name, boxes, tasks), config)
         made.append(segment)
-        semaphores.create(segment.layout)
         return segment
 
     yield make
     for segment in made:
         segment.close()
-    semaphores.unlink_all(rack_name)
     unlink(rack_name)
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]

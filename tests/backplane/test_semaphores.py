@@ -1,23 +1,24 @@
-"""The semaphores of a rack: made together, open without a name, gone without a trace."""
+"""The semaphores of a rack: in its segment, for all that attach to it."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
 
-from rack.backplane import semaphores
+from rack.backplane.address_map import LINE
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
-from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.protocols import MailboxLock
-from rack.backplane.segment import SHM_FOLDER, Segment
+from rack.backplane.segment import Segment
+from rack.backplane.semaphores import done_semaphore, lock_semaphore, wake_semaphore
 from rack.backplane.words import Block
-from tests.backplane.bus import NAME, layout, mailbox, task
+from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, exit_status, fork, forked, wait_until
+from tests.processes import BOUND_S, FORKS, exit_status, forked, wait_until
 
 FUTEX_WAIT_BITSET, FUTEX_CLOCK_REALTIME = 9, 256
 """From the kernel's linux/futex.h: the wait of every semaphore, and the flag of one that is by the
@@ -31,56 +32,50 @@ def bus(make_bus: MakeBus) -> Segment:
     )
 
 
-def named(rack: str) -> int:
-    return len(list(SHM_FOLDER.glob(f"sem.*.{rack}.*")))
+def test_there_are_two_a_task_and_one_a_locked_mailbox_each_in_its_own_line(bus: Segment) -> None:
+    places = bus.map
+    found = [*places.wake.values(), *places.done.values(), *places.locks.values()]
+    assert len(found) == len({address // LINE for address in found}) == 5
+    assert all(places.windows[-1].address + places.windows[-1].size <= at for at in found)
 
 
-def test_there_are_two_a_task_and_one_a_locked_mailbox(bus: Segment) -> None:
-    names = semaphores.names(bus.layout)
-    assert len(names) == len(set(names)) == named(bus.rack) == 5
-    assert semaphores.lock_semaphore(bus.rack, NAME).value == 1
-    assert semaphores.wake_semaphore(bus.rack, "writer").value == 0
-    assert semaphores.done_semaphore(bus.rack, "writer").value == 0
+def test_locks_begin_free_and_wake_ups_unsent(bus: Segment) -> None:
+    assert lock_semaphore(bus, NAME).value == 1
+    assert wake_semaphore(bus, "writer").value == 0
+    assert done_semaphore(bus, "writer").value == 0
 
 
-def test_semaphores_of_a_killed_rack_are_replaced_and_work_without_their_names(
-    bus: Segment,
-) -> None:
-    semaphores.wake_semaphore(bus.rack, "writer").release()
-    semaphores.create(bus.layout)
-    semaphores.open_all(bus.layout)
-    assert semaphores.wake_semaphore(bus.rack, "writer").value == 0
-    # To remove names twice is no error.
-    for _ in range(2):
-        semaphores.unlink(bus.layout)
-    assert named(bus.rack) == 0
-    semaphores.wake_semaphore(bus.rack, "writer").release()
-    semaphores.wake_semaphore(bus.rack, "writer").acquire(0)
+def test_all_that_attach_have_the_same(bus: Segment) -> None:
+    wake_semaphore(bus, "writer").release()
+    with closing(Segment.attach(bus.rack)) as other:
+        assert wake_semaphore(other, "writer").take()
+    assert not wake_semaphore(bus, "writer").take()
 
 
-def test_names_of_a_rack_of_unknown_layout_are_removed_and_no_others(bus: Segment) -> None:
-    near = layout(f"{bus.rack}0", (), [task("writer")])
-    semaphores.create(near)
-    try:
-        semaphores.unlink_all(bus.rack)
-        assert (named(bus.rack), named(near.rack)) == (0, 2)
-    finally:
-        semaphores.unlink(near)
+def test_a_wait_lasts_as_long_as_it_says(bus: Segment) -> None:
+    semaphore = wake_semaphore(bus, "writer")
+    start = time.monotonic()
+    assert not semaphore.acquire(0.02)
+    assert time.monotonic() - start >= 0.02
+    semaphore.release()
+    assert semaphore.acquire(0.02)
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
 @pytest.mark.filterwarnings(FORKS)
-def test_another_users_semaphore_of_that_name_is_named_and_left_alone(bus: Segment) -> None:
-    def create() -> None:
-        os.setuid(65_533)
-        with pytest.raises(
-            SegmentError, match=rf"semaphore /dev/shm/sem.*{bus.rack}.*belongs to another user"
-        ):
-            semaphores.create(bus.layout)
-        semaphores.unlink_all(bus.rack)
+def test_a_release_ends_a_wait(bus: Segment) -> None:
+    semaphore = wake_semaphore(bus, "writer")
+    parent = os.getpid()
 
-    assert exit_status(fork(create)) == 0
-    assert named(bus.rack) == 5
+    def release_once_it_waits() -> None:
+        # Where the kernel does not show it, what is released comes before the wait at times.
+        with suppress(PermissionError):
+            wait_until(lambda: futex_call(parent))
+        semaphore.release()
+
+    with forked(release_once_it_waits) as releaser:
+        assert semaphore.acquire(BOUND_S)
+        assert exit_status(releaser) == 0
+    assert not semaphore.take()
 
 
 def wait_for_release(segment: Segment) -> None:

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
+import random
 from collections import deque
 from collections.abc import Callable
 from itertools import count
+from pathlib import Path
+from select import epoll
+from socket import socket
+from threading import Event, Thread
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +80,7 @@ class Rememberer(Executor):
             self._next = self._turn.taken
         turned = 0.0 if self._next is None else self._next()
         self.status.state = State.EXECUTING
-        self.status.message = self._factor * (
+        self.status.value = self._factor * (
             self._half
             + self._call()
             + self._table.sum()
@@ -86,29 +93,63 @@ class Rememberer(Executor):
         )
 
 
-class Generator(Executor):
-    """Remembers in something that nobody can copy."""
+class Holder(Executor):
+    """Writes a number that depends on what no program can copy piece by piece: a file that it
+    reads, generators of numpy, Python and the C library, an iterator, and a closure."""
 
     status = Output(WaveStatus)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
+        self._file = Path(__file__).open("rb")  # noqa: SIM115  closed in `close`
+        self._generator = np.random.default_rng(7)
+        random.seed(8)
+        self._libc = ctypes.CDLL(None)
+        self._libc.srand(9)
         self._count = count()
+        self._numbers = (number * number for number in range(1 << 40))
+        self._call = counter()
 
     def process(self, tick: int) -> None:
         """Write the next number."""
-        self.status.message = float(next(self._count))
+        if not (line := self._file.readline()):
+            self._file.seek(0)
+        drawn = self._generator.random() + random.random() + self._libc.rand() % 1000
+        counted = next(self._count) + next(self._numbers) + self._call()
+        self.status.state = State.EXECUTING
+        self.status.value = len(line) + drawn + counted
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
 
-class LateGenerator(Generator):
-    """The same, but it makes that only while it runs."""
+class Uncopied(Executor):
+    """Has what no copy can have: a file that it writes, a socket, an epoll object or a thread."""
+
+    status = Output(WaveStatus)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        del self._count
+        self._ends = Event()
+        self._thread = Thread(target=self._ends.wait, args=(60.0,), daemon=True)
+        self._held: Any = None
+        match context.params["holds"]:
+            case "file":
+                self._held = Path(context.params["path"]).open("a")  # noqa: SIM115
+            case "socket":
+                self._held = socket()
+            case "epoll":
+                self._held = epoll()
+            case "thread":
+                self._thread.start()
 
     def process(self, tick: int) -> None:
-        """Write the next number."""
-        if tick == 10:
-            self._count = (number for number in range(1 << 40))  # type: ignore[assignment]
-        self.status.message = float(tick)
+        """Write the tick."""
+        self.status.value = float(tick)
+
+    def close(self) -> None:
+        """Let go of all."""
+        self._ends.set()
+        if self._held is not None:
+            self._held.close()

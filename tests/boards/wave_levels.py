@@ -82,7 +82,7 @@ class Wave(Executor):
         self.status.reason = (
             "the tide" if self._final is State.ERROR and tick >= self._done_at else ""
         )
-        self.status.message = 0.5 * tick * self.gain()
+        self.status.value = 0.5 * tick * self.gain()
 
     def gain(self) -> float:
         return 1.0
@@ -103,7 +103,7 @@ class Steady(PlannedWave):
 
     def process(self, tick: int) -> None:
         self.status.state = State.EXECUTING
-        self.status.message = 0.5 * tick * self.gain()
+        self.status.value = 0.5 * tick * self.gain()
 
 
 class GainPlanner(Planner):
@@ -142,7 +142,7 @@ class Watch(Executor):
     def process(self, tick: int) -> None:
         self.status.state = self.below.message.state
         self.status.reason = self.below.message.reason
-        self.status.message = self.below.message.message
+        self.status.value = self.below.message.message
 
 
 class Endless(Watch):

@@ -91,7 +91,7 @@ def campaign(
         typer.Option(
             "--whole",
             help=(
-                "run each trial from its beginning; default: from a checkpoint before its"
+                "run each trial from its beginning; default: from a snapshot before its"
                 " first fault"
             ),
         ),
@@ -108,8 +108,9 @@ def campaign(
     """Inject random faults of all kinds into runs of a rack, and judge each of them.
 
     Each trial has as many faults as fit. Trials in lockstep run on all cores at once, others one
-    after the other. Until its first fault a trial is the faultless run: in lockstep it starts at a
-    checkpoint of that, with the verdict of a whole trial; --json says which could not, and why.
+    after the other. Until its first fault a trial is the faultless run: in lockstep it goes on from
+    a snapshot of that, and ends when the verdict on each of its faults is certain; --json says
+    which could not, and why. --whole runs each to the end of its task.
     There are also runs without faults, in real time, alone and under load. The
     same --out continues an interrupted campaign.
 

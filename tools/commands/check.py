@@ -6,18 +6,15 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import asdict
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.boards.config import load, resolve, shared_out
+from rack.boards.config import load, shared_out
 from rack.boards.config.cell import built_cell
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
-from rack.boards.crate.rack import RESTORING
-from rack.boards.errors import UNKEPT
 from rack.levels.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
@@ -121,13 +118,12 @@ def check(
     stock = inventory(found, judged.layout, lacking)
     forecast = Forecast.of(judged.timing, not lacking, found.host)
     arm = _abilities(found)
-    unkept = _unkept(found)
     if as_json:
         fits = (None if forecast.uncounted else True) if forecast.holds else False
         verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": fitting.document()}
         timing = forecast.document() | verdict
         arm_document = None if arm is None else asdict(arm)
-        further = {"changed": found.changed, "arm": arm_document, "unkept": unkept or None}
+        further = {"changed": found.changed, "arm": arm_document}
         print_json(stock | further | {"timing": timing})
     else:
         again = shlex.join([config, *(f"--set={setting}" for setting in settings)])
@@ -140,7 +136,6 @@ def check(
             head,
             *found.changed,
             *lacking,
-            *([f"{UNKEPT}{unkept}"] if unkept else []),
             *summary_blocks(forecast, fitting, arm, found.joints, "" if run else measuring),
         ]
         if verbose:
@@ -181,13 +176,6 @@ def _abilities(config: RackConfig) -> Abilities | None:
     from rack.levels.robot.abilities import abilities
 
     return abilities(built_cell(config))
-
-
-def _unkept(config: RackConfig) -> str:
-    """Return why runs of a rack in lockstep have no checkpoints; empty: they have, or want none."""
-    if not config.record.checkpoint_s:
-        return ""
-    return str(import_module(RESTORING).unkept(resolve(config)))
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:

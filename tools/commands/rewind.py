@@ -18,7 +18,7 @@ from rack.boards.errors import one_line
 from rack.levels.tables import LAST_TICK
 from rack.tools.console.answer import MAX_LINE, Failure, as_failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.parameters import Anyway, Json, RunFolder
 from rack.tools.live.display import display_for
 from rack.tools.scripting.rewound import Glance, RewoundRun
 
@@ -35,7 +35,7 @@ USAGE = {
 MOST_S = 1e9
 
 
-def rewind(run: RunFolder, as_json: Json = False) -> None:
+def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> None:
     """Go back to any tick of a recorded run, see what was in force there and what the levels held
     in their own objects, and branch off.
 
@@ -53,8 +53,7 @@ def rewind(run: RunFolder, as_json: Json = False) -> None:
 
     A tick is shown as it is before its tasks begin: messages are those that they then read.
     Messages and events come from the recording. For the objects of levels, and branches, the rack
-    goes on unchanged from the checkpoint or the state shown before, or from its beginning. RUN is
-    only read.
+    runs again unchanged, from the beginning or from where it was before. RUN is only read.
 
     Exit status: 0 the prompt was left; of commands from stdin or with --json: 0 all worked, 2 one
     failed; 2 RUN is not a run.
@@ -64,7 +63,7 @@ def rewind(run: RunFolder, as_json: Json = False) -> None:
       rack rewind runs/whole
       printf 'goto 12.5\\nshow servo.status\\n' | rack rewind runs/whole --json
     """
-    with INTERRUPT.raising(), RewoundRun(run) as rewound:
+    with INTERRUPT.raising(), RewoundRun(run, anyway) as rewound:
         prompt = RewindPrompt(rewound, as_json)
         if sys.stdin.isatty() and not as_json:
             with suppress(ImportError):

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rack.boards.config.files import PartialConfigError, assembled, named_classes
+from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.requests import Preload
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Faults, Json, Settings, View, config_names
+from rack.tools.console.parameters import Anyway, Faults, Json, Settings, View, config_names
 
 if TYPE_CHECKING:
     from rack.boards.config.schema import RackConfig
@@ -77,11 +78,12 @@ def run(
             metavar="RUN@TIME",
             help=(
                 "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or"
-                " --faults a branch of it from there; one without checkpoints, as in real time, is"
-                " repeated from its beginning"
+                " --faults a branch of it from there; the rack runs again in lockstep, from the"
+                " beginning to TIME"
             ),
         ),
     ] = None,
+    anyway: Anyway = False,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>"),
@@ -106,10 +108,10 @@ def run(
     elsewhere one line a second is printed. --json prints the report as one document. With
     --no-record it has the same keys; those that need a recording are null.
 
-    In lockstep the folder of a run holds checkpoints, each record.checkpoint_s of simulated time.
-    With --from, the rack first goes on unchanged from the one before to TIME. What operators
+    With --from, the rack first runs again, unchanged, from the beginning to TIME. What operators
     commanded in that run, before TIME and after it, is repeated; stops and faults by hand are not.
-    Host boards and other racks are not started then: what they sent enters again at the same ticks.
+    Host boards and other racks
+    are not started then: what they sent enters again at the same ticks.
     --seconds counts from the beginning of the run that is continued, as there.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
@@ -164,7 +166,8 @@ def run(
     begins = None
     with ExitStack() as stack:
         if origin is not None:
-            begins = stack.enter_context(beginning(found, origin))
+            warm = crate if isinstance(crate, WarmCrate) else None
+            begins = stack.enter_context(beginning(found, origin, warm, anyway))
         # From the start of the run to the end of its report; during the launch a signal ends the
         # command at once.
         unfinished = NO_TIME.format(folder) if folder else ""

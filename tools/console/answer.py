@@ -29,10 +29,10 @@ class Failure(Exception):
 def exit_status(error: Exception) -> int | None:
     """Return the exit status of an error that the project raises on purpose; None for any other."""
     from rack.backplane.errors import BackplaneError
-    from rack.boards.errors import BoardError, CheckpointError, ConfigError
+    from rack.boards.errors import BoardError, ConfigError, SnapshotError
     from rack.levels.errors import LevelError
 
-    if isinstance(error, ConfigError | CheckpointError):
+    if isinstance(error, ConfigError | SnapshotError):
         return 2
     return 1 if isinstance(error, BackplaneError | BoardError | LevelError) else None
 

@@ -78,6 +78,13 @@ RackName = Annotated[
 RunFolder = Annotated[
     Path, typer.Argument(metavar="RUN", help="folder of a run, as in runs/nasrem-20250101-120000")
 ]
+Anyway = Annotated[
+    bool,
+    typer.Option(
+        "--anyway",
+        help="repeat a run whose code or files have changed since; digests may differ",
+    ),
+]
 View = Annotated[bool, typer.Option("--view", help="open the viewer on the running rack")]
 Timeout = Annotated[
     float | None,

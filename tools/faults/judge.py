@@ -116,6 +116,15 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
     return _Judge(strikes, events, run).verdict()
 
 
+def certain_from(
+    strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances, tick: int
+) -> int | None:
+    """Return the tick from which nothing that happens later can change the judgement of a run's
+    faults, as far as is known before `tick`; a later one at which to ask again; None: its end."""
+    now = Event(0, tick, "end", "", "")
+    return _Judge(strikes, [*events, now], run).certain_from(tick)
+
+
 class _Judge:
     def __init__(
         self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
@@ -161,6 +170,34 @@ class _Judge:
             unexplained=tuple(event for event in stray if event.kind != "miss"),
             misses=tuple(event for event in stray if event.kind == "miss"),
         )
+
+    def certain_from(self, tick: int) -> int | None:
+        latest = tick
+        for strike, found in zip(self._strikes, self.verdict().faults, strict=True):
+            closes = self._closes(strike, found, tick)
+            if closes is None:
+                return None
+            latest = max(latest, closes)
+        return latest
+
+    def _closes(self, strike: Strike, found: Judgement, tick: int) -> int | None:
+        """Return the tick from which the judgement of a fault is certain, as in `certain_from`."""
+        again = tick + self._settle
+        if strike.began < 0:
+            return again
+        if strike.ends >= NEVER:
+            return None
+        ends = strike.tick if strike.record.consequence.ends_process else strike.ends
+        if strike.tick < 0 and ends >= tick:
+            return again
+        over = max(ends, strike.first + (self._bound(strike) or 0))
+        read = last_read(strike.mailboxes, self._layout)
+        closes = over + self._recovery(strike) + read + self._settle + 1
+        if closes > tick:
+            return closes
+        # Its writer may find the fault of a plan at any later time, or have something to write.
+        is_open = self._window(strike)[1] >= tick and found.seen != "detected"
+        return again if is_open or not found.is_recovered else tick
 
     def _bound(self, strike: Strike, reader: str | None = None) -> int | None:
         """Return the ticks from its strike within which a fault must be found, by a reader or,

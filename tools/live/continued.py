@@ -1,7 +1,9 @@
-"""`rack run --from RUN@TIME`, and the state of a run at any tick.
+"""A recorded run, run again in lockstep with snapshots on the way: `rack run --from RUN@TIME`, and
+the state of a run at any tick.
 
-Between two checkpoints the rack goes on from the earlier one, unchanged, to the tick, and keeps its
-state there. That is what a branch begins from: only there may it differ.
+Lockstep is deterministic, so the rack of the run comes to each tick as it did then. What operators
+commanded enters again, and what host boards and other racks sent. Until the tick it goes on
+unchanged: only there may a branch differ.
 """
 
 from __future__ import annotations
@@ -10,41 +12,215 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager, suppress
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import BinaryIO
+from typing import Self
 
 import numpy as np
 
-from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.mailbox.history import chains
-from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
 from rack.boards import Rack
-from rack.boards.checkpoint.format import ATTRIBUTES, NAME, checkpoints
-from rack.boards.checkpoint.taking import outside
 from rack.boards.classes import extend_path
-from rack.boards.config.resolved import load
+from rack.boards.config.outside import outside
+from rack.boards.config.resolved import classes, load
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.line import CrateLine
-from rack.boards.wiring import Entries, Keeping
+from rack.boards.crate.line import WarmCrate
+from rack.boards.crate.rack import cell_of
+from rack.boards.crate.requests import Preload
+from rack.boards.errors import UNKEPT
+from rack.boards.wiring import Continuation, Entries, SnapshotPolicy
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.live.launch import Beginning
-from rack.tools.recording.divergence import ticks_of
+from rack.tools.live.display import Display
+from rack.tools.live.launch import Beginning, run_rack
+from rack.tools.recording.code import check_code
+from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
 from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
-from rack.tools.recording.origin import Origin
+from rack.tools.recording.origin import Origin, continued_at
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
-MOST_STATES = 64
-NO_STATES: Mapping[int, Path] = {}
 WHY_NOT = (
-    "the code of a level has changed since, it missed cycles in real time, or somebody injected a"
-    " fault or stopped it while it ran"
+    "the code of a level has changed since, it missed cycles in real time, it does not repeat"
+    " itself, or somebody injected a fault or stopped it while it ran"
 )
+
+
+class RunAgain:
+    """The rack of a recorded run, which runs again to any tick. Use it as a context: its snapshots
+    end with it, and with its `crate`.
+
+    Each tick that was reached has a snapshot, from which later ones are near. A run that continues
+    another one begins with that. `asked` begins what goes wrong, which is a `Failure`. `anyway`:
+    even if its code or files have changed since.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        asked: str = "",
+        crate: WarmCrate | None = None,
+        anyway: bool = False,
+    ) -> None:
+        self.recording = recording
+        self._asked = asked or str(recording.folder)
+        self._anyway = anyway
+        ran = recording.rack_config
+        # The rack is about to run again, with the levels that its config names.
+        extend_path(ran.python_path)
+        for note in check_code(recording, self._asked, anyway):
+            print(note, file=sys.stderr)
+        self.crate = crate or WarmCrate()
+        # It imports while this process reads the run.
+        self.crate.ask(Preload(classes(ran), tuple(sys.path), cell_of(ran)))
+        self._has_begun = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.crate.end()
+
+    @cached_property
+    def _parent(self) -> RunAgain | None:
+        """The run that this one continues."""
+        if self._branched_at is None:
+            return None
+        folder = other_run(self.recording.folder, Path("origin"), self._asked)
+        return RunAgain(Recording(folder), self._asked, self.crate, self._anyway)
+
+    @cached_property
+    def _branched_at(self) -> int | None:
+        return continued_at(self.recording)
+
+    @cached_property
+    def entries(self) -> Mapping[str, Entries] | None:
+        """What host boards and other racks sent in the run; None: its rack has none."""
+        run = self.recording
+        config = run.rack_config
+        return recorded_entries(config, run.folder, self._asked) if outside(config) else None
+
+    def reach(self, tick: int) -> None:
+        """Have a snapshot before `tick`, in which all is as it was in the run then; note on stderr
+        what is not. Raises `Failure`."""
+        if not self._has_begun and self._branched_at not in (None, tick):
+            # From here on all snapshots are of this run, not of the one that it continues.
+            self.reach(self._branched_at or 0)
+        if self._has_begun and self._nearest(tick) == tick:
+            return
+        with self.rack_at(tick, SnapshotPolicy(at=tick)) as rack:
+            if unlike := unlike_in(self.recording, rack.segment, tick):
+                self._note_unlike(unlike, tick)
+            said = [e.text for e in rack.events if e.kind == "printed" or e.text.startswith(UNKEPT)]
+        if self._nearest(tick) != tick:
+            why = said[-1] if said else "a board is lost then; ask for a time at which it is back"
+            raise Failure(f"{self._asked}: {why}", 2)
+
+    @contextmanager
+    def rack_at(self, tick: int, snapshots: SnapshotPolicy | None = None) -> Iterator[Rack]:
+        """Yield the rack as it is when it has run, unchanged, to `tick`."""
+        begins = self._begin(tick)
+        ran = branched(self.recording, (), None)
+        # The run's own name may be in use.
+        config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{tick}-{os.getpid()}"})
+        with (
+            INTERRUPT.raising(),
+            Rack(
+                config,
+                crate=self.crate,
+                entries=begins.entries,
+                snapshots=snapshots,
+                continues=begins.continues,
+                requests=begins.requests,
+                repeats=ran.name,
+            ) as rack,
+        ):
+            rack.run(tick * config.clock_ns * 1e-9)
+            self._has_begun = True
+            yield rack
+
+    def beginning(self, tick: int) -> Beginning:
+        """Return what a rack goes on from at `tick`."""
+        self.reach(tick)
+        return Beginning(
+            continues=self._continuation(tick),
+            crate=self.crate,
+            entries=self.entries,
+            origin=Origin.at(self.recording, tick),
+        )
+
+    def levels(self, tick: int) -> dict[str, Document]:
+        """Return the attributes of the levels' own objects before `tick`, by task."""
+        self.reach(tick)
+        tasks = [task.name for task in self.recording.layout.tasks]
+        shown = {task: self.crate.show(tick, task).attributes for task in tasks}
+        return {task: json.loads(text) for task, text in shown.items() if text}
+
+    def _begin(self, tick: int) -> Beginning:
+        """Return what the run's own rack goes on from to come to `tick`."""
+        run = self.recording
+        if self._has_begun:
+            return Beginning(continues=self._continuation(tick), entries=self.entries)
+        branched_at = self._branched_at
+        if branched_at is None or self._parent is None:
+            if ticks_of(run)[0] > max(task.every for task in run.layout.tasks):
+                raise Failure(f"{self._asked}: its beginning was not kept", 2)
+            return Beginning(requests=recorded_commands(run), entries=self.entries)
+        self._parent.reach(branched_at)
+        return Beginning(
+            continues=self._parent._continuation(branched_at),
+            requests=commands_from(run, branched_at),
+            entries=self.entries,
+        )
+
+    def _continuation(self, tick: int) -> Continuation:
+        """Return the snapshot at `tick` or before, with what the tables hold there."""
+        ran = self.recording.rack_config
+        return Continuation(tick, len(ran.fault), len(ran.command), self._losses)
+
+    @cached_property
+    def _losses(self) -> tuple[tuple[str, int], ...]:
+        died = (event for event in self.recording.events if event["kind"] == "died")
+        earlier = () if self._parent is None else self._parent._losses
+        before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
+        return (*before, *((one["board"], one["tick"]) for one in died))
+
+    def _nearest(self, tick: int) -> int:
+        return self.crate.show(tick, "").tick
+
+    def _note_unlike(self, unlike: Sequence[str], tick: int) -> None:
+        """Note what is not as recorded, with the first message and field that differ."""
+        names = ", ".join(unlike)
+        first = ""
+        with suppress(Failure), TemporaryDirectory(prefix="rack-") as folder:
+            first = f"{self._first_unlike(Path(folder) / 'again', tick)}: "
+        print(f"{self._asked}: {names} are not as recorded: {first}{WHY_NOT}", file=sys.stderr)
+
+    def _first_unlike(self, folder: Path, tick: int) -> str:
+        """Return the first message that differs until `tick`, as text, from a record of the rack
+        that runs again into `folder`."""
+        ran = branched(self.recording, (), None)
+        config = ran.model_copy(update={"name": f"{ran.name[:16]}-again-{os.getpid()}"})
+        begins = Beginning(
+            continues=self._continuation(self._branched_at or 0),
+            crate=self.crate,
+            entries=self.entries,
+        )
+        run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), begins=begins)
+        again = Recording(folder)
+        first = unlike_messages(self.recording, again)[0]
+        box = again.layout.mailbox(first.mailbox)
+        was, now = (row_of(run, box, first.serial) for run in (self.recording, again))
+        where = f"first {box.name} at tick {first.tick}"
+        if was is None or now is None:
+            return f"{where}, which one of the two lacks"
+        was, now = was["message"], now["message"]
+        names = [field.name for field in box.fields]
+        unlike = [name for name in names if not np.array_equal(was[name], now[name])]
+        return ", ".join((where, *(f"{name} was {was[name]}, is {now[name]}" for name in unlike)))
 
 
 def run_of(origin: str) -> Path:
@@ -58,102 +234,26 @@ def run_of(origin: str) -> Path:
     return path
 
 
-@dataclass(frozen=True)
-class RunState:
-    """The state of a run before a tick: what a rack goes on from and, if asked for, the attributes
-    of its levels, by task."""
-
-    begins: Beginning
-    attributes: Mapping[str, Document] = field(default_factory=dict)
-
-
-class KeptStates:
-    """States of a run that were found on the way, to go on from. Their files have no names: however
-    this process ends, nothing is left. Boards open them by this process's descriptors."""
-
-    def __init__(self) -> None:
-        self._files: dict[int, BinaryIO] = {}
-
-    def keep(self, tick: int, path: Path) -> Path:
-        """Take the file of a checkpoint, in a folder that will be removed; return where it is now.
-        The oldest of too many goes."""
-        if (before := self._files.pop(tick, None)) is not None:
-            before.close()
-        if len(self._files) == MOST_STATES:
-            self._files.pop(next(iter(self._files))).close()
-        self._files[tick] = path.open("rb")
-        return self.found[tick]
-
-    @property
-    def found(self) -> dict[int, Path]:
-        """Those that are here, by tick."""
-        pid = os.getpid()
-        return {tick: Path(f"/proc/{pid}/fd/{f.fileno()}") for tick, f in self._files.items()}
-
-    def close(self) -> None:
-        """Let go of all."""
-        for file in self._files.values():
-            file.close()
-        self._files.clear()
-
-
 @contextmanager
-def beginning(config: RackConfig, origin: str) -> Iterator[Beginning]:
+def beginning(
+    config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
+) -> Iterator[Beginning]:
     """Yield what a rack with this config, a branch perhaps, goes on from at RUN@TIME, for as long
-    as it runs. Raises `Failure`."""
+    as it runs. A `crate` that was started earlier saves time. Raises `Failure`."""
     recording = Recording(run_of(origin).parent)
     asked = f"--from {origin}"
     tick = tick_in(recording, origin.rpartition("@")[2], f"{asked}: ")
-    with state_at(recording, tick, asked=asked) as state:
-        if state.begins.entries is not None:
+    injected = len(recording.ended.get("faults", ())) - len(recording.rack_config.fault)
+    if injected > 0:
+        why = "faults were injected while it ran, which is not repeated"
+        print(f"{asked}: {injected} {why}", file=sys.stderr)
+    with RunAgain(recording, asked, crate, anyway) as again:
+        if again.entries is not None:
             lan = config.adapter.lan
             senders = ", ".join(map(repr, (*config.host, *(() if lan is None else lan.racks))))
             why = f"not started: {senders}; what they sent enters again"
             print(f"{asked}: {why}", file=sys.stderr)
-        checkpoint = state.begins.checkpoint
-        if checkpoint is not None:
-            checkpoint = replace(checkpoint, packages=config.python_path)
-        yield replace(state.begins, checkpoint=checkpoint)
-
-
-@contextmanager
-def state_at(
-    recording: Recording,
-    tick: int,
-    *,
-    asked: str = "",
-    shows: bool = False,
-    crate: CrateLine | None = None,
-    states: KeptStates | None = None,
-) -> Iterator[RunState]:
-    """Yield the state of a run before `tick`, for as long as a rack runs that continues from it;
-    with `shows`, with the attributes of its levels.
-
-    A `crate` that was started earlier saves time, as do `states` found before; this one joins them.
-    A state that is not that of the recording is noted on stderr. Raises `Failure`, which begins
-    with what was `asked`.
-    """
-    asked = asked or f"{recording.folder}@{tick * recording.layout.clock_ns * 1e-9:g}"
-    found = {} if states is None else states.found
-    begins, before = begun_before(recording, tick, asked, found)
-    this = Origin.at(recording, tick)
-    if begins == tick and not shows:
-        yield RunState(replace(before, origin=this))
-        return
-    with ExitStack() as stack:
-        if states is None:
-            states = stack.enter_context(closing(KeptStates()))
-        with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-") as folder:
-            path = Path(folder)
-            kept = replace(before.checkpoint or Keeping(), folder=path, at=tick, shows=shows)
-            with gone_on(recording, replace(before, checkpoint=kept), tick, asked, crate) as rack:
-                if differing := unlike_in(recording, rack.segment, tick):
-                    names = ", ".join(differing)
-                    print(f"{asked}: {names} are not as recorded: {WHY_NOT}", file=sys.stderr)
-            origin = states.keep(tick, path / NAME.format(tick))
-            attributes = attributes_in(path)
-        kept_there = _kept_in(recording, origin, tick)
-        yield RunState(Beginning(kept_there, entries=before.entries, origin=this), attributes)
+        yield again.beginning(tick)
 
 
 def tick_in(recording: Recording, text: str, asked: str = "") -> int:
@@ -176,113 +276,6 @@ def branched(recording: Recording, settings: Sequence[str], faults: str | None) 
     """Return the config of a branch of a run in lockstep. Raises `ConfigError`."""
     overrides = ["clock.mode=lockstep", "clock.speed=1.0", *settings]
     return load(str(recording.folder / CONFIG), overrides, faults)
-
-
-def begun_before(
-    recording: Recording, tick: int, asked: str, found: Mapping[int, Path] = NO_STATES
-) -> tuple[int, Beginning]:
-    """Return the last checkpoint at `tick` or before, of the run or else `found`, or tick 0 without
-    one, and what goes on from there, with what operators commanded later. Raises `Failure`."""
-    # The rack is about to run again, with the levels that its config names.
-    extend_path(recording.rack_config.python_path)
-    kept = {at: path.resolve() for at, path in checkpoints(recording.folder).items()}
-    if begins := max((at for at in (*kept, *found) if at <= tick), default=0):
-        keeping = _kept_in(recording, kept.get(begins) or found[begins], begins)
-        entries = _entered(recording, asked)
-        return begins, Beginning(keeping, _commanded(recording, begins, asked), entries)
-    if ticks_of(recording)[0] > max(task.every for task in recording.layout.tasks):
-        # Of a run that goes on from another the beginning is that other's.
-        if not kept:
-            raise Failure(f"{asked}: it continues another run, and has no checkpoints", 2)
-        first = min(kept) * recording.layout.clock_ns * 1e-9
-        raise Failure(f"{asked}: permitted: from its first checkpoint, {first:g} s, on", 2)
-    commands = recorded_commands(recording)
-    entries = _entered(recording, asked)
-    if not kept:
-        injected = len(recording.ended.get("faults", ())) - len(recording.rack_config.fault)
-        without = f", without {injected} faults injected meanwhile" if injected > 0 else ""
-        print(
-            f"{asked}: {recording.folder} has no checkpoints: it is repeated in lockstep from its"
-            f" beginning, with {len(commands)} commands of its operators{without}",
-            file=sys.stderr,
-        )
-    return 0, Beginning(requests=commands, entries=entries)
-
-
-def _entered(recording: Recording, asked: str) -> Mapping[str, Entries] | None:
-    """Return what host boards and other racks sent in a run; None: its rack has none. Raises
-    `Failure`."""
-    config = recording.rack_config
-    return recorded_entries(config, recording.folder, asked) if outside(config) else None
-
-
-def _commanded(recording: Recording, begins: int, asked: str) -> tuple[Request, ...]:
-    """Return the commands from a checkpoint on that find room in the operator table; note on stderr
-    those that do not."""
-    commands = commands_from(recording, begins)
-    room = OPERATOR_ENTRIES - len(recording.rack_config.command)
-    if left := commands[room:]:
-        since_s = left[0].tick * recording.layout.clock_ns * 1e-9
-        why = f"the operator table holds {OPERATOR_ENTRIES}"
-        print(f"{asked}: commands from {since_s:g} s on are not repeated: {why}", file=sys.stderr)
-    return commands[:room]
-
-
-def _kept_in(recording: Recording, origin: Path, tick: int) -> Keeping:
-    """Return what goes on from the state of a run at `tick`, in this file."""
-    ran = recording.rack_config
-    died = (event for event in recording.events if event["kind"] == "died")
-    return Keeping(
-        origin=origin,
-        packages=ran.python_path,
-        faults=len(ran.fault),
-        commands=len(ran.command),
-        losses=tuple((one["board"], one["tick"]) for one in died if one["tick"] < tick),
-    )
-
-
-@contextmanager
-def gone_on(
-    recording: Recording,
-    begins: Beginning,
-    until: int,
-    asked: str,
-    crate: CrateLine | None = None,
-) -> Iterator[Rack]:
-    """Let the rack of a run go on, unchanged, to tick `until`; yield it as it is then. Raises
-    `Failure` if its state was to be kept on the way, and is not."""
-    keeping = begins.checkpoint
-    ran = branched(recording, (), None)
-    # The run's own name may be in use.
-    config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{until}-{os.getpid()}"})
-    with Rack(
-        config,
-        crate=crate,
-        entries=begins.entries,
-        keeping=keeping,
-        requests=begins.requests,
-        repeats=ran.name,
-    ) as rack:
-        rack.run(until * config.clock_ns * 1e-9)
-        at = None if keeping is None else keeping.at
-        if (
-            keeping is not None
-            and at is not None
-            and not (keeping.folder / NAME.format(at)).is_file()
-        ):
-            printed = [event.text for event in rack.events if event.kind == "printed"]
-            why = (
-                printed[-1]
-                if printed
-                else "a board is lost then; ask for a time at which it is back"
-            )
-            raise Failure(f"{asked}: {why}", 2)
-        yield rack
-
-
-def attributes_in(folder: Path) -> dict[str, Document]:
-    """Return the attributes of levels next to a checkpoint, by task."""
-    return {found.stem: json.loads(found.read_bytes()) for found in folder.glob(f"*{ATTRIBUTES}")}
 
 
 def unlike_in(recording: Recording, segment: Segment, tick: int) -> list[str]:

@@ -13,12 +13,10 @@ from rack.backplane.operator_table import Request
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards import Rack
-from rack.boards.checkpoint.taking import are_wanted, keeping_for, outside
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
-from rack.boards.errors import UNKEPT
 from rack.boards.events import Event, Outcome
-from rack.boards.wiring import Entries, Keeping
+from rack.boards.wiring import Continuation, Entries
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, strikes
@@ -30,6 +28,7 @@ from rack.tools.live.other_racks import OtherEnd, OtherRacks
 from rack.tools.live.queues import queue_fills
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.live.verdict import list_failures
+from rack.tools.recording.code import write_code
 from rack.tools.recording.origin import Origin
 from rack.tools.recording.recorder_process import RecorderProcess
 
@@ -58,11 +57,12 @@ News = Callable[[], list[str]]
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a run goes on from: the checkpoint of another run, or, without one, the other's first
-    tick; the commands that its operators gave; what its host boards and other racks sent, which are
-    not started then; and which run that is, for the record."""
+    """What a run goes on from: a snapshot in a crate, or, without one, another run's first tick;
+    the commands that its operators gave; what its host boards and other racks sent, which are not
+    started then; and which run that is, for the record."""
 
-    checkpoint: Keeping | None = None
+    continues: Continuation | None = None
+    crate: CrateLine | None = None
     requests: tuple[Request, ...] = ()
     entries: Mapping[str, Entries] | None = None
     origin: Origin | None = None
@@ -120,9 +120,9 @@ def run_rack(
 
     With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
     `step`, in lockstep, hold before tick 0 until the rack is stepped. `share` and `crate` are
-    as in `Rack`; `begins`: the run that it continues or repeats. A rack in lockstep that is
-    recorded takes checkpoints, if it can. Launch the racks that the config names: one that
-    fails ends the run, and a run that does not succeed ends them.
+    as in `Rack`; `begins`: the run that it continues or repeats, whose crate takes the place of
+    `crate`. Launch the racks that the config names: one that fails ends the run, and a run that
+    does not succeed ends them.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
     dies does not end the run, but files that cannot be written do: raises `Failure`.
@@ -130,9 +130,6 @@ def run_rack(
     log = EventLog(display)
     news: list[News] = []
     begins = begins or Beginning()
-    keeping = begins.checkpoint
-    if folder is not None:
-        keeping = keeping_for(config, folder, keeping)
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to keep.
         with INTERRUPT.at_once():
@@ -148,19 +145,18 @@ def run_rack(
                     config,
                     log.add,
                     share or bool(others),
-                    crate,
+                    begins.crate or crate,
                     begins.entries,
-                    keeping,
-                    begins.requests,
+                    continues=begins.continues,
+                    requests=begins.requests,
                 )
             )
             rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
-                if are_wanted(config) and (why := outside(config)):
-                    log.add(Event(time.time_ns(), -1, "ready", "", f"{UNKEPT}{why}"))
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
                     (folder / "config.toml").write_text(config.text())
+                    write_code(config, folder)
                     if begins.origin is not None:
                         begins.origin.write(folder)
                     log.open(folder / "events.jsonl")

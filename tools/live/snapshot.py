@@ -198,6 +198,8 @@ class RackMonitor:
             shown.append(f"NO REAL-TIME PRIORITY: {', '.join(refused)}")
         if words[System.HELD]:
             shown.append(HELD.format(self._segment.rack))
+        if count := words[System.SNAPSHOTS]:
+            shown.append(f"{count} SNAPSHOTS, {words[System.SNAPSHOT_BYTES] / 1e6:.0f} MB")
         return shown
 
     def _row(self, task: TaskSpec) -> TaskRow:

@@ -44,12 +44,13 @@ class UnlikeMessage:
     visible_at: int
 
 
-def other_run(run: Path, named: Path) -> Path:
+def other_run(run: Path, named: Path, asked: str = "") -> Path:
     """Return the folder of the run that one is compared with: the one `named` or, for "origin", the
-    one that it goes on from, where its user named it or next to it. Raises `Failure`."""
+    one that it goes on from, where its user named it or next to it. Raises `Failure`, which begins
+    with what was `asked`."""
     if str(named) != "origin":
         return named
-    asked = f"--against origin: {run}"
+    asked = f"{asked or '--against origin'}: {run}"
     origin = Origin.of(Recording(run))
     if origin is None:
         raise Failure(f"{asked} records no run that it goes on from; permitted: --against RUN", 2)
@@ -57,8 +58,7 @@ def other_run(run: Path, named: Path) -> Path:
     for folder in (there, run.resolve().parent / there.name):
         if (folder / CONFIG).is_file() and origin.is_of(Recording(folder)):
             return folder
-    why = "that run is not there any more; permitted: --against RUN"
-    raise Failure(f"{asked} goes on from {there}, and {why}", 2)
+    raise Failure(f"{asked} goes on from {there}, and that run is not there any more", 2)
 
 
 def first_difference(one: Recording, other: Recording) -> Difference | None:

@@ -22,6 +22,7 @@ VIEW = "rack.tools.viewer.sink:ViewSink"
 SPOOL = "recorder.spool"
 """Name of the file that a recorder has open in the folder of its run."""
 ORIGIN = "origin.json"
+CODE = "code.json"
 """Name of the file, there, that says which run this one goes on from."""
 BEGUN = "recording"
 """Printed by the recorder when it has attached."""
@@ -34,7 +35,7 @@ on a loaded machine it is slow, but never idle. Fewer for one that a signal has 
 seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
-RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", ".checkpoint", "published.json")
+RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json")
 """Endings of the names of a recording's files, whose number and size no report changes."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR

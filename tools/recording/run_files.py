@@ -19,7 +19,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.parquet import CONFIG, PUBLISHED, SIGNALS, CyclesFile, signal_tables
-from rack.tools.recording.recorder_process import LOOK_S, ORIGIN, SPOOL
+from rack.tools.recording.recorder_process import CODE, LOOK_S, ORIGIN, SPOOL
 from rack.tools.recording.spool import (
     OPEN,
     STRETCHES,
@@ -242,7 +242,7 @@ def save(folder: Path, into: Path) -> None:
     """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
     on."""
     stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
-    for name in (CONFIG, PUBLISHED, ORIGIN, EVENTS, CHECKSUMS, SPOOL, *stretches):
+    for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
         (into / name).parent.mkdir(parents=True, exist_ok=True)
         # The flight recorder may have removed it meanwhile; few runs have an origin.
         with suppress(FileNotFoundError):

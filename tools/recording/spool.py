@@ -43,7 +43,7 @@ from rack.tools.recording.checksums import (
     read_line,
 )
 from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder_process import ORIGIN, SPOOL
+from rack.tools.recording.recorder_process import CODE, ORIGIN, SPOOL
 
 FLUSH_S = 0.1
 """SIGKILL of all processes loses what boards wrote in this time, between two drains, and in one or
@@ -132,7 +132,7 @@ class Spool:
                 raise Failure(f"{self.path}: another recorder is running there")
             if not self.path.stat().st_size:
                 # The config and the origin of the run are written before its recorder begins.
-                Checksums(folder).store(CONFIG, ORIGIN)
+                Checksums(folder).store(CONFIG, ORIGIN, CODE)
                 _write(self._file, SpoolHead(asdict(layout), launch))
             with self.path.open("rb") as left:
                 found = read_head(left, self.path)

@@ -3,29 +3,22 @@ goes on from there."""
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 from rack.backplane.message import AnyMessage
-from rack.backplane.words import Run, System
 from rack.boards import Rack
-from rack.boards.crate.line import CrateLine
-from rack.boards.crate.rack import LAUNCH_S
 from rack.tools.console.answer import Document, Failure, as_failure
-from rack.tools.live.continued import KeptStates, branched, state_at
+from rack.tools.live.continued import RunAgain, branched
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, mailbox_of
-
-LOOK_S = 0.005
-"""Time between looks for the clock of a rack that is launched: it posts nothing."""
 
 
 class RecordedMoment:
     """A run before the tasks released at `tick` begin.
 
-    Whatever goes wrong is a `Failure`. Levels and racks go on from the checkpoint
-    before; all else is recorded.
+    Whatever goes wrong is a `Failure`. For levels and racks the run is repeated up to
+    here; all else is recorded.
     """
 
     def __init__(self, recording: Recording, in_force: InForce, tick: int) -> None:
@@ -66,46 +59,37 @@ class RecordedMoment:
             if self._in_force.row(name, self.tick) is not None
         }
 
-    def levels(
-        self, crate: CrateLine | None = None, states: KeptStates | None = None
-    ) -> dict[str, Document]:
-        """Return the attributes of the levels' own objects, by task, in plain data. A `crate` that
-        was started earlier saves time, as do `states` found before."""
-        run = self._recording
-        with (
-            as_failure(),
-            state_at(run, self.tick, shows=True, crate=crate, states=states) as state,
-        ):
-            return dict(state.attributes)
+    def levels(self, anyway: bool = False) -> dict[str, Document]:
+        """Return the attributes of the levels' own objects, by task, in plain data; `anyway`: even
+        if the code or the files of the run have changed since."""
+        with as_failure(), RunAgain(self._recording, anyway=anyway) as again:
+            return again.levels(self.tick)
 
     def resume(
-        self, *settings: str, faults: str | None = None, seconds: float | None = None
+        self,
+        *settings: str,
+        faults: str | None = None,
+        seconds: float | None = None,
+        anyway: bool = False,
     ) -> Rack:
         """Return a rack in the background that goes on from here in lockstep; with `settings`, as
         in "board.servo.params.bandwidth=80", or `faults` it is a branch.
 
-        Close it, or use it as a context. `seconds` counts from the beginning of the recorded run.
+        Close it, or use it as a context. `seconds` counts from the beginning of the recorded run;
+        `anyway` is as in `levels`.
         """
         with as_failure():
             config = branched(self._recording, settings, faults)
-            with state_at(self._recording, self.tick) as state:
-                begins = state.begins
+            again = RunAgain(self._recording, anyway=anyway)
+            try:
+                begins = again.beginning(self.tick)
                 rack = Rack(
-                    config,
-                    entries=begins.entries,
-                    keeping=begins.checkpoint,
-                    requests=begins.requests,
+                    config, crate=again.crate, entries=begins.entries, continues=begins.continues
                 )
                 rack.launch()
                 rack.run_in_background(seconds)
-                _await_begun(rack)
+            except BaseException:
+                again.crate.end()
+                raise
+            again.crate.is_last = True
         return rack
-
-
-def _await_begun(rack: Rack) -> None:
-    """Wait until the clock, the last of a rack's processes to do so, has read the state."""
-    deadline = time.monotonic() + LAUNCH_S
-    while rack.segment.words[System.STATE] == Run.STARTING and rack.wait(LOOK_S) is None:
-        if time.monotonic() > deadline:
-            rack.close()
-            raise Failure(f"rack '{rack.config.name}': its clock has not begun in {LAUNCH_S:g} s")

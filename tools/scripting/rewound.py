@@ -2,26 +2,22 @@
 
 `rack rewind` is the prompt to it. What is shown at a tick is what the tasks released then find,
 before they begin: the messages in force, which the recording has, and the objects of the levels,
-read in their own processes, which go on to that tick from the checkpoint before.
+read in copies of their processes, of which the rack that runs again leaves some on the way.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Self
 
-from rack.boards.config.resolved import classes
-from rack.boards.crate.line import WarmCrate
-from rack.boards.crate.rack import cell_of
-from rack.boards.crate.requests import Preload
 from rack.boards.events import Event
-from rack.tools.console.answer import Document, Failure
+from rack.tools.console.answer import Document, Failure, as_failure
 from rack.tools.console.tables import fitted
-from rack.tools.live.continued import KeptStates, branched, state_at, tick_in
+from rack.tools.live.continued import RunAgain, branched, tick_in
 from rack.tools.live.display import Display, event_text
 from rack.tools.live.folder import folder_of
 from rack.tools.live.launch import run_rack
@@ -45,10 +41,11 @@ class Glance:
 
 
 class RewoundRun:
-    """A run, and the `tick` at which one looks at it. Use it as a context: it keeps a crate warm,
-    from which boards are forked."""
+    """A run, and the `tick` at which one looks at it. Use it as a context: it repeats the run, and
+    keeps snapshots of it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, anyway: bool = False) -> None:
+        self._anyway = anyway
         self.recording = Recording(folder)
         self._layout = self.recording.layout
         self._first, self._end = ticks_of(self.recording)
@@ -58,26 +55,24 @@ class RewoundRun:
         self._boxes = {box.name: box for box in self._layout.timed}
         self._tasks = [task.name for task in self._layout.tasks]
         self._levels: tuple[int, Mapping[str, Document]] = -1, {}
-        self._crate: WarmCrate | None = None
-        self._states = KeptStates()
+        self._again: RunAgain | None = None
 
     def __enter__(self) -> Self:
-        self._ready()
+        # Its crate imports while the user types. What keeps a run from being repeated is said when
+        # that is asked for.
+        with suppress(Failure):
+            self._ready()
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._states.close()
-        if self._crate is not None:
-            self._crate.end()
+        if self._again is not None:
+            self._again.crate.end()
 
-    def _ready(self) -> WarmCrate:
-        """Return the crate. One that has just been started imports while the user types."""
-        if self._crate is None or self._crate.is_over:
-            config = self.recording.rack_config
-            self._crate = WarmCrate()
-            path = (*sys.path, *map(str, config.python_path))
-            self._crate.ask(Preload(classes(config), path, cell_of(config)))
-        return self._crate
+    def _ready(self) -> RunAgain:
+        """Return the run that is repeated; anew after its crate was lost."""
+        if self._again is None or self._again.crate.is_over:
+            self._again = RunAgain(self.recording, anyway=self._anyway)
+        return self._again
 
     @property
     def names(self) -> list[str]:
@@ -146,7 +141,8 @@ class RewoundRun:
     def _level(self, task: str) -> Glance:
         tick, levels = self._levels
         if tick != self.tick:
-            levels = self._moment.levels(self._ready(), self._states)
+            with as_failure():
+                levels = self._ready().levels(self.tick)
             self._levels = self.tick, levels
         rows = [[name, cell(value)] for name, value in _flat(levels[task])]
         return self._shown(task, levels[task], fitted(("attribute", "value"), rows))
@@ -175,8 +171,8 @@ class RewoundRun:
         if seconds is None and ended.get("cause") == "time over":
             seconds = self.time_s(self._end)
         folder = folder_of(out, config.name)
-        with state_at(self.recording, self.tick, states=self._states) as state:
-            result = run_rack(config, seconds, folder, display, begins=state.begins)
+        begins = self._ready().beginning(self.tick)
+        result = run_rack(config, seconds, folder, display, begins=begins)
         report, _ = write_report(folder)
         differs = first_difference(self.recording, Recording(folder))
         where = "all that both wrote is equal"

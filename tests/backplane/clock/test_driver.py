@@ -50,7 +50,7 @@ def given_out(
 def test_a_run_stops_at_its_tick_and_wakes_everybody(make_bus: MakeBus) -> None:
     segment = make_bus()
     start(segment)
-    posts = [wake_semaphore(segment.rack, name) for name in ("writer", "reader")]
+    posts = [wake_semaphore(segment, name) for name in ("writer", "reader")]
     ticks = given_out(segment, STOP)
     epoch = segment.words[System.EPOCH_NS]
     assert all(at >= epoch + tick * PERIOD_NS for tick, at in ticks)
@@ -69,7 +69,7 @@ def test_the_clock_works_ahead_for_tasks_that_sleep(make_bus: MakeBus) -> None:
     sleeper, waiter = segment.block("sleeper"), segment.block("waiter")
 
     def take() -> None:
-        post = wake_semaphore(segment.rack, "waiter")
+        post = wake_semaphore(segment, "waiter")
         while segment.words[System.STATE] != Run.STOPPED:
             if post.acquire(BOUND_S):
                 made.append((sleeper[Block.RELEASED], waiter[Block.RELEASED], time.monotonic_ns()))
@@ -82,7 +82,7 @@ def test_the_clock_works_ahead_for_tasks_that_sleep(make_bus: MakeBus) -> None:
     assert all(at >= epoch + second * PERIOD_NS and first >= second for first, second, at in made)
     # One post as the grid begins, one at the end; one more only for a tick of which the clock was
     # late.
-    assert wake_semaphore(segment.rack, "sleeper").value < 2 + len(ticks)
+    assert wake_semaphore(segment, "sleeper").value < 2 + len(ticks)
 
 
 def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> None:
@@ -92,7 +92,7 @@ def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> N
     numbers = [
         tick for tick, _ in given_out(segment, 30, lambda tick: time.sleep(2 * PERIOD_NS * 1e-9))
     ]
-    assert wake_semaphore(segment.rack, "sleeper").value == 2 + len(numbers) - 1
+    assert wake_semaphore(segment, "sleeper").value == 2 + len(numbers) - 1
 
 
 def test_the_controller_works_before_and_after_the_releases_of_each_tick(
@@ -121,7 +121,7 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
     assert len(ticks) > 1
     assert work == [step for steps in both for step in steps]
     # A task that polls is released without a post: the one is the end's.
-    assert wake_semaphore(segment.rack, "poller").value == 1
+    assert wake_semaphore(segment, "poller").value == 1
 
 
 def test_a_late_clock_leaves_ticks_out_and_counts_them(make_bus: MakeBus) -> None:

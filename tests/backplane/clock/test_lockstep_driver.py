@@ -37,7 +37,7 @@ def serve(
         time.sleep(work_s)
         log.append(("end", name, tick))
         block[Block.DONE] = tick
-        done_semaphore(segment.rack, name).release()
+        done_semaphore(segment, name).release()
 
 
 def lockstep(
@@ -261,10 +261,10 @@ def test_a_batch_ends_before_what_the_clock_must_do(make_bus: MakeBus) -> None:
     driver._begins(1)
     due = driver.due(1, 0)
     assert driver._batch_end(due, 1) == 7
-    driver.keep = lambda tick: 4
+    driver.snapshot = lambda tick: 4
     driver._begins(1)
     assert driver._batch_end(due, 1) == 4
-    driver.keep = lambda tick: tick
+    driver.snapshot = lambda tick: tick
     driver._begins(1)
     assert driver._batch_end(due, 1) == 2
 
@@ -307,6 +307,6 @@ def test_a_restarted_clock_waits_for_the_batch_of_its_predecessor(make_bus: Make
     driver = LockstepDriver(segment, ended, False, HISTORY)
     with in_thread(driver.run):
         block[Block.DONE] = 6
-        done_semaphore(segment.rack, "fast").release()
+        done_semaphore(segment, "fast").release()
     assert asked
     assert set(asked) == {6}

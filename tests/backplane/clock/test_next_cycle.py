@@ -47,7 +47,7 @@ def start_grid(segment: Segment, passed_ns: int = 0, period_ns: int = PERIOD_NS)
 
 def release(segment: Segment, tick: int) -> None:
     segment.block("level")[Block.RELEASED] = tick
-    wake_semaphore(segment.rack, "level").release()
+    wake_semaphore(segment, "level").release()
 
 
 def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
@@ -135,7 +135,7 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     )
     thread.start()
     bus.words[System.STATE] = Run.STOPPED
-    wake_semaphore(bus.rack, "level").release()
+    wake_semaphore(bus, "level").release()
     thread.join(BOUND_S)
     assert found == [-1, None]
 
@@ -248,7 +248,7 @@ def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: S
     block[Block.FIRST] = 24
     release(bus, 28)
     assert [(cycle.wait(), cycle.skipped) for _ in range(2)] == [(24, 2), (28, 0)]
-    assert wake_semaphore(bus.rack, "level").value == 0
+    assert wake_semaphore(bus, "level").value == 0
 
 
 @pytest.mark.filterwarnings(FORKS)

@@ -61,7 +61,7 @@ def test_an_observer_reads_by_its_protocol_and_never_waits(
     writer, observer = open_writer(segment, NAME), open_observer(segment, NAME)
     writer.write(0)
     if protocol == "lock":
-        lock_semaphore(segment.rack, NAME).acquire(0)
+        lock_semaphore(segment, NAME).acquire(0)
     expected = Verdict.NONE if protocol in BY_TICKS else Verdict.NEW
     assert observer.read(0).verdict is expected
     assert observer.read(4).is_there

@@ -20,7 +20,10 @@ def test_durations_are_text_or_seconds_and_survive_the_config_of_a_run(small: Pa
     ("table", "line"),
     [
         ("{ keep = '-3 s' }", 'record.keep = "-3 s": should be a time'),
-        ("{ checkpoint_s = 'nan s' }", 'record.checkpoint_s = "nan s": should be a time'),
+        ("{ keep = 0.5 }", "record.keep = 0.5: should be greater than or equal to 1"),
+        ("{ keep = '10 s', before = -1 }", "record.before = -1: should be greater"),
+        ("{ before = 'nan s' }", 'record.before = "nan s": should be a time'),
+        ("{ checkpoint_s = 5.0 }", "record.checkpoint_s = 5.0: unknown key"),
         ("{ keep = '8 s' }", "record: keep = 8 s is shorter than before + after = 10 s"),
         ("{ keep = '1 h' }", 'record.keep = "1 h": should be a time, as in "0.5s", "20ms"'),
     ],

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane import semaphores
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import RackInUseError, SegmentError
 from rack.backplane.layout import Layout
@@ -35,16 +34,14 @@ as_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can become anot
 def spec(rack_name: str) -> Iterator[Layout]:
     """A layout; whatever is made of it is removed."""
     yield layout(rack_name, [mailbox("lock")])
-    semaphores.unlink_all(rack_name)
     unlink(rack_name)
 
 
 def leave_dead(spec: Layout) -> None:
-    """Leave a segment and its semaphores as a launcher that was killed would."""
+    """Leave a segment as a launcher that was killed would."""
 
     def launch() -> None:
         Segment.create(spec, "")
-        semaphores.create(spec)
 
     assert exit_status(fork(launch)) == 0
 
@@ -53,9 +50,9 @@ def left(rack: str) -> list[str]:
     return [path.name for path in SHM_FOLDER.iterdir() if rack in path.name]
 
 
-def test_a_dead_racks_segment_and_semaphores_are_removed(spec: Layout) -> None:
+def test_a_dead_racks_segment_is_removed(spec: Layout) -> None:
     leave_dead(spec)
-    assert len(left(spec.rack)) == 1 + len(semaphores.names(spec))
+    assert len(left(spec.rack)) == 1
     assert remove_dead(spec.rack)
     assert left(spec.rack) == []
 
@@ -94,17 +91,6 @@ def test_another_users_rack_is_left_alone(spec: Layout) -> None:
     assert spec.rack in racks()
 
 
-@as_root
-def test_another_users_semaphore_does_not_keep_a_dead_rack(spec: Layout) -> None:
-    semaphores.create(spec)
-
-    def leave_and_clean() -> None:
-        os.setuid(STRANGER)
-        assert exit_status(fork(lambda: Segment.create(spec, "").close())) == 0
-        assert spec.rack in clean()[0]
-
-    assert exit_status(fork(leave_and_clean)) == 0
-    assert len(left(spec.rack)) == len(semaphores.names(spec))
 
 
 def test_a_rack_removed_and_launched_meanwhile_is_not_removed(
@@ -226,7 +212,6 @@ def test_a_rack_of_another_pid_namespace_is_not_taken_for_the_own_one(spec: Layo
 
 def test_only_the_own_racks_of_a_process_are_removed_by_it(spec: Layout, rack_name: str) -> None:
     own = Segment.create(spec, "")
-    semaphores.create(spec)
     other = layout(f"{rack_name}-other")
     assert exit_status(fork(lambda: Segment.create(other, "").close())) == 0
     try:

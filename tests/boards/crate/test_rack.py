@@ -197,13 +197,6 @@ def text_of(events: Sequence[Event], kind: str) -> str:
                 r" \d+ of .*"
             ),
         ),
-        (
-            (*SMALL, "all"),
-            (
-                r"rack '.*': 4 semaphores of 4096 bytes: No space left .*: /dev/shm has \d+ bytes,"
-                r" 0 of .*"
-            ),
-        ),
     ],
 )
 def test_a_limit_of_the_system_is_one_line_with_its_value(

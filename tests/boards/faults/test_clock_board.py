@@ -44,7 +44,7 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
             time.sleep(CYCLE_S)
             seen.append((tick, entry.stage))
             segment.block("writer")[Block.DONE] = tick
-            done_semaphore(segment.rack, "writer").release()
+            done_semaphore(segment, "writer").release()
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
@@ -194,7 +194,7 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
             wait_until(lambda: not is_alive(pid))
             block[Block.LOST] = 3
             site.segment.words[System.LOSSES] += 1
-            done_semaphore(site.segment.rack, "writer").release()
+            done_semaphore(site.segment, "writer").release()
 
         entry = site.add("kill", tick=2)
         with in_thread(crate):

@@ -98,13 +98,13 @@ def test_in_real_time_a_program_waits_for_a_message_or_its_time(
     assert not bus.wait(0.02)
     assert time.monotonic() - began >= 0.02
     assert not bus.wait(-1.0)
-    semaphore = wake_semaphore(site.segment.rack, "program")
+    semaphore = wake_semaphore(site.segment, "program")
     with in_thread(semaphore.release):
         assert bus.wait(BOUND_S)
     bus.await_turn()
     bus.finish()
     assert site.host[Block.STATE] == TaskState.ENDED
-    assert done_semaphore(site.segment.rack, "program").value == 0
+    assert done_semaphore(site.segment, "program").value == 0
 
 
 def test_in_lockstep_time_is_that_of_its_turns(make_site: MakeSite, open_bus: OpenBus) -> None:
@@ -112,8 +112,8 @@ def test_in_lockstep_time_is_that_of_its_turns(make_site: MakeSite, open_bus: Op
     site.segment.words[System.LOCKSTEP] = 1
     site.host[Block.RELEASED] = 8
     bus = open_bus(site)
-    done = done_semaphore(site.segment.rack, "program")
-    wake = wake_semaphore(site.segment.rack, "program")
+    done = done_semaphore(site.segment, "program")
+    wake = wake_semaphore(site.segment, "program")
     assert (bus.tick, bus.time_s) == (8, pytest.approx(8 * TICK_S))
     seen: list[tuple[bool, int]] = []
 
@@ -152,5 +152,5 @@ def test_a_program_in_lockstep_runs_only_in_its_turn(
         with in_thread(lambda passed=passed: passed.append(bus.await_turn() is None)):
             assert passed == []
             block[word] = free
-            wake_semaphore(site.segment.rack, "program").release()
+            wake_semaphore(site.segment, "program").release()
         assert passed == [True]

@@ -117,7 +117,7 @@ def test_a_restarted_bridge_counts_on_and_repeats_what_it_said(
 def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: OpenBus) -> None:
     site = make_site()
     bus = open_bus(site)
-    semaphore = wake_semaphore(site.segment.rack, "program")
+    semaphore = wake_semaphore(site.segment, "program")
     site.cycle()
     assert (semaphore.value, site.count("sum")) == (0, {"arrived": NEVER, "age": NEVER})
     level = OutputPorts(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from rack.backplane import semaphores
+from rack.backplane.errors import MailboxError
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.mailbox.slots import Slots
@@ -36,7 +37,6 @@ class Bench:
     def __init__(self, plan: Resolved) -> None:
         self.plan = plan
         self.segment = Segment.create(plan.layout, "")
-        semaphores.create(plan.layout)
         self.segment.words[System.PERIOD_NS] = HOUR_NS
         self.to(0)
 
@@ -72,7 +72,6 @@ def bench(config: MakeConfig) -> Iterator[MakeBench]:
 
     yield make
     for found in made:
-        semaphores.unlink(found.plan.layout)
         unlink(found.segment.rack)
         found.segment.close()
 

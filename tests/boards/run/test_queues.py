@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rack.backplane import semaphores
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import FIELDS, TraceWriter
@@ -114,7 +113,6 @@ class QueueLink:
         for reader in self.reads.readers.values():
             reader.close()  # type: ignore[attr-defined]
         self.segment.close()
-        semaphores.unlink_all(self.segment.rack)
         unlink(self.segment.rack)
 
 
@@ -129,7 +127,6 @@ def link(rack_name: str) -> Iterator[MakeQueue]:
         tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
         name = f"{rack_name}-{len(made)}"
         segment = Segment.create(layout(name, queue(capacity, rates), tasks), "")
-        semaphores.create(segment.layout)
         made.append(QueueLink(segment, sends))
         return made[-1]
 
@@ -154,7 +151,6 @@ def test_order_and_fullness_depend_on_ticks_alone(
         segment = Segment.create(
             layout(f"test-queue-{id(bursts)}", queue(capacity, rates), tasks), ""
         )
-        semaphores.create(segment.layout)
         rack = QueueLink(segment)
         try:
             most = 0

@@ -149,7 +149,7 @@ def test_a_change_of_the_levels_state_has_its_tick(site: Site) -> None:
 
 
 def test_in_lockstep_a_cycle_has_no_deadline_and_is_reported(stepped: Site) -> None:
-    done = done_semaphore(stepped.segment.rack, "level")
+    done = done_semaphore(stepped.segment, "level")
     before = time.monotonic_ns()
     stepped.cycle(5, ends_after_ns=100 * PERIOD_NS)
     record = stepped.traced()
@@ -165,7 +165,7 @@ def test_in_lockstep_a_cycle_has_no_deadline_and_is_reported(stepped: Site) -> N
 
 def test_several_releases_given_at_once_are_reported_once(stepped: Site) -> None:
     stepped.block[Block.RELEASED] = 7
-    done = done_semaphore(stepped.segment.rack, "level")
+    done = done_semaphore(stepped.segment, "level")
     for tick, reports in ((5, 0), (6, 0), (7, 1)):
         stepped.cycle(tick)
         assert (stepped.counts(Block.DONE), done.value) == ([tick], reports)
@@ -175,7 +175,7 @@ def test_in_real_time_nobody_waits_for_a_report(site: Site) -> None:
     site.cycle(5)
     site.watch.idle()
     site.watch.notify_clock()
-    assert done_semaphore(site.segment.rack, "level").value == 0
+    assert done_semaphore(site.segment, "level").value == 0
 
 
 def test_the_clock_is_asked_once_the_deadline_may_have_come(site: Site) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import mujoco
 import numpy as np
 import pytest
 
 from rack.backplane.message import Message
-from rack.boards.checkpoint.kinds import part_kind
 from rack.levels.arm import SimulatedArm
 from rack.levels.arm.simulation import sleeping
 from rack.levels.messages import ArmState
@@ -71,27 +68,14 @@ def test_objects_sleep_until_one_is_pushed_and_end_where_they_would_without_slee
     assert places(arm) == pytest.approx(places(other), abs=0.005)
 
 
-def by_message(arm: SimulatedArm, again: SimulatedArm) -> None:
-    again.restore(saved(arm))
-
-
-def by_checkpoint(arm: SimulatedArm, again: SimulatedArm) -> None:
-    kind = part_kind(mujoco.MjData)
-    assert kind.contents is not None
-    assert kind.put is not None
-    by_message(arm, again)
-    kind.put(again._data, kind.contents(arm._data))
-
-
-@pytest.mark.parametrize("restore", [by_message, by_checkpoint])
 @pytest.mark.parametrize("tick", [FALLING_ASLEEP_TICK, 100, PUSHED_TICK + 5, END_TICK - 60])
 def test_a_restored_cell_continues_bit_for_bit_asleep_or_awake(
-    tick: int, restore: Callable[[SimulatedArm, SimulatedArm], None]
+    tick: int,
 ) -> None:
     arm, again = arm_of(), arm_of()
     arm.step(tick)
     again.step(PUSHED_TICK + 3)  # where others are awake
-    restore(arm, again)
+    again.restore(saved(arm))
     assert state(again) == state(arm)
     for each in (arm, again):
         each.step(END_TICK - tick)

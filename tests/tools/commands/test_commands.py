@@ -100,6 +100,7 @@ def test_run_prints_one_json_document_and_nothing_else(
     assert (report["rack"], report["worked"], report["outcome"]["ticks"]) == (rack_name, True, 400)
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [
         "checksums.xxh128",
+        "code.json",
         "config.toml",
         "cycles.parquet",
         "events.jsonl",

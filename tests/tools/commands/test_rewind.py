@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from rack.boards.checkpoint.format import FOLDER, NAME
+from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.live import continued
+from rack.boards.events import CONTINUES, Event
+from rack.tools.live.continued import RunAgain
 from rack.tools.live.display import Display
-from rack.tools.live.launch import Beginning, run_rack
+from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
-from tests.boards.checkpoint.test_keeping import REMEMBERING
+from tests.boards.remembering_racks import REMEMBERING
 from tests.processes import descriptors
 from tests.tools.command_line import rack
 
@@ -28,12 +30,12 @@ DIGITS = "9" * 400
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 800 ticks with checkpoints at 200, 400 and 600."""
+    """A run of 800 ticks."""
     folder = tmp_path_factory.mktemp("rewound")
     path = folder / "remembering.toml"
     path.write_text(REMEMBERING)
     run = folder / "run"
-    config = load(path, [f"name=test-rewind-{folder.name}", "record.checkpoint_s=0.5"])
+    config = load(path, [f"name=test-rewind-{folder.name}"])
     run_rack(config, SECONDS, run, Display())
     return run
 
@@ -102,37 +104,40 @@ def test_a_condition_leads_to_where_it_begins_to_hold_forwards_and_backwards(
 def test_a_level_is_shown_as_it_was_at_that_tick(asked: Asked) -> None:
     found = asked("goto 1.2", "show wave", "goto 1", "show wave", "goto 0.3", "show wave")
     assert found[1]["value"]["_recent"] == [tick % 7 for tick in range(475, 480)]
-    # At a checkpoint, and before the first.
     assert found[3]["value"]["_recent"] == [tick % 7 for tick in range(395, 400)]
     assert found[5]["value"]["_recent"] == [tick % 7 for tick in range(115, 120)]
 
 
-def test_a_state_that_was_found_is_where_later_ones_go_on_from(
+def test_a_tick_that_was_reached_is_where_later_ones_go_on_from(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    origins: list[Path | None] = []
-    gone_on = continued.gone_on
+    begun: list[int] = []
+    rack_at = RunAgain.rack_at
 
-    def noted(recording: Recording, begins: Beginning, *others: Any) -> Any:
-        assert begins.checkpoint is not None
-        origins.append(begins.checkpoint.origin)
-        return gone_on(recording, begins, *others)
+    @contextmanager
+    def noted(self: RunAgain, *asked: Any) -> Iterator[Rack]:
+        with rack_at(self, *asked) as ran:
+            begun.append(continued_from(ran.events))
+            yield ran
 
-    monkeypatch.setattr(continued, "gone_on", noted)
-    monkeypatch.setattr(continued, "MOST_STATES", 1)
+    monkeypatch.setattr(RunAgain, "rack_at", noted)
     recording = Recording(run)
     before = descriptors()
-    with closing(continued.KeptStates()) as states:
-        found = []
-        for tick in (450, 470):
-            with continued.state_at(recording, tick, shows=True, states=states) as state:
-                found += states.found.items()
-                attributes = state.attributes
-    assert [tick for tick, _ in found] == [450, 470]
-    assert origins == [(run / FOLDER / NAME.format(400)).resolve(), found[0][1]]
+    with RunAgain(recording) as again:
+        levels = [again.levels(tick) for tick in (450, 470, 450, 460)]
+    assert (begun[0], begun[2]) == (-1, 450)
+    # None at which there is a snapshot runs again.
+    assert len(begun) == 3
+    assert begun[1] >= 450
+    assert levels[0] == levels[2]
     assert descriptors() == before
-    with continued.state_at(recording, 470, shows=True) as alone:
-        assert alone.attributes == attributes
+    with RunAgain(Recording(run)) as alone:
+        assert alone.levels(470) == levels[1]
+
+
+def continued_from(events: Sequence[Event]) -> int:
+    """Return the tick of the snapshot from which a rack went on; -1: none."""
+    return next((event.tick for event in events if event.code == CONTINUES), -1)
 
 
 def test_a_branch_differs_from_its_tick_on_and_an_unchanged_one_nowhere(

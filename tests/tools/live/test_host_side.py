@@ -50,8 +50,7 @@ def test_a_replay_of_recorded_entries_repeats_the_run_without_host_boards(
     assert first["digest"] == again["digest"]
     assert first["entries"] == again["entries"]
     assert next(entry["passed"] for entry in first["entries"]) == 40
-    unkept = "no checkpoints: 'program': a host program's state"
-    assert first["notes"] == again["notes"] == [unkept]
+    assert first["notes"] == again["notes"] == []
 
 
 @pytest.mark.slow
@@ -66,15 +65,10 @@ def test_a_run_with_a_host_board_is_continued_with_what_that_sent(
     done = rack("run", *asked.split(), "--out", tmp_path / "two", "--json")
     assert json.loads(done.stdout)["digest"] == first["digest"]
     assert done.stderr.splitlines() == [
-        f"{asked}: {run} has no checkpoints: it is repeated in lockstep from its beginning, with 0"
-        " commands of its operators",
         f"{asked}: not started: 'program'; what they sent enters again",
     ]
     two = Recording(tmp_path / "two")
     assert two.signal("bridge.numbers", "tick").min() >= tick
-    refused = rack("run", "--from", f"{two.folder}@{middle_s}", "--no-record")
-    assert (refused.returncode, refused.stdout) == (2, "")
-    assert refused.stderr.endswith("it continues another run, and has no checkpoints\n")
     refused = rack("run", *asked.split(), "--entries", run)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert "a run that is continued has its own" in refused.stderr

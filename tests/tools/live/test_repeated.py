@@ -1,4 +1,4 @@
-"""A run without checkpoints, in real time too, is repeated in lockstep with what its operators
+"""A run, in real time too, is repeated in lockstep with what its operators
 commanded."""
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def commanded(folder: Path, name: str, mode: str) -> Recording:
     ticks, in real time whenever it comes."""
     file = folder / "commanded.toml"
     file.write_text(COMMANDED)
-    settings = (f"name={name}", f"clock.mode={mode}", "record.checkpoint_s=0", commands(HOLD))
+    settings = (f"name={name}", f"clock.mode={mode}", commands(HOLD))
     config = load(file, settings)
     given = requests(config, resume=80, hold=200)
     run = folder / "one"
@@ -113,11 +113,7 @@ def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
     """Return the run that goes on from it."""
     arguments = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
     done = rack("run", *arguments)
-    said = (
-        f"--from {one.folder}@{at}: {one.folder} has no checkpoints: it is repeated in lockstep"
-        " from its beginning, with 2 commands of its operators"
-    )
-    assert done.stderr.splitlines() == [said]
+    assert not done.stderr
     assert json.loads(done.stdout)["recording"] == "complete"
     return Recording(folder)
 
@@ -183,12 +179,12 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
 
 @pytest.fixture(scope="module", params=[Client.WAITS, Client.LEASES])
 def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A run in lockstep with a checkpoint each 100 ticks, whose operator commands at 140 and 260
+    """A run in lockstep whose operator commands at 140 and 260
     what no config has; under a lease these are in force to the end."""
     folder = tmp_path_factory.mktemp("by-hand")
     (folder / "commanded.toml").write_text(COMMANDED)
     name = f"test-by-hand-{os.getpid()}"
-    settings = (f"name={name}", "clock.mode=lockstep", "record.checkpoint_s=0.25", commands(HOLD))
+    settings = (f"name={name}", "clock.mode=lockstep", commands(HOLD))
     config = load(folder / "commanded.toml", settings)
     given = requests(config, resume=140, hold=260)
     with closing(ByHand(name, given, request.param)) as operator:
@@ -211,7 +207,7 @@ def continued(one: Recording, at: float, folder: Path, *settings: str) -> Record
 @pytest.mark.parametrize(
     ("at", "ticks"), [(0.25, [140, 260]), (0.3, [140, 260]), (0.4, [260]), (0.6, [260]), (0.7, [])]
 )
-def test_what_operators_commanded_after_a_checkpoint_is_repeated(
+def test_what_operators_commanded_later_is_repeated(
     by_hand: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
     two = continued(by_hand, at, tmp_path / "two")
@@ -221,11 +217,11 @@ def test_what_operators_commanded_after_a_checkpoint_is_repeated(
 
 
 @pytest.mark.slow
-def test_a_command_that_waits_in_a_checkpoint_is_issued_once(
+def test_a_command_that_waits_in_a_snapshot_is_issued_once(
     by_hand: Recording, tmp_path: Path
 ) -> None:
     two = continued(by_hand, 0.3, tmp_path / "two")
-    # Those that two repeats wait in its checkpoint at tick 200.
+    # Those that two repeats wait in the snapshot at tick 240.
     three = continued(two, 0.6, tmp_path / "three")
     assert three.signal("upper.operator", "tick").tolist() == [260]
     assert first_difference(two, three) is None
@@ -249,17 +245,6 @@ def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
     flight.kept = [(0, 200), (240, 800)]
     found = [[one.tick for one in commands_from(flight, tick)] for tick in (0, 100, 250)]
     assert found == [[40, 140], [140], [260]]
-
-
-@pytest.mark.slow
-def test_commands_that_do_not_fit_into_the_table_are_noted(
-    by_hand: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # One of them is the config's.
-    monkeypatch.setattr("rack.tools.live.continued.OPERATOR_ENTRIES", 2)
-    options = ("--seconds", SECONDS, "--no-record", "--json")
-    done = rack("run", "--from", f"{by_hand.folder}@0.4", *options)
-    assert "commands from 0.65 s on are not repeated: the operator table holds 2" in done.stderr
 
 
 @pytest.mark.slow

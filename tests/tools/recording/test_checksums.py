@@ -16,9 +16,7 @@ import numpy as np
 import pytest
 
 from rack.boards import Rack
-from rack.boards.checkpoint.format import read as read_checkpoint
 from rack.boards.config import RackConfig, load
-from rack.boards.errors import CheckpointError
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, checked_line, read_line
@@ -242,14 +240,6 @@ def test_a_report_replaces_its_own_files_whatever_they_are(damaged: Path, name: 
         assert (done.returncode, done.stdout) == (0, whole)
         assert (damaged / name).is_file()
         assert not (damaged / name).is_symlink()
-
-
-def test_a_checkpoint_is_read_from_a_regular_file_only(tmp_path: Path) -> None:
-    for number, take_place in enumerate(PLACES):
-        path = tmp_path / f"{number}.checkpoint"
-        take_place(path)
-        with bounded(), pytest.raises(CheckpointError, match="not a regular file"):
-            read_checkpoint(path)
 
 
 def test_a_damaged_file_of_the_viewer_is_named(damaged: Path) -> None:

@@ -63,7 +63,7 @@ def test_a_run_at_a_time_has_the_messages_that_are_read_there(small: Path) -> No
 def test_a_run_is_resumed_from_a_time_in_the_background(tmp_path: Path, rack_name: str) -> None:
     path = tmp_path / "small.toml"
     path.write_text(SMALL)
-    config = load(path, [f"name={rack_name}", "record.checkpoint_s=0.5"])
+    config = load(path, [f"name={rack_name}"])
     run = tmp_path / "run"
     run_rack(config, 2.0, run, Display())
     expected = Recording(run).ended["outcome"]

@@ -11,7 +11,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from rack.boards.config import load
-from rack.tools.live.continued import branched, state_at
+from rack.tools.live.continued import RunAgain, branched
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.recording import Recording
@@ -19,7 +19,7 @@ from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.viewer.merged import write_merged
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read
-from tests.boards.checkpoint.test_keeping import REMEMBERING
+from tests.boards.remembering_racks import REMEMBERING
 from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
 from tests.tools.machines import CLOCK_NS, MS, TICKS, A, B, S, recorded
@@ -107,12 +107,12 @@ def branched_runs(rack_name: str, tmp_path: Path) -> Path:
     """Runs "whole", and "other", which branches off at tick 150; the folder of both."""
     file = tmp_path / "remembering.toml"
     file.write_text(REMEMBERING)
-    config = load(file, [f"name={rack_name}", "record.checkpoint_s=0.25"])
+    config = load(file, [f"name={rack_name}"])
     run_rack(config, 1.0, tmp_path / "whole", Display())
     whole = Recording(tmp_path / "whole")
     config = branched(whole, ["board.wave.params.factor=2"], None)
-    with state_at(whole, 150) as state:
-        run_rack(config, 1.0, tmp_path / "other", Display(), begins=state.begins)
+    with RunAgain(whole) as again:
+        run_rack(config, 1.0, tmp_path / "other", Display(), begins=again.beginning(150))
     return tmp_path
 
 

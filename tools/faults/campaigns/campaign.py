@@ -18,7 +18,6 @@ from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Document, Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
-from rack.tools.faults.campaigns.base import BaseRun
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
 from rack.tools.faults.campaigns.environment import examine, load
 from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
@@ -38,9 +37,7 @@ MOST_AGAIN = 4
 less does one more cost."""
 ORDER = "order.json"
 TRIALS = "trials"
-BASE = "base"
-"""In a campaign's folder: the file with its order, the folder of its trials, and, while it goes on,
-that of the run from which they continue."""
+"""In a campaign's folder: the file with its order, and the folder of its trials."""
 NOMINAL = Plan(0, "nominal", lockstep=True)
 
 
@@ -71,7 +68,7 @@ class Order:
 
 
 class Campaign:
-    """One campaign; with `whole`, no trial starts at a checkpoint. Raises `ConfigError`, and
+    """One campaign; with `whole`, no trial goes on from a snapshot. Raises `ConfigError`, and
     `Failure` for a task that is not done even without faults."""
 
     def __init__(self, order: Order, folder: Path, progress: Progress, whole: bool = False) -> None:
@@ -87,16 +84,14 @@ class Campaign:
         self.kinds = kinds_for(order.kinds, self._targets, False in order.modes)
         self._ticks = 0
         self._number = 0
-        self._base = None if whole else BaseRun(self._config, folder / BASE)
-        self._has_base = False
+        self._whole = whole
 
     def run(self) -> Results:
         """Do everything that is not done yet, or as much as there is time for until Ctrl-C."""
         order = self.order
         self._open()
         examine(self._config)
-        base = None if self._base is None else self._base.folder
-        with self._base or nullcontext(), Workers(self._config, base) as self._workers:
+        with Workers(self._config, self._whole) as self._workers:
             self._progress.begin("without faults, in lockstep")
             made = self._made([NOMINAL])
             if not made:
@@ -181,18 +176,9 @@ class Campaign:
             if waiting:
                 mode = "lockstep" if lockstep else "real time"
                 self._progress.begin(f"{len(waiting)} in {mode}")
-            if waiting and lockstep:
-                self._make_base(waiting)
             for job in self._workers.run(waiting, alone=not lockstep):
                 self._show(job)
         return [found for job in jobs if (found := _kept(job))]
-
-    def _make_base(self, waiting: Sequence[TrialJob]) -> None:
-        """Make the run from which trials continue, once, unless it is among those that wait."""
-        if self._base is not None and not self._has_base and waiting[0].plan != NOMINAL:
-            job = replace(self._job(NOMINAL), path=self._base.folder / f"{NOMINAL.purpose}.json")
-            list(self._workers.run([job], alone=False))
-        self._has_base = True
 
     def _job(self, plan: Plan) -> TrialJob:
         name = f"{plan.number:04}" if plan.number else plan.purpose

@@ -285,7 +285,7 @@ def _ordered(rack: RackUnderTest, cards: Sequence[Card], rng: Random) -> list[Ca
 
 def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
     """Return a tick for each window, one after the other from a random tick on: a trial goes on
-    from the checkpoint before its first fault."""
+    from the snapshot before its first fault."""
     free = max(round(LEAD_S * rack.second), rack.last() - rack.first() - sum(windows))
     earliest = accumulate(windows, initial=rack.first() + rng.randint(0, free))
     return list(earliest)[:-1]

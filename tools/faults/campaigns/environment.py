@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rack.backplane.process import die_with_parent, is_alive, name_process, readable
+from rack.backplane.process import COPY, die_with_parent, is_alive, name_process, readable
 from rack.backplane.segment import SHM_FOLDER
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import descendants
@@ -36,7 +36,9 @@ DISKS = "disks"
 
 def children() -> set[int]:
     """Return the living processes that descend from this one."""
-    return {pid for pid in descendants(os.getpid()) if is_alive(pid)}
+    found = {pid for pid in descendants(os.getpid()) if is_alive(pid)}
+    # The snapshots of a crate that serves several racks end with that.
+    return {pid for pid in found if not _name(pid).startswith(COPY)}
 
 
 def left_behind(rack: str, before: set[int]) -> list[str]:

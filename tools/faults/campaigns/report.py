@@ -204,7 +204,7 @@ class CampaignReport:
         begun = [run for run in self.results.trials if run.start]
         skipped_s = sum(run.start for run in begun) * self.clock_ms * 1e-3
         spared = f"{len(begun)} trials, {skipped_s:.0f} simulated s of the faultless run"
-        yield "continued from a checkpoint", spared
+        yield "continued from a snapshot", spared
         yield "limits violated", f"{summary.limits_violated} (in any substep of any run)"
         yield "touches", summary.touches
         yield "left behind", f"{summary.left_behind} (processes, segments)"

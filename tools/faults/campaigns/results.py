@@ -19,16 +19,17 @@ from rack.tools.faults.campaigns.statistics import EventRate, rate
 from rack.tools.faults.campaigns.trial import Trial
 from rack.tools.faults.judge import FaultVerdict, Judgement, Seen, judge
 
-Ended = Literal["task done", "safely stopped", "not armed", "neither"]
+Ended = Literal["task done", "verdicts certain", "safely stopped", "not armed", "neither"]
 
 
 @dataclass(frozen=True)
 class TrialResult:
     """The part of a trial that is kept, for the report of its campaign.
 
-    `ended`: how the task ended; safely: with the arm at rest and no limit violated. `misses`: their
+    `ended`: how the task ended; safely: with the arm at rest and no limit violated; or that the
+    trial was ended before, since the verdict on each fault was certain. `misses`: their
     number by code; `stray_misses`: those that no fault explains. `unexplained`: false detections.
-    `shortfalls`: a line each; none in a good trial. `start`: the tick of the checkpoint from which
+    `shortfalls`: a line each; none in a good trial. `start`: the tick of the snapshot from which
     it was run, or 0, and then `whole` says why.
     """
 
@@ -207,6 +208,8 @@ def _ended(trial: Trial) -> Ended:
         return "not armed" if is_to_be_refused else "neither"
     if outcome is None or outcome.cause == "stopped":
         return "neither"
+    if trial.is_cut:
+        return "verdicts certain"
     if outcome.worked:
         return "task done"
     return "safely stopped" if trial.arm.is_at_rest and not trial.arm.violations else "neither"

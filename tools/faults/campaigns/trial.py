@@ -17,9 +17,9 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
-from rack.boards.errors import BoardError, CheckpointError, ConfigError
+from rack.boards.errors import BoardError, ConfigError
 from rack.boards.events import Event, Outcome
-from rack.tools.faults.campaigns.base import BaseRun, Start
+from rack.tools.faults.campaigns.base import BaseRack, Start
 from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import (
@@ -31,7 +31,7 @@ from rack.tools.faults.ending import (
     levels_of,
     strikes,
 )
-from rack.tools.faults.judge import Circumstances
+from rack.tools.faults.judge import Circumstances, certain_from
 
 MAX_LENGTH = 4
 GRACE_S = 60.0
@@ -45,6 +45,8 @@ STUCK_S = 20.0
 """Longest time from a request to stop to the end."""
 LOOK_S = 0.001
 """Time between two looks at the tick in lockstep, which has no grid to sleep on."""
+HELD_S = 0.004
+"""Time between two looks at a rack that may be held."""
 AGAIN_S = 2.0
 """Simulated time of the run that follows a refused launch: each task has its cycles."""
 RETRY_S = 0.02
@@ -130,7 +132,8 @@ class Trial:
     `again`: how a run without its faults ended, right after it was refused. `left` is everything
     that it left behind. `levels` holds the last state of each level; `is_late`: one gave up because
     it could not meet a time. `run`: what the judge must know of it; None where it was refused.
-    `events` are those of a whole run, wherever it has its `start`.
+    `events` are those of a whole run, wherever it has its `start`. `is_cut`: it was ended when the
+    verdict on each of its faults was certain.
     """
 
     plan: Plan
@@ -146,6 +149,7 @@ class Trial:
     is_late: bool = False
     again: Outcome | None = None
     start: Start = field(default_factory=Start)
+    is_cut: bool = False
 
 
 def run_trial(
@@ -155,54 +159,55 @@ def run_trial(
     ticks: int,
     seconds: float | None,
     *,
-    base: BaseRun | None = None,
+    base: BaseRack | None = None,
     crate: WarmCrate | None = None,
 ) -> Trial:
     """Run a plan, and return its outcome, events and strikes.
 
     `ticks` is the length of a faultless run; `seconds` of simulated time, for a rack that no task
-    ends. It starts at a checkpoint of `base` if it can. A `crate` saves time, as for a `Rack`.
+    ends. It goes on from a snapshot of `base` if it can, which is in that `crate`, and then ends as
+    soon as the verdict on each of its faults is certain.
     Raises `ConfigError` for a plan that does not fit the config.
     """
-    start = Start(whole="as asked") if base is None else base.start_of(plan)
+    start = Start(whole="as asked") if base is None else base.start_of(plan, crate, seconds)
     before = children()
     started = time.monotonic()
-    rack = Rack(plan.config(config, rack_name), crate=crate, keeping=start.keeping)
+    snapshots = None if base is None else base.snapshots_for(plan)
+    rack = Rack(
+        plan.config(config, rack_name),
+        crate=crate,
+        snapshots=snapshots,
+        continues=start.continues,
+    )
     refused = ""
+    is_cut = False
     levels = ""
     late = False
     arm = ArmEnd()
     found: tuple[Strike, ...] = ()
     try:
         with rack:
+            start = start.at(rack.begins_at)
             rack.follow(start.events)
             killer = Killer(rack.segment, plan.kills)
-            _watch(rack, killer, ticks, seconds)
             joints = config.robot.joints if config.robot is not None else ()
+            certainty = None
+            if start.continues is not None and not plan.kills:
+                certainty = Certainty(rack, joints, _circumstances(rack, plan))
+            _watch(rack, killer, ticks, seconds, certainty)
+            is_cut = certainty is not None and certainty.is_reached
             found = (*strikes(rack.segment, joints), *killer.done)
             arm = arm_of(rack.segment)
             levels = levels_of(rack.segment)
             late = is_late(rack.segment)
     except ConfigError:
         raise
-    except CheckpointError as error:
-        if base is None or not start.tick:
-            raise
-        base.give_up(str(error))
-        return run_trial(config, plan, rack_name, ticks, seconds, base=base, crate=crate)
     except (BackplaneError, BoardError) as error:
         refused = str(error)
     again = None
     run = None
     if not refused:
-        run = Circumstances(
-            layout=rack.segment.layout,
-            offset_ns=time.time_ns() - time.monotonic_ns(),
-            is_lockstep=plan.lockstep,
-            restart_s=config.supervision.restart_s(plan.lockstep),
-            has_failed=rack.outcome is not None and not rack.outcome.worked,
-            moving=tuple(motion.body for motion in config.scene.motion),
-        )
+        run = _circumstances(rack, plan)
     elif plan.faults:
         sound = replace(plan, faults=())
         again = run_trial(config, sound, rack_name, ticks, AGAIN_S, crate=crate).outcome
@@ -220,10 +225,62 @@ def run_trial(
         is_late=late,
         again=again,
         start=start,
+        is_cut=is_cut,
     )
 
 
-def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None) -> None:
+def _circumstances(rack: Rack, plan: Plan) -> Circumstances:
+    """Return what the judge must know of a run."""
+    config = rack.config
+    return Circumstances(
+        layout=rack.segment.layout,
+        offset_ns=time.time_ns() - time.monotonic_ns(),
+        is_lockstep=plan.lockstep,
+        restart_s=config.supervision.restart_s(plan.lockstep),
+        has_failed=rack.outcome is not None and not rack.outcome.worked,
+        moving=tuple(motion.body for motion in config.scene.motion),
+    )
+
+
+class Certainty:
+    """Ends a trial in lockstep as soon as nothing that follows can change the verdict on a fault.
+
+    It holds the rack before the ticks at which that may be so. `is_reached`: it has ended the
+    trial.
+    """
+
+    def __init__(self, rack: Rack, joints: Sequence[str], run: Circumstances) -> None:
+        self.is_reached = False
+        self._rack = rack
+        self._joints = joints
+        self._run = run
+        self._words = rack.segment.words
+        self._hold(max(0, rack.begins_at))
+
+    def look(self) -> None:
+        """Judge, if the rack is held; then let it go on, or end."""
+        tick = self._words[System.HELD] - 1
+        if tick < 0 or self.is_reached:
+            return
+        struck = strikes(self._rack.segment, self._joints)
+        certain_at = certain_from(struck, self._rack.events, self._run, tick)
+        if certain_at is None:
+            # It runs to its end.
+            self._words[System.HOLD_AT] = 0
+        elif certain_at > tick:
+            self._hold(certain_at)
+        else:
+            self.is_reached = True
+            self._words[System.STOP_TICK] = max(tick, 1)
+            self._words[System.HOLD_AT] = 0
+
+    def _hold(self, tick: int) -> None:
+        self._words[System.HOLD_AT] = tick + 1
+
+
+def _watch(
+    rack: Rack, killer: Killer, ticks: int, seconds: float | None, certainty: Certainty | None
+) -> None:
     """Watch a run to its end, and kill its boards as planned; no run lasts for ever."""
     rack.start(seconds)
     words = rack.segment.words
@@ -232,8 +289,10 @@ def _watch(rack: Rack, killer: Killer, ticks: int, seconds: float | None) -> Non
     seen = -1
     deadline = 0.0
     stopped = False
-    while rack.watch(killer.due_in_s()):
+    while rack.watch(killer.due_in_s() if certainty is None else HELD_S):
         killer.advance()
+        if certainty is not None:
+            certainty.look()
         if words[System.TICK] != seen and not stopped:
             seen = words[System.TICK]
             deadline = time.monotonic() + STILL_S

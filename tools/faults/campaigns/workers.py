@@ -1,28 +1,23 @@
 """Worker processes make the trials, as many at once as there are cores; each trial has its own rack
-and leaves a file.
-
-As a program, `python -m rack.tools.faults.campaigns.workers FD PARENT`: one such process; it ends
-with its parent.
-"""
+and leaves a file."""
 
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, Pipe, wait
+from multiprocessing import active_children, get_context
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any
 
 from rack.backplane.process import die_with_parent
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.faults.campaigns.base import BaseRun
+from rack.tools.faults.campaigns.base import BaseRack
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.results import keep
 from rack.tools.faults.campaigns.trial import run_trial
@@ -46,14 +41,22 @@ class Workers:
     """Processes that make trials. Use it as a context; they end with it, and with the process that
     made it.
 
-    `base`: the folder of the run from which trials go on.
+    `whole`: no trial goes on from a snapshot of the faultless rack.
     """
 
-    def __init__(self, config: RackConfig, base: Path | None = None) -> None:
-        self._order = config, base
-        self._cores = sorted(os.sched_getaffinity(0))
-        self._lines: list[Connection] = []
-        self._processes: list[subprocess.Popen[bytes]] = []
+    def __init__(self, config: RackConfig, whole: bool = False) -> None:
+        context = get_context("spawn")
+        cores = sorted(os.sched_getaffinity(0))
+        numbers = context.SimpleQueue()
+        for core in cores:
+            numbers.put(core)
+        self._most = len(cores)
+        self._pool = ProcessPoolExecutor(
+            self._most,
+            mp_context=context,
+            initializer=_begin,
+            initargs=(config, whole, numbers, os.getpid()),
+        )
 
     def __enter__(self) -> Workers:
         return self
@@ -61,90 +64,71 @@ class Workers:
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if kind is not None:
             self._stop()
-        # Workers without a trial end with their lines, and with them their crates.
-        for line in self._lines:
-            line.close()
-        for process in self._processes:
-            process.wait()
+        # Workers without a trial end with the pool, and with them their crates.
+        self._pool.shutdown(cancel_futures=True)
 
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
         """Make trials and yield each that is done and has its file; a signal ends those in
         progress, which leave none.
 
-        Trials that are `alone` have the machine for themselves. Others share its cores: many get
-        one each, where their boards hand messages to each other sooner; a single one gets all.
+        Trials that are `alone` have the machine for themselves. Others get a core each, where their
+        boards hand messages to each other sooner.
         """
         waiting = list(jobs)
-        busy = dict[Any, TrialJob]()
-        shares = 1 if alone else min(len(self._cores), max(1, len(waiting)))
-        cores = [set(self._cores[first::shares]) for first in range(shares)]
+        busy = dict[Future[str], TrialJob]()
+        most = 1 if alone else self._most
         while (waiting or busy) and not INTERRUPT.number:
-            lines = self._some(min(len(cores), len(waiting) + len(busy)))
-            for line, its_cores in zip(lines, cores, strict=False):
-                if line not in busy and waiting:
-                    busy[line] = waiting.pop(0)
-                    line.send((busy[line], its_cores))
-            ready: list[Any] = wait(list(busy), LOOK_S)
-            for line in ready:
-                yield self._done(line, busy.pop(line))
+            while waiting and len(busy) < most:
+                job = waiting.pop(0)
+                busy[self._pool.submit(_make, job)] = job
+            done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
+            for future in done:
+                job = busy.pop(future)
+                try:
+                    wrong = future.result()
+                except BrokenProcessPool:
+                    wrong = "the process that made it ended"
+                if wrong:
+                    raise Failure(f"trial {job.plan.number}: {wrong}")
+                yield job
         if busy:
             self._stop()
-
-    def _done(self, line: Any, job: TrialJob) -> TrialJob:
-        try:
-            wrong = line.recv()
-        except (EOFError, ConnectionResetError):
-            wrong = "the process that made it ended"
-        if wrong:
-            raise Failure(f"trial {job.plan.number}: {wrong}")
-        return job
 
     def _stop(self) -> None:
         """End the workers. What is left of a trial in progress is of no use: its rack is removed,
         not stopped."""
-        for process in self._processes:
+        for process in active_children():
             process.terminate()
 
-    def _some(self, count: int) -> list[Connection]:
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-        while len(self._lines) < count:
-            here, there = Pipe()
-            command = [
-                sys.executable,
-                "-P",
-                "-m",
-                "rack.tools.faults.campaigns.workers",
-                str(there.fileno()),
-                str(os.getpid()),
-            ]
-            # In a process group of its own: Ctrl-C on the terminal reaches only the campaign, which
-            # stops its workers.
-            process = subprocess.Popen(
-                command, env=environment, pass_fds=[there.fileno()], process_group=0
-            )
-            self._processes.append(process)
-            there.close()
-            here.send(self._order)
-            self._lines.append(here)
-        return self._lines[:count]
 
+class TrialMaker:
+    """What makes trials in one worker: its core, its crate, and the faultless rack in that."""
 
-class Crates:
-    """Keeps a crate for trials in lockstep. In real time each has its own: there a crate that has
-    served would be another machine."""
-
-    def __init__(self) -> None:
+    def __init__(self, config: RackConfig, whole: bool, core: int) -> None:
+        self._config = config
+        self._whole = whole
+        self._core = core
+        self._cores = os.sched_getaffinity(0)
         self._crate: WarmCrate | None = None
+        self._base = BaseRack(config, f"camp-{os.getpid()}x")
 
-    def __enter__(self) -> Crates:
-        return self
+    def make(self, job: TrialJob) -> None:
+        """Make a trial, and keep its result."""
+        is_lockstep = job.plan.lockstep
+        os.sched_setaffinity(0, {self._core} if is_lockstep else self._cores)
+        crate = self._ready(is_lockstep)
+        base = None if self._whole else self._base
+        name = self._base.name
+        trial = run_trial(
+            self._config, job.plan, name, job.ticks, job.seconds, base=base, crate=crate
+        )
+        if crate is not None and self._base.snapshots_for(job.plan) and not self._whole:
+            self._base.keep(crate, trial.events)
+        keep(trial, job.path)
 
-    def __exit__(self, *error: object) -> None:
-        if self._crate is not None:
-            self._crate.end()
-
-    def ready(self, lockstep: bool) -> WarmCrate | None:
-        """Return the crate for the next trial; None: the rack starts its own."""
+    def _ready(self, lockstep: bool) -> WarmCrate | None:
+        """Return the crate for the next trial; None: the rack starts its own, as in real time,
+        where a crate that has served would be another machine."""
         if self._crate is not None and (self._crate.is_over or not lockstep):
             self._crate.end()
             self._crate = None
@@ -153,32 +137,22 @@ class Crates:
         return self._crate
 
 
-def main() -> None:
-    """Make the trials that come over a line, one after the other."""
+_maker: TrialMaker
+
+
+def _begin(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int) -> None:
+    """Begin as a worker: it ends with its parent, and Ctrl-C on the terminal reaches only that."""
+    global _maker
+    os.setpgid(0, 0)
     INTERRUPT.catch()
-    line = Connection(int(sys.argv[1]))
-    parent = int(sys.argv[2])
     die_with_parent(parent)
-    with suppress(EOFError), Crates() as crates:
-        config, folder = line.recv()
-        base = None if folder is None else BaseRun(config, folder)
-        while True:
-            job, cores = line.recv()
-            os.sched_setaffinity(0, cores)
-            crate = crates.ready(job.plan.lockstep)
-            try:
-                name = f"camp-{os.getpid()}x"
-                trial = run_trial(
-                    config, job.plan, name, job.ticks, job.seconds, base=base, crate=crate
-                )
-                if base is not None and job.plan.purpose == "nominal":
-                    base.keep(trial.events)
-                keep(trial, job.path)
-            except Exception as error:  # whatever it is, the campaign must hear of it
-                line.send(f"{type(error).__name__}: {error}")
-            else:
-                line.send("")
+    _maker = TrialMaker(config, whole, cores.get())
 
 
-if __name__ == "__main__":
-    main()
+def _make(job: TrialJob) -> str:
+    """Make a trial; return what went wrong, if anything."""
+    try:
+        _maker.make(job)
+    except Exception as error:  # whatever it is, the campaign must hear of it
+        return f"{type(error).__name__}: {error}"
+    return ""

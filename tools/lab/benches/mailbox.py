@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane import semaphores
 from rack.backplane.layout import PROTOCOLS, InterruptSpec, Layout, MailboxSpec, Protocol, TaskSpec
 from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.mailbox.mailbox import Reader
@@ -170,9 +169,7 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
     with ExitStack() as names:
         # Before they exist: an interrupt may come at any time.
         names.callback(unlink, rack)
-        names.callback(semaphores.unlink, layout)
         segment = Segment.create(layout, "")
-        semaphores.create(layout)
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
         readers = [

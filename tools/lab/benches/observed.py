@@ -36,7 +36,6 @@ class Recorded(NamedTuple):
 
 UNVIEWED = (
     "record.keep=600",
-    "record.checkpoint_s=0",
     "supervision.max_missed_fraction=1",
 )
 """Settings of a rack whose recording nobody looks at: a flight recorder makes no viewer's file,

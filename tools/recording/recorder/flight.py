@@ -1,5 +1,5 @@
 """The flight recorder: a recorder whose spool is in stretches, and forgets those that are old and
-near no occasion, with the checkpoints that lead to none of the others."""
+near no occasion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.checkpoint.format import checkpoints
 from rack.tools.recording.occasions import Occasions, Retention, TickRange
 from rack.tools.recording.run_files import Tally
 from rack.tools.recording.spool import Spool, StretchHead
@@ -21,8 +20,7 @@ STRETCH_S = 1.0
 
 
 class Sealed(NamedTuple):
-    """A stretch that is finished: its file, and between which ticks its rows are, at the most; or a
-    checkpoint, with the ticks up to the next one."""
+    """A stretch that is finished: its file, and between which ticks its rows are, at the most."""
 
     path: Path
     ticks: TickRange
@@ -35,9 +33,7 @@ class FlightRecorder:
     restarts its recorder three times at the most.
     """
 
-    def __init__(
-        self, segment: Segment, retention: Retention, spool: Spool, tally: Tally, folder: Path
-    ) -> None:
+    def __init__(self, segment: Segment, retention: Retention, spool: Spool, tally: Tally) -> None:
         self._retention = retention
         self._spool = spool
         self._tally = tally
@@ -45,10 +41,6 @@ class FlightRecorder:
         self._occasions = Occasions(segment)
         self._length = round(STRETCH_S * 1e9 / segment.layout.clock_ns)
         self._sealed: deque[Sealed] = deque()
-        self._folder = folder
-        # Those of an earlier recorder stay, as its stretches do.
-        self._newest = max(checkpoints(folder).items(), default=None)
-        self._left: deque[Sealed] = deque()
         self._windows: list[TickRange] = []
         self._began = 0
         if tally.number:
@@ -98,23 +90,11 @@ class FlightRecorder:
         self._windows.append(window)
 
     def _forget(self, before: int) -> None:
-        """Remove the stretches that ended before a tick and are in no window, and checkpoints
-        likewise."""
-        self._seal_checkpoints()
-        for sealed in (self._sealed, self._left):
-            while sealed and sealed[0].ticks.last < before:
-                path, (first, last) = sealed.popleft()
-                if not any(one.first <= last and first <= one.last for one in self._windows):
-                    path.unlink(missing_ok=True)
-        begins = [sealed[0].ticks.first for sealed in (self._sealed, self._left) if sealed]
-        begins += [self._began if self._newest is None else self._newest[0]]
-        self._windows = [one for one in self._windows if one.last >= min(begins)]
-
-    def _seal_checkpoints(self) -> None:
-        """Find the checkpoints that others have followed: only the newest leads to what comes."""
-        for tick, path in checkpoints(self._folder).items():
-            before = self._newest
-            if before is None or tick > before[0]:
-                if before is not None:
-                    self._left.append(Sealed(before[1], TickRange(before[0], tick - 1)))
-                self._newest = tick, path
+        """Remove the stretches that ended before a tick and are in no window."""
+        sealed = self._sealed
+        while sealed and sealed[0].ticks.last < before:
+            path, (first, last) = sealed.popleft()
+            if not any(one.first <= last and first <= one.last for one in self._windows):
+                path.unlink(missing_ok=True)
+        begins = sealed[0].ticks.first if sealed else self._began
+        self._windows = [one for one in self._windows if one.last >= begins]

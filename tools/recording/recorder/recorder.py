@@ -198,7 +198,7 @@ class Recorder:
         self._flight = (
             None
             if retention is None
-            else FlightRecorder(segment, retention, self._spool, self._tally, folder)
+            else FlightRecorder(segment, retention, self._spool, self._tally)
         )
         for name, taken in self._tally.taken.items():
             self._rings[name].resume(taken)

@@ -9,32 +9,20 @@ what differs is the state of the level or its parameters.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.mailbox.history import chains
-from rack.boards.checkpoint.format import checkpoints
-from rack.boards.wiring import Keeping
 from rack.tools.console.answer import Failure, as_failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.live.continued import (
-    attributes_in,
-    begun_before,
-    gone_on,
-    state_at,
-    unlike_in,
-)
-from rack.tools.live.launch import Beginning
+from rack.tools.live.continued import RunAgain, unlike_in
 from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, unlike_values
-from rack.tools.recording.entries import commands_from
-from rack.tools.recording.origin import continued_at
 from rack.tools.recording.recording import Recording
 
+TIMES = 2
+"""How often a cycle is repeated."""
 Because = Literal["state", "code", "chance"]
 
 
@@ -71,18 +59,12 @@ def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
         if run.rack_config.clock.mode != "lockstep":
             raise Failure(f"{run.folder} ran in real time")
     until = found.unlike[cycle.mailbox].visible_at + 1
-    one, other = found.runs
-    parents = {one: other, other: one}
     with INTERRUPT.raising(), as_failure():
-        again = {run: _again(run, parents[run], cycle, until, shows=True) for run in found.runs}
-        others = [run for run in found.runs if cycle.mailbox in again[run].unlike]
-        # Nothing is kept before it this time: that takes long enough for a level that looks at a
-        # clock.
-        is_chance = any(
-            _again(run, parents[run], cycle, until, shows=False).wrote != again[run].wrote
-            for run in others
-        )
-    layout = one.layout
+        repeats = {run: _again(run, cycle, until) for run in found.runs}
+    again = {run: what for run, (what, _) in repeats.items()}
+    others = [run for run in found.runs if cycle.mailbox in again[run].unlike]
+    is_chance = not all(repeats[run][1] for run in others)
+    layout = found.runs[0].layout
     strays = {
         str(run.folder): tuple(
             name for name in again[run].unlike if layout.mailbox(name).writer != cycle.writer
@@ -98,43 +80,15 @@ def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
     )
 
 
-def _again(
-    run: Recording, parent: Recording, cycle: UnlikeCycle, until: int, *, shows: bool
-) -> _Again:
-    """Repeat a cycle of a run until what it writes is visible; with `shows`, with the attributes of
-    its level."""
-    asked = f"{run.folder} at tick {cycle.tick}"
-    attributes: Mapping[str, Any] = {}
-    with ExitStack() as stack:
-        begins = stack.enter_context(_beginning(run, parent, cycle.tick, asked))
-        path = Path(stack.enter_context(TemporaryDirectory(prefix="rack-")))
-        if shows:
-            kept = replace(begins.checkpoint or Keeping(), folder=path, at=cycle.tick, shows=True)
-            begins = replace(begins, checkpoint=kept)
-        rack = stack.enter_context(gone_on(run, begins, until, asked))
-        if shows:
-            attributes = attributes_in(path)[cycle.writer]
-        wrote = chains(rack.segment, until)[cycle.mailbox]
-        return _Again(attributes, wrote, tuple(unlike_in(run, rack.segment, until)))
-
-
-@contextmanager
-def _beginning(run: Recording, parent: Recording, tick: int, asked: str) -> Iterator[Beginning]:
-    """Yield what a run goes on from to the cycle: a branch without a checkpoint until then from the
-    other run, at the tick at which it branched off."""
-    branched_at = continued_at(run)
-    if branched_at is None or _has_checkpoint(run, tick):
-        yield begun_before(run, tick, asked)[1]
-        return
-    if continued_at(parent) is not None and not _has_checkpoint(parent, branched_at):
-        why = f"has no checkpoint before tick {tick}, and is no branch of {parent.folder}"
-        raise Failure(f"{run.folder} {why}")
-    with state_at(parent, branched_at) as state:
-        keeping = state.begins.checkpoint
-        assert keeping is not None, "a state that is kept"
-        keeping = replace(keeping, packages=run.rack_config.python_path)
-        yield replace(state.begins, checkpoint=keeping, requests=commands_from(run, branched_at))
-
-
-def _has_checkpoint(run: Recording, until: int) -> bool:
-    return any(at <= until for at in checkpoints(run.folder))
+def _again(run: Recording, cycle: UnlikeCycle, until: int) -> tuple[_Again, bool]:
+    """Repeat a cycle of a run until what it writes is visible; return what it did, and whether it
+    does that each time."""
+    with RunAgain(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
+        attributes = again.levels(cycle.tick)[cycle.writer]
+        found = []
+        for _ in range(TIMES):
+            with again.rack_at(until) as rack:
+                wrote = chains(rack.segment, until)[cycle.mailbox]
+                unlike = tuple(unlike_in(run, rack.segment, until))
+                found.append(_Again(attributes, wrote, unlike))
+    return found[0], len({one.wrote for one in found}) == 1

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from rack.backplane import semaphores
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import Message
@@ -58,9 +57,7 @@ class Bench:
 def bench(rack_name: str) -> Iterator[Bench]:
     plan = resolve(load("nist-state-table", [f"name={rack_name}", "clock.mode=lockstep"]))
     segment = Segment.create(plan.layout, "")
-    semaphores.create(plan.layout)
     yield Bench(segment, plan)
-    semaphores.unlink(plan.layout)
     unlink(segment.rack)
     segment.close()
 

@@ -55,12 +55,10 @@ class Trials:
     def __init__(self, ends: Callable[[Plan], TrialResult]) -> None:
         self.ends = ends
         self.made: list[Plan] = []
-        self.base: Path | None = None
+        self.whole = False
 
-    def __call__(self, config: object, base: Path | None) -> Self:
-        self.base = base
-        # It is there for the trials.
-        assert base is None or base.is_dir()
+    def __call__(self, config: object, whole: bool) -> Self:
+        self.whole = whole
         return self
 
     def __enter__(self) -> Self:
@@ -155,22 +153,17 @@ def test_trials_that_are_kept_are_not_made_again(make: MakeCampaign) -> None:
     path.write_text(json.dumps(found))
     third, once_more = make()
     third.run()
-    # What it goes on from is made again, too.
-    assert once_more.made == [trials.made[0], trials.made[1]]
+    assert once_more.made == [trials.made[1]]
 
 
-def test_trials_have_a_run_to_go_on_from_as_long_as_the_campaign_unless_they_are_whole(
-    make: MakeCampaign,
-) -> None:
+def test_it_is_the_same_campaign_whichever_way_its_trials_are_made(make: MakeCampaign) -> None:
     campaign, trials = make()
     campaign.run()
-    assert trials.base == campaign.folder.resolve() / module.BASE
-    assert not trials.base.exists()
-    # It is the same campaign, whichever way its trials are made.
+    assert not trials.whole
     whole, others = make(whole=True)
     (whole.folder / "trials" / "0001.json").unlink()
     whole.run()
-    assert others.base is None
+    assert others.whole
     assert others.made == [trials.made[1]]
 
 

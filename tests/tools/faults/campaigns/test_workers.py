@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
+import signal
+from dataclasses import replace
+from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
 
+from rack.backplane.process import is_alive
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
+from rack.tools.console.interrupt import INTERRUPT, descendants
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
+from tests.processes import FORKS, forked, wait_until
 
 pytestmark = pytest.mark.slow
 SECONDS = 0.2
@@ -27,20 +33,33 @@ def job(folder: Path, number: int, **more: object) -> TrialJob:
 
 
 def test_each_trial_leaves_a_file_and_no_process_stays(config: RackConfig, tmp_path: Path) -> None:
-    jobs = [job(tmp_path, number) for number in range(3)]
+    jobs = [job(tmp_path, number) for number in range(4)]
     with Workers(config) as workers:
         done = list(workers.run(jobs, alone=False))
-        processes = list(workers._processes)
-        assert 1 <= len(processes) <= len(workers._cores)
-        # Each has a core of its own.
-        cores = [os.sched_getaffinity(process.pid) for process in processes]
-        assert cores == [{core} for core in workers._cores[: len(processes)]]
+        processes = {process.pid for process in active_children()}
+        assert 1 <= len(processes) <= len(os.sched_getaffinity(0))
         # The same processes make later trials.
-        done += list(workers.run([job(tmp_path, 3)], alone=True))
-        assert workers._processes == processes
-    assert sorted(one.plan.number for one in done) == [0, 1, 2, 3]
+        done += list(workers.run([job(tmp_path, 4)], alone=True))
+        assert {process.pid for process in active_children()} == processes
+    assert sorted(one.plan.number for one in done) == [0, 1, 2, 3, 4]
     assert all(one.path.is_file() for one in done)
-    assert [process.returncode is not None for process in processes] == [True] * len(processes)
+    assert not active_children()
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_workers_end_with_a_campaign_that_is_killed(config: RackConfig, tmp_path: Path) -> None:
+    endless = replace(job(tmp_path, 5), seconds=1e6)
+
+    def campaign() -> None:
+        with Workers(config) as workers:
+            list(workers.run([endless], alone=False))
+
+    with forked(campaign) as pid:
+        # A worker, its crate, and a board at least.
+        wait_until(lambda: len([*descendants(pid)]) > 3)
+        family = [*descendants(pid)]
+        os.kill(pid, signal.SIGKILL)
+        wait_until(lambda: not any(map(is_alive, family)))
 
 
 def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
@@ -52,3 +71,12 @@ def test_a_trial_that_cannot_be_made_ends_the_campaign_with_its_reason(
         pytest.raises(Failure, match=r"^trial 7: ConfigError: .*nobody"),
     ):
         list(workers.run([bad], alone=False))
+
+
+def test_after_a_signal_nothing_is_begun(
+    config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(INTERRUPT, "number", 2)
+    with Workers(config) as workers:
+        assert list(workers.run([job(tmp_path, 8)], alone=True)) == []
+        assert not active_children()

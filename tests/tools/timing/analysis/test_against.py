@@ -11,20 +11,19 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load
-from rack.tools.live.continued import branched, state_at
+from rack.tools.live.continued import RunAgain, branched
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
 from rack.tools.recording.checksums import checked_line, read_line
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.against import compared
 from rack.tools.timing.analysis.report import OtherRun
-from tests.boards.checkpoint.test_keeping import REMEMBERING
 from tests.boards.commanded_racks import COMMANDED, commands
+from tests.boards.remembering_racks import REMEMBERING
 from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
-SECONDS = 0.7
-CHECKPOINTS = "record.checkpoint_s=0.25"
+SECONDS = 1.0
 OWN_LEVEL = """
 from time import monotonic_ns
 import numpy as np
@@ -86,7 +85,7 @@ def run_in(folder: Path, rack_name: str) -> Run:
         script = folder / f"{name}-faults.toml"
         script.write_text(faults)
         given = str(script) if faults else None
-        config = load(file, [f"name={rack_name}", CHECKPOINTS, *settings], given)
+        config = load(file, [f"name={rack_name}", *settings], given)
         run_rack(config, SECONDS, folder / name, Display())
         return Recording(folder / name)
 
@@ -151,8 +150,8 @@ def test_of_a_branch_the_level_is_shown_at_the_tick_where_it_branches_off(
 ) -> None:
     _, one, _ = runs
     config = branched(one, ["board.wave.params.factor=2"], None)
-    with state_at(one, 150) as state:
-        run_rack(config, SECONDS, tmp_path / "two", Display(), begins=state.begins)
+    with RunAgain(one) as again:
+        run_rack(config, SECONDS, tmp_path / "two", Display(), begins=again.beginning(150))
     found = why(Recording(tmp_path / "two"), one)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"]) == (150, "wave.status")

@@ -1,0 +1,119 @@
+"""The attributes of a level as plain data, for people: its own, and of the objects in them what has
+changed since the level was built. Programs, configs and views of shared memory are left out."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from enum import Enum
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from rack.backplane.byte_lock import ByteLock
+from rack.backplane.layout import Layout
+from rack.backplane.message import Message, text_of
+from rack.backplane.segment import Segment
+from rack.boards.run.settings import attribute_names, has_attributes
+
+MOST = 24
+"""Numbers of an array, or items, that are shown; of larger ones the size."""
+DEPTH = 5
+"""Objects within objects, at most."""
+OMITTED = (ByteLock, Layout, Segment)
+"""Objects that are never shown."""
+_NOTHING = object()
+
+
+class ObjectAttributes(dict[str, Any]):
+    """The attributes of an object, unlike the items of a mapping."""
+
+
+class AttributeView:
+    """What a level shows of itself; make it when the level is built."""
+
+    def __init__(self, level: object) -> None:
+        self._level = level
+        self._built = _Reading().attributes(level, DEPTH)
+
+    def show(self) -> Mapping[str, Any]:
+        """Return its attributes by name, as JSON holds them: numbers, texts, lists, and objects as
+        dictionaries of theirs."""
+        now = _Reading().attributes(self._level, DEPTH)
+        shown = {
+            name: _changed(value, self._built.get(name))
+            if isinstance(value, ObjectAttributes)
+            else value
+            for name, value in now.items()
+        }
+        return {name: value for name, value in shown.items() if value is not _NOTHING}
+
+
+def _changed(now: Any, built: Any) -> Any:
+    """Return what is news in an object's attributes."""
+    if not isinstance(now, ObjectAttributes) or not isinstance(built, ObjectAttributes):
+        return _NOTHING if now == built else now
+    found = {name: _changed(value, built.get(name, _NOTHING)) for name, value in now.items()}
+    return {name: value for name, value in found.items() if value is not _NOTHING} or _NOTHING
+
+
+class _Reading:
+    """One look at objects, each at the first place that leads to it."""
+
+    def __init__(self) -> None:
+        self._seen: set[int] = set()
+
+    def attributes(self, thing: object, depth: int) -> ObjectAttributes:
+        """Return the attributes of an object as plain data."""
+        self._seen.add(id(thing))
+        names = attribute_names(thing)
+        plain = {name: self._plain(getattr(thing, name), depth) for name in names}
+        return ObjectAttributes(
+            (name, value) for name, value in plain.items() if value is not _NOTHING
+        )
+
+    def _plain(self, thing: Any, depth: int) -> Any:
+        match thing:
+            case Enum():
+                return thing.name.lower()
+            case bytes() | bytearray():
+                return thing.hex() if b"\x00" in thing else text_of(thing)
+            case float() if not isfinite(thing):
+                # JSON has no word for it.
+                return str(thing)
+            case None | bool() | str() | int() | float():
+                return thing
+            case Message():
+                return self._array(thing.record, depth)
+            case np.ndarray() | np.generic():
+                return self._array(thing, depth)
+            case Mapping() | list() | deque() | tuple() | set() | frozenset():
+                return self._items(thing, depth)
+        is_omitted = isinstance(thing, OMITTED) or not has_attributes(thing)
+        if is_omitted or id(thing) in self._seen or not depth:
+            return _NOTHING
+        return self.attributes(thing, depth - 1) or _NOTHING
+
+    def _array(self, array: Any, depth: int) -> Any:
+        """Return an array, a number of numpy, or a record."""
+        if array.size > MOST:
+            sizes = " x ".join(map(str, array.shape))
+            return f"{sizes} of {array.dtype.name}"
+        if array.shape:
+            return [self._array(row, depth) for row in array]
+        if array.dtype.names is None:
+            return self._plain(array.item(), depth)
+        return {name: self._array(array[name], depth) for name in array.dtype.names}
+
+    def _items(self, thing: Any, depth: int) -> Any:
+        if len(thing) > MOST:
+            return f"{len(thing)} items"
+        if isinstance(thing, Mapping):
+            found = {str(key): self._plain(value, depth) for key, value in thing.items()}
+            return {key: value for key, value in found.items() if value is not _NOTHING}
+        plain = [self._plain(item, depth) for item in thing]
+        return [
+            f"a {type(item).__name__}" if shown is _NOTHING else shown
+            for item, shown in zip(thing, plain, strict=True)
+        ]

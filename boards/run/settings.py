@@ -1,0 +1,86 @@
+"""Other settings for a level that goes on from a snapshot: it keeps all that has happened to it.
+
+A level of its class is built with the settings that it has, and one with those that it gets. What
+differs between the two, it takes over, unless it has changed that itself since it was built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from rack.levels.level import Executor, LevelContext, Planner
+
+_WHOLE = (BaseModel, LevelContext, ModuleType, memoryview, type)
+"""Values that are replaced as a whole, or not at all."""
+_NUMBERS = "biufc"
+"""Kinds of numpy's arrays whose elements are compared one by one."""
+
+
+def change_settings(level: Executor | Planner, context: LevelContext) -> None:
+    """Let a level go on with another context. Raises what its constructor raises."""
+    before, after = type(level)(level.context), type(level)(context)
+    try:
+        _Change().apply(level, before, after)
+    finally:
+        before.close()
+        after.close()
+    level.context = context
+
+
+class _Change:
+    """What differs between two objects, for a third one of their class."""
+
+    def __init__(self) -> None:
+        self._seen: set[int] = set()
+
+    def apply(self, live: object, before: object, after: object) -> None:
+        """Change the attributes of `live`."""
+        if id(live) in self._seen:
+            return
+        self._seen.add(id(live))
+        for name in attribute_names(before):
+            if hasattr(live, name) and hasattr(after, name):
+                now = getattr(live, name)
+                wanted = self._merged(now, getattr(before, name), getattr(after, name))
+                if wanted is not now:
+                    # Frozen records, too.
+                    object.__setattr__(live, name, wanted)
+
+    def _merged(self, now: Any, old: Any, new: Any) -> Any:
+        """Return a value after the change from `old` to `new`; objects are changed in place."""
+        if not type(now) is type(old) is type(new):
+            # None, perhaps, that has become an object.
+            return new if type(now) is type(old) and now == old else now
+        match now:
+            case np.ndarray():
+                if now.shape == old.shape == new.shape and now.dtype.kind in _NUMBERS:
+                    changes = (old != new) & (now == old)
+                    if changes.any():
+                        now[changes] = new[changes]
+            case dict() | list() if len(now) == len(old) == len(new):
+                for key in now if isinstance(now, dict) else range(len(now)):
+                    if isinstance(now, list) or (key in old and key in new):
+                        now[key] = self._merged(now[key], old[key], new[key])
+            case None | bool() | int() | float() | complex() | str() | bytes() | BaseModel():
+                return new if old != new and now == old else now
+            case _ if has_attributes(now):
+                self.apply(now, old, new)
+        return now
+
+
+def has_attributes(thing: object) -> bool:
+    """Say whether an object has attributes in Python, and is no function, class or config."""
+    is_whole = callable(thing) or isinstance(thing, _WHOLE)
+    return not is_whole and (hasattr(thing, "__dict__") or hasattr(type(thing), "__slots__"))
+
+
+def attribute_names(thing: object) -> Iterable[str]:
+    """Return the names of an object's attributes, those in slots too."""
+    slots = [getattr(kind, "__slots__", ()) for kind in type(thing).__mro__]
+    names = [name for found in slots for name in found if hasattr(thing, name)]
+    return [*getattr(thing, "__dict__", ()), *names]

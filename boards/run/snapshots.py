@@ -1,0 +1,133 @@
+"""Snapshots of a rack in lockstep: between two ticks, when every task has finished, each task and
+the clock fork a copy of themselves, and the clock copies the segment.
+
+The tasks fork at the same time, each on its core. A snapshot that falls into the outage of a board
+is taken once the board is back: a process that is not there cannot be copied.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from functools import partial
+
+from rack.backplane.clock.lockstep import LockstepDriver
+from rack.backplane.copies import copy_memory
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block, Run, System, TaskState
+from rack.boards.errors import UNKEPT, SnapshotError
+from rack.boards.run.attributes import AttributeView
+from rack.boards.run.copying import Copier
+from rack.boards.run.settings import change_settings
+from rack.boards.run.task import Task
+from rack.levels.level import Executor, Planner
+
+FIRST_COST_S = 0.03
+"""About the standstill for a snapshot, before one is taken."""
+REFUSED = -1
+"""Value of `Block.COPY` of a task that cannot be copied."""
+
+
+class TaskCopies:
+    """Forks a copy of one task, between two of its cycles, when the clock wants it."""
+
+    def __init__(
+        self, task: Task, level: Executor | Planner, copier: Copier, attention: int
+    ) -> None:
+        self._block = task.block
+        self._attention = attention
+        self._stopwatch = task.stopwatch
+        self._copier = copier
+        copier.attributes = AttributeView(level).show
+        copier.change_settings = partial(change_settings, level)
+
+    def __call__(self) -> None:
+        """Fork it, and go on; in the copy, go on when a rack does."""
+        block = self._block
+        try:
+            goes_on = self._copier.copy(block[Block.COPY] - 1)
+        except SnapshotError as error:
+            print(f"{UNKEPT}{error}", file=sys.stderr, flush=True)
+            block[Block.COPY] = REFUSED
+        else:
+            if goes_on:
+                block[Block.PID] = os.getpid()
+                block[Block.STATE] = TaskState.RUNNING
+                self._stopwatch.begin()
+                os.eventfd_write(self._attention, 1)
+            block[Block.COPY] = 0
+        self._stopwatch.notify_clock()
+
+
+class ClockCopies:
+    """Takes the snapshots of a rack, so that the standstill for them is one part in
+    `System.SNAPSHOT_PART` of lockstep's time; and one before the tick in `System.SNAPSHOT_AT`.
+
+    `cost_s`: the standstill for the last one.
+    """
+
+    def __init__(self, segment: Segment, driver: LockstepDriver, copier: Copier) -> None:
+        self.cost_s = FIRST_COST_S
+        self._segment = segment
+        self._driver = driver
+        self._copier = copier
+        self._not_before_s = 0.0
+        self._taken_at = -sys.maxsize
+
+    def __call__(self, tick: int) -> int:
+        """Take a snapshot before `tick`, if one is due and every process is there; return the next
+        tick before which one is."""
+        words = self._segment.words
+        wanted = words[System.SNAPSHOT_AT] - 1
+        part, every = words[System.SNAPSHOT_PART], words[System.SNAPSHOT_EVERY]
+        is_due = (every > 0 and tick >= self._taken_at + every) or (
+            part > 0 and time.monotonic() >= self._not_before_s
+        )
+        if tick == wanted or is_due:
+            tasks = self._driver.tasks
+            self._driver.settle()
+            are_there = [task.is_settled() and not task.is_lost | task.is_stopped for task in tasks]
+            if all(are_there) and self._take(tick):
+                # What the rack wants that goes on from here.
+                return self(tick)
+        ahead = wanted if wanted > tick else sys.maxsize
+        return min(ahead, max(self._taken_at + every, tick + 1)) if every else ahead
+
+    def _take(self, tick: int) -> bool:
+        """Take a snapshot; return whether this is a copy in it that goes on."""
+        started_s = time.monotonic()
+        tasks = self._driver.tasks
+        for task in tasks:
+            task.block[Block.COPY] = tick + 1
+            task.wake()
+        for task in tasks:
+            self._driver.await_state(task, partial(_is_copied, task.block))
+        if any(task.block[Block.COPY] for task in tasks):
+            # One refuses, and will.
+            for task in tasks:
+                task.block[Block.COPY] = 0
+            self._not_before_s = float("inf")
+            return False
+        self._taken_at = tick
+        memory = copy_memory(self._segment)
+        try:
+            goes_on = self._copier.copy(tick, memory)
+        except SnapshotError as error:
+            print(f"{UNKEPT}{error}", file=sys.stderr, flush=True)
+            goes_on = False
+        os.close(memory)
+        words = self._segment.words
+        if goes_on:
+            words[System.CLOCK_PID] = os.getpid()
+            words[System.EPOCH_NS] = time.monotonic_ns()
+            words[System.STATE] = Run.RUNNING
+        now_s = time.monotonic()
+        if not goes_on:
+            self.cost_s = now_s - started_s
+        self._not_before_s = now_s + self.cost_s * words[System.SNAPSHOT_PART]
+        return goes_on
+
+
+def _is_copied(block: memoryview) -> bool:
+    return block[Block.COPY] <= 0

@@ -1,0 +1,123 @@
+"""From random ticks a rack goes on to its own digest: in the middle of motions, plans, faults,
+restarts and holds; and so does every shipped rack."""
+
+from __future__ import annotations
+
+import random
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from rack.boards import Rack
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.line import WarmCrate
+from rack.boards.events import Event
+from rack.boards.wiring import Continuation, SnapshotPolicy
+from rack.tools.lab.benches.observed import record
+from rack.tools.live.continued import RunAgain
+from rack.tools.live.display import Display
+from rack.tools.live.launch import run_rack
+from rack.tools.recording.recording import Recording
+from tests import golden
+
+SEED = 43
+SECONDS = 7.0
+COUNT = 25
+"""Of each of four runs."""
+HOLDS = (
+    "command=[{ level = 'task', what = 'hold', at = 2.0 }, { level = 'task', what = 'resume', at ="
+    " 3.0 }, { level = 'servo', what = 'hold', at = 4.5 }, { level = 'servo', what = 'resume', at ="
+    " 5.2 }]"
+)
+RUNS = {
+    "plain": ((), None),
+    "restarts": ((), "kill-each-board"),
+    "faults": ((), "bad-sensors"),
+    "holds": ((HOLDS,), None),
+}
+WITHOUT = ("chimera", "condor", "ibm", "penn")
+"""Racks with programs on the host side, whose state nobody can copy: these are repeated with what
+they sent."""
+HOSTED_S = 3.0
+OF_SHIPPED = 10
+
+
+def losses_in(events: Sequence[Event]) -> tuple[tuple[str, int], ...]:
+    return tuple((event.board, event.tick) for event in events if event.kind == "died")
+
+
+def strays(config: RackConfig, seconds: float | None, count: int, expected: str = "") -> list[int]:
+    """Return those of `count` random ticks from which a rack does not go on to its digest."""
+    with WarmCrate() as crate:
+        with Rack(config, crate=crate) as plain:
+            outcome = plain.run(seconds)
+        assert not expected or outcome.digest == expected
+        ticks = random.Random(SEED).sample(range(outcome.ticks), min(count, outcome.ticks))
+        known = (len(config.fault), len(config.command), losses_in(plain.events))
+        found = []
+        for nth, tick in enumerate(ticks):
+            wanted = SnapshotPolicy(part=10, at=tick)
+            begins = Continuation(tick, *known) if nth else None
+            # It has a snapshot there, and goes on to its end.
+            with Rack(config, crate=crate, snapshots=wanted, continues=begins) as rack:
+                if rack.run(seconds).digest != outcome.digest:
+                    found.append(tick)
+            with Rack(config, crate=crate, continues=Continuation(tick, *known)) as rack:
+                again = rack.run(seconds)
+            if (again.digest, again.ticks) != (outcome.digest, outcome.ticks):
+                found.append(tick)
+    return found
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("run", RUNS)
+def test_nasrem_goes_on_from_random_ticks(run: str, rack_name: str) -> None:
+    settings, faults = RUNS[run]
+    config = load("nasrem", [f"name={rack_name}", "clock.mode=lockstep", *settings], faults)
+    assert strays(config, SECONDS, COUNT) == []
+
+
+@pytest.mark.slow
+def test_a_rack_with_restarts_and_holds_goes_on_from_some_ticks(rack_name: str) -> None:
+    settings = [f"name={rack_name}", "clock.mode=lockstep", HOLDS]
+    assert strays(load("nasrem", settings, "kill-each-board"), 4.0, 2) == []
+
+
+def rack_of(run: str, name: str) -> tuple[RackConfig, float | None]:
+    """Return the config of a golden run, as the rack `name`, and how long it lasts."""
+    words = shlex.split(run)
+    options = dict(zip(words[1::2], words[2::2], strict=True))
+    place = golden.FILE.parents[1] / words[0]
+    settings = [f"name={name}", "clock.mode=lockstep", *options.get("--set", "").split()]
+    found = place if place.is_file() else words[0]
+    seconds = options.get("--seconds")
+    config = load(found, settings, options.get("--faults"))
+    return config, None if seconds is None else float(seconds)
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("run", [run for run in golden.RUNS if not run.startswith(WITHOUT)])
+def test_a_shipped_rack_goes_on_from_random_ticks(run: str, rack_name: str) -> None:
+    config, seconds = rack_of(run, rack_name)
+    assert strays(config, seconds, OF_SHIPPED, golden.read()["digests"][run]) == []
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(480)
+@pytest.mark.parametrize("system", WITHOUT)
+def test_a_shipped_rack_with_host_programs_goes_on_with_what_they_sent(
+    system: str, rack_name: str, tmp_path: Path
+) -> None:
+    config, _ = rack_of(system, rack_name)
+    one = record(config, HOSTED_S, tmp_path / "one")
+    ends = one.result.outcome
+    with RunAgain(Recording(tmp_path / "one")) as again:
+        for tick in random.Random(SEED).sample(range(ends.ticks), OF_SHIPPED):
+            folder = tmp_path / str(tick)
+            result = run_rack(config, HOSTED_S, folder, Display(), begins=again.beginning(tick))
+            assert result.outcome.digest == ends.digest, tick

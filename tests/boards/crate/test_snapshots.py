@@ -1,0 +1,314 @@
+"""A rack in lockstep goes on from each of its snapshots, any number of times, to the same
+digest."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.backplane.process import children_of, is_alive, readable
+from rack.backplane.words import System
+from rack.boards import Rack
+from rack.boards.config.schema import RackConfig
+from rack.boards.crate.clean import remove_dead
+from rack.boards.crate.line import WarmCrate
+from rack.boards.errors import UNKEPT, SnapshotError
+from rack.boards.events import Event, Outcome
+from rack.boards.faults.config import FaultConfig
+from rack.boards.wiring import Continuation, SnapshotPolicy
+from tests.boards.conftest import LOOSE, MakeConfig
+from tests.boards.remembering_racks import REMEMBERING
+from tests.processes import BOUND_S, FORKS, forked, wait_until
+
+pytestmark = pytest.mark.slow
+SECONDS = 1.0
+OFTEN = SnapshotPolicy(part=1)
+"""About half of the time goes into snapshots."""
+
+
+@pytest.fixture
+def crate() -> Iterator[WarmCrate]:
+    with WarmCrate() as crate:
+        yield crate
+
+
+def taken(
+    config: RackConfig, crate: WarmCrate, snapshots: SnapshotPolicy = OFTEN
+) -> tuple[Outcome, list[Event]]:
+    """Run a rack that takes snapshots."""
+    with Rack(config, crate=crate, snapshots=snapshots) as rack:
+        return rack.run(SECONDS), rack.events
+
+
+def taken_at(config: RackConfig, crate: WarmCrate, *ticks: int) -> Outcome:
+    """Run a rack so often that it has a snapshot at each of these ticks, in this order."""
+    for tick in ticks:
+        begins = Continuation(tick, faults=len(config.fault)) if tick != ticks[0] else None
+        wanted = SnapshotPolicy(part=0, at=tick)
+        with Rack(config, crate=crate, snapshots=wanted, continues=begins) as rack:
+            outcome = rack.run(SECONDS)
+    return outcome
+
+
+def continued(
+    config: RackConfig,
+    crate: WarmCrate,
+    tick: int,
+    known: RackConfig | None = None,
+    seconds: float | None = SECONDS,
+    **losses: Any,
+) -> Outcome:
+    """Go on from the last snapshot at a tick or before, of a run of `known` or the same config."""
+    begins = Continuation(tick, faults=len((known or config).fault), **losses)
+    with Rack(config, crate=crate, continues=begins) as rack:
+        return rack.run(seconds)
+
+
+def ticks_on(crate: WarmCrate) -> list[int]:
+    """Return the ticks of all snapshots."""
+    found = [crate.show(1 << 40, "").tick]
+    while found[-1] > 0:
+        found.append(crate.show(found[-1] - 1, "").tick)
+    return [tick for tick in found[::-1] if tick >= 0]
+
+
+def faulty(config: RackConfig, *faults: dict[str, Any]) -> RackConfig:
+    """Return the config with these faults."""
+    return config.model_copy(update={"fault": tuple(FaultConfig(**fault) for fault in faults)})
+
+
+@pytest.mark.parametrize("settings", [(), LOOSE, ("protocol.default=lock",)])
+def test_a_run_goes_on_from_each_snapshot_to_the_same_digest(
+    config: MakeConfig, crate: WarmCrate, settings: Sequence[str]
+) -> None:
+    rack = config(*settings)
+    with Rack(rack) as plain:
+        expected = plain.run(SECONDS)
+    ticks = (0, *sorted(random.Random(1).sample(range(1, 400), 5)))
+    assert taken_at(rack, crate, *ticks).digest == expected.digest
+    assert ticks_on(crate) == [*ticks]
+    for tick in (*ticks[::-1], ticks[3], 399):
+        again = continued(rack, crate, tick)
+        assert (again.digest, again.ticks) == (expected.digest, expected.ticks), tick
+
+
+@pytest.mark.parametrize("level", ["Rememberer", "Holder"])
+def test_all_that_a_level_has_is_in_a_snapshot(
+    config: MakeConfig, crate: WarmCrate, level: str
+) -> None:
+    rack = config(text=REMEMBERING.replace("Rememberer", level))
+    with Rack(rack) as plain:
+        expected = plain.run(SECONDS)
+    for at in (210, 300):
+        taken(rack, crate, SnapshotPolicy(part=0, at=at))
+    for tick in (300, 210, 300, 210):
+        assert continued(rack, crate, tick).digest == expected.digest
+
+
+def test_what_goes_on_from_a_snapshot_has_snapshots_that_go_on(
+    config: MakeConfig, crate: WarmCrate
+) -> None:
+    rack = config(text=REMEMBERING.replace("Rememberer", "Holder"))
+    outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=100))
+    later = SnapshotPolicy(part=0, at=250)
+    with Rack(rack, crate=crate, continues=Continuation(100), snapshots=later) as again:
+        assert again.run(SECONDS).digest == outcome.digest
+    assert ticks_on(crate) == [100, 250]
+    assert [continued(rack, crate, at).digest for at in (260, 120)] == [outcome.digest] * 2
+
+
+def test_a_snapshot_shows_the_attributes_of_its_levels(
+    config: MakeConfig, crate: WarmCrate
+) -> None:
+    taken(config(text=REMEMBERING), crate, SnapshotPolicy(part=0, at=210))
+    found = crate.show(399, "wave")
+    assert found.tick == 210
+    shown = json.loads(found.attributes)
+    assert (shown["_factor"], shown["_half"], shown["_list"]) == (1.0, 0.5, "210 items")
+    assert shown["_recent"] == [tick % 7 for tick in range(205, 210)]
+    assert sorted(shown["_odd"]) == [tick for tick in range(13) if len(range(tick, 210, 13)) % 2]
+    turned = 0.125 * len(range(20, 210))
+    assert shown["_turn"] == {"of": [turned, 0.0], "size": 0.125}
+    # Shared state is shown as it is; functions are not.
+    assert shown["_table"] == [[0.0, 0.0, 0.0], [0.0, turned, 0.0]]
+    assert not {"context", "_call", "_next"} & set(shown)
+
+
+def test_a_task_that_has_ended_ends_the_run_that_goes_on(
+    config: MakeConfig, crate: WarmCrate
+) -> None:
+    rack = config("board.wave.params.done_at=100")
+    with Rack(rack) as plain:
+        expected = plain.run()
+    taken(rack, crate, SnapshotPolicy(part=0, at=140))
+    outcome = continued(rack, crate, 140, seconds=None)
+    assert (outcome.cause, outcome.ticks) == ("task done", expected.ticks)
+    assert outcome.digest == expected.digest
+
+
+def test_a_branch_goes_another_way_from_its_snapshot(config: MakeConfig, crate: WarmCrate) -> None:
+    rack = config(text=REMEMBERING)
+    outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=210))
+    other = config("board.wave.params.factor=2.0", text=REMEMBERING)
+    struck = faulty(rack, {"kind": "kill", "board": "wave", "tick": 220})
+    branches = [continued(other, crate, 210), continued(struck, crate, 210, known=rack)]
+    assert len({outcome.digest, *(branch.digest for branch in branches)}) == 3
+    with Rack(other) as whole:
+        assert whole.run(SECONDS).digest not in (outcome.digest, branches[0].digest)
+    # The snapshot itself is as it was.
+    assert continued(rack, crate, 210).digest == outcome.digest
+
+
+def test_a_run_with_faults_restarts_and_skipped_ticks_goes_on(
+    config: MakeConfig, crate: WarmCrate
+) -> None:
+    rack = faulty(
+        config("supervision.lockstep_restart_s=0.1"),
+        {"kind": "kill", "board": "wave", "tick": 100},
+        {"kind": "drop", "board": "wave", "mailbox": "wave.status", "tick": 60, "cycles": 9},
+        {"kind": "clock-skip", "board": "clock", "tick": 180},
+        {"kind": "kill", "board": "wave.planner", "tick": 250},
+    )
+    ticks = (30, 65, 99, 141, 180, 181, 249, 300, 390)
+    outcome = taken_at(rack, crate, *ticks)
+    with Rack(rack) as plain:
+        assert plain.run(SECONDS).digest == outcome.digest
+    # None falls into an outage, of 40 ticks.
+    taken_at(rack, crate, 110, 270)
+    assert ticks_on(crate) == [*ticks]
+    for tick in ticks:
+        assert continued(rack, crate, tick).digest == outcome.digest, tick
+
+
+def test_restarts_before_a_snapshot_count_after_it(config: MakeConfig, crate: WarmCrate) -> None:
+    rack = faulty(
+        config("supervision.restarts=1", "supervision.lockstep_restart_s=0.1"),
+        {"kind": "kill", "board": "wave", "tick": 20},
+        {"kind": "kill", "board": "wave", "tick": 100},
+    )
+    outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=70))
+    assert outcome.cause == "board lost"
+    again = continued(rack, crate, 70, losses=(("wave", 20),))
+    assert (again.cause, again.digest) == (outcome.cause, outcome.digest)
+
+
+@pytest.mark.parametrize(
+    ("holds", "named"),
+    [
+        ("file", "it holds /"),
+        ("socket", "it holds socket:"),
+        ("epoll", "it holds anon_inode:"),
+        ("thread", "it has the thread "),
+    ],
+)
+def test_a_level_that_cannot_be_copied_is_named_and_runs_as_before(
+    config: MakeConfig, crate: WarmCrate, tmp_path: Path, holds: str, named: str
+) -> None:
+    settings = (f"board.wave.params.holds={holds}", f"board.wave.params.path={tmp_path / 'log'}")
+    rack = config(*settings, text=REMEMBERING.replace("Rememberer", "Uncopied"))
+    with Rack(rack) as plain:
+        expected = plain.run(SECONDS)
+    outcome, events = taken(rack, crate)
+    assert (outcome.cause, outcome.digest) == ("time over", expected.digest)
+    (note,) = [event.text for event in events if event.kind == "ready"]
+    assert note.startswith(f"{UNKEPT}wave: {named}")
+    assert ticks_on(crate) == []
+
+
+def test_without_a_snapshot_and_in_real_time_a_rack_is_refused(
+    config: MakeConfig, crate: WarmCrate
+) -> None:
+    with pytest.raises(SnapshotError, match="no snapshot before tick 100"):
+        continued(config(), crate, 100)
+    with pytest.raises(SnapshotError, match="add --lockstep"):
+        taken(config("clock.mode=realtime"), crate)
+
+
+def copies_of(crate: WarmCrate) -> set[int]:
+    """Return the processes of a crate between two racks: copies that wait."""
+    return {pid for pid in children_of(crate.pid) if is_alive(pid)}
+
+
+def test_snapshots_end_with_their_crate_however_that_ends(config: MakeConfig) -> None:
+    for how in (signal.SIGKILL, signal.SIGTERM, None):
+        with WarmCrate() as crate:
+            taken(config(), crate, SnapshotPolicy(part=0, at=100))
+            pids = copies_of(crate)
+            assert len(pids) == len(config().board) + 2  # a planner, and the clock
+            if how is signal.SIGKILL:
+                os.kill(crate.pid, how)
+                wait_until(lambda pids=pids: not any(map(is_alive, pids)))
+        assert not any(map(is_alive, pids))
+
+
+def test_a_snapshot_that_has_lost_a_copy_goes_whole(config: MakeConfig, crate: WarmCrate) -> None:
+    rack = config()
+    outcome, _ = taken(rack, crate, SnapshotPolicy(part=0, at=100))
+    earlier = copies_of(crate)
+    taken(rack, crate, SnapshotPolicy(part=0, at=200))
+    lost = copies_of(crate) - earlier
+    os.kill(min(lost), signal.SIGKILL)
+    wait_until(lambda: not is_alive(min(lost)))
+    assert ticks_on(crate) == [100]
+    wait_until(lambda: copies_of(crate) == earlier)
+    assert continued(rack, crate, 250).digest == outcome.digest
+
+
+def test_a_board_that_went_on_from_a_snapshot_is_restarted_when_it_is_killed(
+    config: MakeConfig, crate: WarmCrate
+) -> None:
+    rack = faulty(
+        config("supervision.lockstep_restart_s=0.1"),
+        {"kind": "kill", "board": "wave", "tick": 300},
+    )
+    outcome, events = taken(rack, crate, SnapshotPolicy(part=0, at=200))
+    with Rack(rack, crate=crate, continues=Continuation(200, faults=1)) as again:
+        assert again.run(SECONDS).digest == outcome.digest
+    restarts = [event.board for event in again.events if event.code == "restart"]
+    assert restarts == [event.board for event in events if event.code == "restart"] == ["wave"]
+
+
+def test_a_running_rack_states_how_many_snapshots_there_are(
+    config: MakeConfig, crate: WarmCrate
+) -> None:
+    with Rack(config(), crate=crate, snapshots=OFTEN) as rack:
+        rack.run(SECONDS)
+        words = rack.segment.words
+        count, size = words[System.SNAPSHOTS], words[System.SNAPSHOT_BYTES]
+        segment = len(rack.segment.bytes)
+    assert count >= 1
+    assert size >= count * segment // 2
+
+
+@pytest.mark.filterwarnings(FORKS)
+def test_nothing_is_left_of_snapshots_whose_launcher_is_killed(config: MakeConfig) -> None:
+    rack = config()
+    begun, begins = os.pipe()
+
+    def launch() -> None:
+        with WarmCrate() as crate:
+            taken(rack, crate, SnapshotPolicy(part=0, at=100))
+            # The rack that goes on runs until it is killed.
+            with Rack(rack, crate=crate, continues=Continuation(100)) as again:
+                again.start(1e6)
+                os.write(begins, crate.pid.to_bytes(4, "little"))
+                while again.watch(1.0):
+                    continue
+
+    with forked(launch) as launcher:
+        assert readable(begun, BOUND_S)
+        crate = int.from_bytes(os.read(begun, 4), "little")
+        family = {crate, *children_of(crate)}
+        for child in [*family]:
+            family |= children_of(child)
+        os.kill(launcher, signal.SIGKILL)
+        wait_until(lambda: not any(map(is_alive, family)))
+    assert len(family) > 2 * (len(rack.board) + 2)
+    remove_dead(rack.name)

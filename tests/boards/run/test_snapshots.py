@@ -1,0 +1,82 @@
+"""When the clock takes snapshots: so that they cost a part of lockstep's time, each so many ticks,
+and before a tick that is asked for."""
+
+from __future__ import annotations
+
+import time
+from time import process_time_ns
+from types import SimpleNamespace
+
+import pytest
+
+from rack.backplane.process import compute_until
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.run.snapshots import ClockCopies
+from tests.backplane.bus import task
+from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
+
+PART = 20
+COST_NS = 2_000_000
+
+
+class StubCopier:
+    """Stands for a fork: takes some time, and notes the tick."""
+
+    def __init__(self) -> None:
+        self.ticks: list[int] = []
+
+    def copy(self, tick: int, memory: int) -> bool:
+        """Take time."""
+        compute_until(process_time_ns() + COST_NS)
+        self.ticks.append(tick)
+        return False
+
+
+@pytest.fixture
+def segment(make_bus: MakeBus) -> Segment:  # noqa: F811
+    return make_bus(task("level"))
+
+
+def copies_of(segment: Segment) -> tuple[ClockCopies, StubCopier]:
+    copier = StubCopier()
+    # No task is there to fork.
+    driver = SimpleNamespace(tasks=(), settle=lambda: None)
+    return ClockCopies(segment, driver, copier), copier  # type: ignore[arg-type]
+
+
+def test_the_standstill_is_a_part_of_the_time(segment: Segment) -> None:
+    segment.words[System.SNAPSHOT_PART] = PART
+    copies, copier = copies_of(segment)
+    started_s = time.monotonic()
+    costs_s: list[float] = []
+    tick = 0
+    while len(copier.ticks) < 4:
+        taken = len(copier.ticks)
+        elapsed_s = time.monotonic() - started_s
+        copies(tick)
+        if len(copier.ticks) > taken:
+            assert sum(costs_s) * PART <= elapsed_s
+            costs_s.append(copies.cost_s)
+        tick += 1
+    assert min(costs_s) >= COST_NS * 1e-9
+    assert copier.ticks[0] == 0
+
+
+def test_one_is_taken_each_so_many_ticks_and_before_the_tick_that_is_asked_for(
+    segment: Segment,
+) -> None:
+    segment.words[System.SNAPSHOT_EVERY] = 30
+    segment.words[System.SNAPSHOT_AT] = 50 + 1
+    copies, copier = copies_of(segment)
+    tick = 0
+    while tick <= 100:
+        # No batch goes beyond what it returns.
+        tick = min(copies(tick), tick + 8)
+    assert copier.ticks == [0, 30, 50, 80]
+
+
+def test_without_a_wish_none_is_taken(segment: Segment) -> None:
+    copies, copier = copies_of(segment)
+    assert min(copies(tick) for tick in range(50)) > 1 << 60
+    assert copier.ticks == []
