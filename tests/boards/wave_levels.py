@@ -122,7 +122,7 @@ class GainPlanner(Planner):
 
     def plan(self, tick: int) -> None:
         self.trouble.at(tick)
-        self.output.gain = 1.0 + 1.0 / (1.0 + abs(self.status.message.message))
+        self.output.gain = 1.0 + 1.0 / (1.0 + abs(self.status.message.value))
         self.output.made_at = tick
 
 
@@ -142,7 +142,7 @@ class Watch(Executor):
     def process(self, tick: int) -> None:
         self.status.state = self.below.message.state
         self.status.reason = self.below.message.reason
-        self.status.value = self.below.message.message
+        self.status.value = self.below.message.value
 
 
 class Endless(Watch):

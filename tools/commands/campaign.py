@@ -91,8 +91,7 @@ def campaign(
         typer.Option(
             "--whole",
             help=(
-                "run each trial from its beginning; default: from a snapshot before its"
-                " first fault"
+                "run each trial from its beginning; default: from a snapshot before its first fault"
             ),
         ),
     ] = False,

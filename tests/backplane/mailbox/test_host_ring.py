@@ -93,7 +93,7 @@ def test_lengths_beyond_those_declared_and_text_beyond_ascii_are_improper_empty_
 ):
     fields, message = field_specs(Number.message_type, {}), Number.zeros({})
     for value, colour, permitted in ((0.0, 0, True), (0.0, 2, False), (np.nan, 1, False)):
-        message.message, message.colour = value, colour
+        message.value, message.colour = value, colour
         assert is_proper(message.record, fields) is permitted
     turn = Field("turn", "f8", "1", "unit", (2,), (0.9, 1.1))
     one = MessageType("one", 1, (Field("name", "S4", "ASCII", "its name"), turn))

@@ -91,8 +91,6 @@ def test_another_users_rack_is_left_alone(spec: Layout) -> None:
     assert spec.rack in racks()
 
 
-
-
 def test_a_rack_removed_and_launched_meanwhile_is_not_removed(
     spec: Layout, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -74,7 +74,7 @@ class Site:
         """Return the numbers that are in the bridge's own mailbox, oldest first."""
         reading = open_observer(self.segment, "bridge.numbers").peek()
         values = [*reading.earlier, reading.message] if reading.is_there else []
-        return [message.message for message in values]
+        return [message.value for message in values]
 
 
 MakeSite = Callable[..., Site]

@@ -51,7 +51,7 @@ def test_a_message_without_an_id_has_its_number(make_site: MakeSite, open_bus: O
     ring = entry._ring._slots  # type: ignore[attr-defined]
     for serial in (1, 2, 3):
         assert ring.fetch(serial)
-        ids.append((ring.message.id, ring.message.message, ring.message.colour))
+        ids.append((ring.message.id, ring.message.value, ring.message.colour))
     # A field that is not given is zero, whatever the message before it had.
     assert ids == [(1, 1.5, 0), (40, 2.5, 0), (3, 3.5, 0)]
     assert bus.sent("numbers") == 3

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from rack.backplane import semaphores
-from rack.backplane.errors import MailboxError
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.mailbox.slots import Slots

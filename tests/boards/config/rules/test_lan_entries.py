@@ -125,10 +125,7 @@ MISTAKES = {
         ),
     ),
     "a port of the adapter's own": (
-        [
-            "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PulseStatus',"
-            " 500 }"
-        ],
+        ["adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PulseStatus', 500 }"],
         "adapter.lan.import.status: the adapter writes its status under this name; rename the port",
     ),
     "a board of its name": (
