@@ -389,7 +389,7 @@ class Planner(LevelSection, ABC):
     def wanted(self, tick: int) -> bool:
         """Return, in well under a cycle, whether a plan is wanted now. Default: a command is
         new."""
-        command: Reading[Message] = getattr(self, "command")  # noqa: B009  # a port of most
+        command: Reading[Message] = getattr(self, "above")  # noqa: B009  # a port of most
         return command.is_new
 
     @abstractmethod

@@ -217,8 +217,12 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
         kinds: Classes of ports to collect.
 
     Raises:
-        LevelError: The class has a port and another attribute of the same name.
+        LevelError: The class has a port and another attribute of the same name, or lists its ports
+            in a dict, as before version 0.3.
     """
+    if attribute in vars(level):
+        why = f"'{attribute}' is not a dict any more: each port is an attribute of the class"
+        raise LevelError(f"class {level.__name__}: {why}, as in status = Output(MyStatus)")
     known: dict[str, Any] = {}
     for base in reversed(level.__mro__[1:]):
         known |= {port.name: port for port in vars(base).get(attribute, {}).values()}

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic_ns
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
@@ -21,6 +21,7 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
+from tests.bare_level import BareLevel
 
 COUNTED = ("stage", "struck_tick", "hidden", "count")
 """Words of a fault's entry that do not depend on time."""
@@ -42,12 +43,14 @@ class WritingTask:
     def __init__(self, segment: Segment) -> None:
         self.every = segment.layout.task("writer").every
         alarms = AlarmWriter(segment, "writer")
-        self.ports = OutputPorts(segment, {"point": NAME}, alarms, InputPorts(segment, {}, alarms))
+        self.level = BareLevel()
+        inputs = InputPorts(segment, self.level, {}, alarms)
+        self.ports = OutputPorts(segment, self.level, {"point": NAME}, alarms, inputs)
         self._block, self._trace = segment.block("writer"), TraceWriter(segment, "writer")
 
     def cycle(self, tick: int, now: int | None = None) -> bool:
         """Write, trace the cycle, say that it is done; the clock stands at `now`, or at `tick`."""
-        message = self.ports.messages.point
+        message = self.level.ports["point"]
         message.id, message.row = tick, tick
         cut_off = self.ports.bus_errors
         in_time = self.ports.write(tick, tick if now is None else now)
@@ -71,8 +74,10 @@ class ReadingTask:
 
     def __init__(self, segment: Segment) -> None:
         self.every = segment.layout.task("reader").every
+        self.level = BareLevel()
         self.ports = InputPorts(
             segment,
+            self.level,
             {"point": NAME},
             AlarmWriter(segment, "reader"),
             inbox=open_inbox(segment, "reader"),
@@ -82,7 +87,7 @@ class ReadingTask:
     def cycle(self, tick: int) -> Reading:
         """Read once."""
         self.ports.read(tick)
-        reading: Reading = self.ports.values.point
+        reading: Reading[Any] = self.level.ports["point"]
         row = reading.message.row
         assert (row == reading.message.id).all(), "half a message, or a forged one"
         released = reading.message.id if reading.is_there else -1

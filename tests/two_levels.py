@@ -144,8 +144,12 @@ class SizedPlanner(LowerPlanner):
     output = Output(CountPlan)
 
 
-class PlanWriter(Lower):
+class PlanWriter(Executor):
     """Writes the mailbox of its own planner."""
 
+    above = Input(CountCommand, "above.command")
     status = Output(CountStatus)
     plan = Output(SmallPlan)
+
+    def process(self, tick: int) -> None:
+        """Do nothing."""

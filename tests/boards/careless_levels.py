@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from rack.levels.arm import SimulatedArm
-from rack.levels.level import Executor, LevelContext
+from rack.levels.level import Executor, LevelContext, Output
 from rack.levels.messages import ArmState
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import Table, read_params
@@ -28,7 +26,7 @@ class CarelessParams(Table):
 class Careless(Executor):
     """Holds the arm where it is, but for what its parameters say."""
 
-    outputs: ClassVar = {"state": ArmState}
+    state = Output(ArmState)
     params = CarelessParams
 
     def __init__(self, context: LevelContext) -> None:

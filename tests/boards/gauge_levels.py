@@ -12,7 +12,7 @@ from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults import drawing as draw
 from rack.boards.faults.bounds import DELIVERY, writes
 from rack.boards.faults.messages import MessageStep, Outgoing
-from rack.levels.level import Executor, Output
+from rack.levels.level import Executor, Input, Output
 
 OPENS_AT = 40
 
@@ -71,4 +71,4 @@ class Gauge(Executor):
 class GaugeWatch(Watch):
     """Reads the gauge."""
 
-    below = Watch.inputs["status"]._replace(type=Gauge.outputs["status"])
+    below = Input(GaugeStatus, Watch.below.source)

@@ -47,7 +47,7 @@ class Adder(Executor):
     def process(self, tick: int) -> None:
         """Add the numbers that are new, once each."""
         number, out = self.number, self.status
-        for value in (*number.earlier, number.value) if number.is_new else ():
+        for value in (*number.earlier, number.message) if number.is_new else ():
             if value.id and value.id != out.last:
                 out.sum += value.value
                 out.last = value.id

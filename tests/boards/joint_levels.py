@@ -42,7 +42,7 @@ class Swing(Executor):
         """Write the set point due two cycles later."""
         command, due = self.command, tick + 2 * self.context.every
         readings = self.statuses.values()
-        held = any(not one.is_there or one.is_lost or one.value.stopped for one in readings)
+        held = any(not one.is_there or one.is_lost or one.message.stopped for one in readings)
         self.status.state = State.HOLDING if held else State.EXECUTING
         self.status.reason = "a board below is stopped" if held else ""
         command.opening, command.force = self.opening, 20.0
@@ -50,7 +50,7 @@ class Swing(Executor):
             self._begun, command.due = None, 0
             return
         if self._begun is None:
-            self._begun, self._from = due, np.array(next(iter(readings)).value.position)
+            self._begun, self._from = due, np.array(next(iter(readings)).message.position)
         elif (due - self._begun) * self.context.tick_s > LASTS_S:
             self._begun, self._from, self._to, self._next = due, self._to, self._next, self._to
         u, way = (due - self._begun) * self.context.tick_s / LASTS_S, self._to - self._from

@@ -40,7 +40,7 @@ def request_id(context: LevelContext, tick: int, number: int) -> int:
 
 def count(requests: Reading, status: Message) -> None:
     """Check the ids of the requests taken, and count them."""
-    for request in (*requests.earlier, requests.value) if requests.is_new else ():
+    for request in (*requests.earlier, requests.message) if requests.is_new else ():
         step = request.id - status.newest
         status.repeated += step <= 0
         status.missing += max(0, step - 1)

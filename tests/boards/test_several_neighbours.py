@@ -141,12 +141,12 @@ WRONG = {
         'board.path.below = "j2": no other board has this name; boards: ',
     ),
     "many for one port": (
-        "board.joint1.reads.command=['path.command', 'joint2.part']",
-        "port 'command' of the executor reads one mailbox, not 2",
+        "board.joint1.reads.above=['path.command', 'joint2.part']",
+        "port 'above' of the executor reads one mailbox, not 2",
     ),
     "rests on no input": (
         "board.joint1.executor=vector_levels:Misled",
-        "its output 'part' rests on 'comand'; inputs: command, below",
+        "its output 'part' rests on 'parts'; inputs: above, below",
     ),
 }
 

@@ -61,6 +61,7 @@ def test_a_level_without_a_board_has_empty_readings_and_messages_of_its_own() ->
     ("body", "why"),
     [
         ({"context": Input(Number, "a.b")}, ""),
+        ({"inputs": {"a": Input(Number, "a.b")}}, "'inputs' is not a dict any more"),
         ({"process": Input(Number, "a.b")}, "port 'process' has the name of another attribute"),
         ({"params": Output(Number)}, "port 'params' has the name of another attribute"),
         ({"above": 3}, "attribute 'above' has the name of a port"),
@@ -76,7 +77,7 @@ def test_a_port_with_the_name_of_another_attribute_is_an_error_of_the_class(
         with pytest.raises(LevelError, match="class Bad: attribute 'context' has the name of a"):
             level.input_table("context")
         return
-    with pytest.raises(LevelError, match=f"^class Bad: {why}; rename"):
+    with pytest.raises(LevelError, match=f"^class Bad: {why}"):
         type("Bad", (Base,), body)
 
 

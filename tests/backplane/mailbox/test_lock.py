@@ -51,7 +51,7 @@ def test_an_access_that_its_bound_cut_off_is_a_bus_error(bus: Segment) -> None:
     with forked(lambda: hold(bus)):
         wait_until(lambda: bus.words[REPORT])
         cut_off = reader.read(1)
-        assert (cut_off.value.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
+        assert (cut_off.message.id, cut_off.verdict) == (1, Verdict.BUS_ERROR)
         assert not writer.write(1, now=1)
     assert (reader.statistics.bus_errors, writer.bus_errors, writer.serial) == (2, 1, 1)
     # Its holder lives: the reader was held up by no fault.
@@ -158,7 +158,7 @@ def test_a_holder_overtaken_between_its_two_steps_is_not_the_owner(bus: Segment)
     assert quick.acquire()
     assert not slow._owner.take()
     # Nor does a semaphore posted once too often let a second one in.
-    lock_semaphore(bus.rack, NAME).release()
+    lock_semaphore(bus, NAME).release()
     assert not slow.acquire()
     quick.release()
     assert lock_semaphore(bus, NAME).value == 1

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
-from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
 from rack.backplane.mailbox.queue import QueueReader, QueueWriter, taken_name
@@ -35,7 +34,7 @@ def send(writer: QueueWriter, tick: int, *serials: int, now: int | None = None) 
     verdicts = []
     for serial in serials:
         writer.message.id, writer.message.row = serial, serial
-        verdicts.append(writer.message.send())
+        verdicts.append(writer.send())
     writer.write(tick, now)
     return verdicts
 
@@ -57,7 +56,7 @@ def test_several_messages_of_a_cycle_are_read_in_order(make_bus: MakeBus) -> Non
     assert ids(reader.read(0)) == []
     assert ids(reader.read(1)) == [1, 2, 3]
     again = reader.read(2)
-    assert (again.verdict, again.value.id, again.earlier) == (Verdict.OLD, 3, ())
+    assert (again.verdict, again.message.id, again.earlier) == (Verdict.OLD, 3, ())
 
 
 def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
@@ -77,10 +76,10 @@ def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
 def test_a_full_queue_is_a_verdict_and_keeps_what_it_holds(make_bus: MakeBus) -> None:
     segment = make_bus(*queue(3))
     writer, reader = ends(segment)
-    assert writer.message.room() == 3
+    assert writer.room() == 3
     assert send(writer, 0, 1, 2) == [True, True]
     assert send(writer, 1, 3, 4) == [True, False]
-    assert (writer.message.room(), writer.refused) == (0, 1)
+    assert (writer.room(), writer.refused) == (0, 1)
     assert open_observer(segment, NAME).slots.box[Box.REFUSED] == 1
     assert ids(reader.read(2)) == [1, 2, 3]
     assert send(writer, 2, 5) == [False]
@@ -98,7 +97,7 @@ def test_messages_of_a_cycle_are_published_together_or_not_at_all(make_bus: Make
         send(writer, 0, 1, 2)
         for serial in (3, 4):
             writer.message.id, writer.message.row = serial, serial
-            writer.message.send()
+            writer.send()
         for _ in writer.outgoing():
             # Killed before they are shown.
             writer.publish(1, 2, 1)
@@ -117,7 +116,7 @@ def test_a_late_write_becomes_visible_at_the_next_boundary(
     writer, reader = ends(make_bus(*queue(4, rates=(4, 1))))
     assert writer.write(4, now)  # nothing to write is never late
     writer.message.id, writer.message.row = 1, 1
-    assert writer.message.send()
+    assert writer.send()
     assert writer.write(4, now) is in_time
     assert [ids(reader.read(tick)) for tick in (7, 8, 12)] == [[], [1][:in_time], [1][in_time:]]
 
@@ -137,7 +136,7 @@ def test_an_observer_takes_nothing(make_bus: MakeBus) -> None:
     _, reader = writer.close(), open_reader(segment, NAME)
     assert isinstance(reader, QueueReader)
     again = reader.take(3, 0)
-    assert (again.verdict, again.value.id) == (Verdict.OLD, 3)
+    assert (again.verdict, again.message.id) == (Verdict.OLD, 3)
     # Its position counts the messages left.
     position = open_observer(segment, taken_name(NAME)).peek().message
     assert (position.taken, position.unread) == (3, 3)
@@ -148,20 +147,12 @@ def test_a_lost_message_is_found_at_its_tick_even_without_a_later_one(make_bus: 
     writer.visible_at(0, None)
     writer.lose()
     writer.show()
-    assert writer.message.room() == 0
+    assert writer.room() == 0
     assert [reader.read(tick).is_new or reader.statistics.lost for tick in (0, 3, 4)] == [0, 0, 1]
     assert reader.taken == 1
     writer.taken = reader.taken
     assert send(writer, 8, 2) == [True]
     assert ids(reader.read(12)) == [2]
-
-
-def test_messages_of_other_mailboxes_cannot_be_sent(make_bus: MakeBus) -> None:
-    writer = open_writer(make_bus(*queue(8)), taken_name(NAME))
-    with pytest.raises(MailboxError, match=r"declare the port as Output\(\.\.\., queued=True\)"):
-        writer.message.send()
-    with pytest.raises(MailboxError, match=r"in every cycle"):
-        writer.message.room()
 
 
 @pytest.mark.parametrize("word", range(8))

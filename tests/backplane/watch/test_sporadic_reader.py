@@ -50,7 +50,7 @@ def test_silence_is_no_loss(segment: Segment, writer: Writer) -> None:
     assert not reader.read(10).is_there
     assert reader.read(11).is_new
     late = reader.read(10_000)
-    assert (late.value.id, late.is_lost, late.is_new) == (7, False, False)
+    assert (late.message.id, late.is_lost, late.is_new) == (7, False, False)
     assert rung(segment) == []
 
 

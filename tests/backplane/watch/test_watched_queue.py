@@ -41,7 +41,7 @@ class Site:
         self.writer.taken = self.reader.reader.taken
         for number in numbers:
             self.writer.message.id = number
-            assert self.writer.message.send()
+            assert self.writer.send()
         self.writer.write(tick)
 
     def read(self, tick: int) -> list[int]:

@@ -60,7 +60,7 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
     ("setting", "why"),
     [
         (
-            "board.hub.exchange.status.asynchronous=true",
+            "board.hub.exchange.below.asynchronous=true",
             (
                 "the messages of 'figure0.status' interrupt the board as they come already;"
                 " permitted: false"

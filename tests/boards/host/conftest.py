@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from rack.backplane import semaphores
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.watch.alarms import AlarmWriter
@@ -42,8 +41,10 @@ class Site:
         adapter = find_class(wiring.target, BusAdapter)(wiring.context)
         adapter.attach(self.segment, None)
         alarms = AlarmWriter(self.segment, "bridge")
-        self.inputs = InputPorts(self.segment, wiring.inputs, alarms)
-        self.outputs = OutputPorts(self.segment, wiring.outputs, alarms, self.inputs, wiring.sent)
+        self.inputs = InputPorts(self.segment, adapter, wiring.inputs, alarms)
+        self.outputs = OutputPorts(
+            self.segment, adapter, wiring.outputs, alarms, self.inputs, wiring.sent
+        )
         return adapter
 
     def restart(self) -> None:
@@ -89,9 +90,6 @@ def make_site(config: MakeConfig) -> Iterator[MakeSite]:
             segment = Segment.create(plan.layout, "")
             stack.callback(unlink, plan.layout.rack)
             stack.callback(segment.close)
-            semaphores.create(plan.layout)
-            stack.callback(semaphores.unlink_all, plan.layout.rack)
-            semaphores.open_all(plan.layout)
             return Site(plan, segment)
 
         yield make

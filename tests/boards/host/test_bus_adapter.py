@@ -11,6 +11,7 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.entries import NEVER, EntryConfig, Replayed
 from rack.boards.run.ports import InputPorts, OutputPorts
+from tests.bare_level import BareLevel
 from tests.boards.host.conftest import EVERY, MakeSite, OpenBus
 
 NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
@@ -120,14 +121,11 @@ def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: Op
     semaphore = wake_semaphore(site.segment, "program")
     site.cycle()
     assert (semaphore.value, site.count("sum")) == (0, {"arrived": NEVER, "age": NEVER})
-    level = OutputPorts(
-        site.segment,
-        {"status": "adder.status"},
-        AlarmWriter(site.segment, "adder"),
-        InputPorts(site.segment, {}, AlarmWriter(site.segment, "adder")),
-    )
-    level.messages.status.sum = 2.5
-    assert level.write(1, None)
+    adder, alarms = BareLevel(), AlarmWriter(site.segment, "adder")
+    inputs = InputPorts(site.segment, adder, {}, alarms)
+    outputs = OutputPorts(site.segment, adder, {"status": "adder.status"}, alarms, inputs)
+    adder.ports["status"].sum = 2.5
+    assert outputs.write(1, None)
     site.host[Block.WAITS_UNTIL] = 50
     for _ in range(2):
         site.cycle()

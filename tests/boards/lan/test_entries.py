@@ -8,7 +8,7 @@ import pytest
 from rack.backplane.mailbox.mailbox import Verdict
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.mailbox.slots import message_dtype
-from rack.backplane.message import Message, State
+from rack.backplane.message import AnyMessage, State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
@@ -46,7 +46,7 @@ class Importing:
             self.spec.message, self.spec.version, message_dtype(self.spec.fields, self.spec.size)
         )
         self.key, self.sealer = out_key("two", "pulse.status"), Sealer()
-        self.status = Message(status_of((), ("other",)).dtype({}))
+        self.status = status_of((), ("other",)).zeros({})
         self.task = ReadingTask()
         self.reader = watched(segment, "lan.other", AlarmWriter(segment, "echo"), self.task)
         self.open()
@@ -76,7 +76,7 @@ class Importing:
         **head: int,
     ) -> None:
         """Let a message arrive, written there at the time of our tick `written`."""
-        message = Message(message_dtype(self.spec.fields, self.spec.size))
+        message = AnyMessage(message_dtype(self.spec.fields, self.spec.size))
         message.count = number if count is None else count
         message.record["state"] = state
         time_ns = self.grid.time_ns(written)
@@ -90,7 +90,7 @@ class Importing:
 
     def cycle(self, tick: int) -> None:
         self.entry.look(tick)
-        self.entry.exchange(self.port.message, tick)
+        self.entry.exchange(self.port.value, tick)
         self.port.write(tick, None)
         self.entry.fill(self.status.import_other, tick)
 

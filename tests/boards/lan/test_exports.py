@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.resolved import loads
@@ -27,7 +26,7 @@ class Exporting:
             Network(),
         )
         self.writer = open_writer(segment, "pulse.status")
-        self.status = Message(status_of(("pulse",), ()).dtype({}))
+        self.status = status_of(("pulse",), ()).zeros({})
         self.open()
 
     def open(self) -> None:

@@ -113,7 +113,7 @@ NO_TABLE = TEXT.partition("[board.notes.exchange]")[0]
 QUEUE = (
     "protocol.mailbox={ 'wave.status' = 'queue' }",
     "board.notes.executor='wave_levels:Watch'",
-    "board.notes.exchange={ status = { every = 4, phase = 1 } }",
+    "board.notes.exchange={ below = { every = 4, phase = 1 } }",
 )
 
 
@@ -134,10 +134,10 @@ def test_a_queue_is_emptied_at_every_exchange_and_its_writer_misses_nothing(
 
 
 def test_a_queue_is_not_read_asynchronously(config: MakeConfig) -> None:
-    wanted = "board.notes.exchange={ status = { asynchronous = true } }"
+    wanted = "board.notes.exchange={ below = { asynchronous = true } }"
     with pytest.raises(
         ConfigError,
-        match=r"^board.notes.exchange.status.asynchronous = true: 'wave.status' is a queue",
+        match=r"^board.notes.exchange.below.asynchronous = true: 'wave.status' is a queue",
     ):
         resolve(config(*QUEUE[:2], wanted, text=NO_TABLE))
 

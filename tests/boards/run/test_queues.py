@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from time import monotonic_ns
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -19,6 +20,7 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, queue, task
+from tests.bare_level import BareLevel
 from tests.processes import FORKS, exit_status, fork
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
@@ -33,11 +35,11 @@ class QueueLink:
     def __init__(self, segment: Segment, sends: bool = True) -> None:
         self.segment = segment
         self.rates = tuple(segment.layout.task(name).every for name in ("writer", "reader"))
-        self.room = 1 << 30
+        self.writing, self.reading = BareLevel(), BareLevel()
         heard = AlarmWriter(segment, "reader")
         self._sent = ("point",) if sends else ()
         self._open_writer()
-        self.reads = InputPorts(segment, {"point": NAME}, heard, room=lambda port: self.room)
+        self.reads = InputPorts(segment, self.reading, {"point": NAME}, heard)
         self._trace = TraceWriter(segment, "writer")
         self.serial = 0
         self.taken: list[int] = []
@@ -46,8 +48,10 @@ class QueueLink:
 
     def _open_writer(self) -> None:
         alarms = AlarmWriter(self.segment, "writer")
-        self._inputs = InputPorts(self.segment, {}, alarms)
-        self.ports = OutputPorts(self.segment, {"point": NAME}, alarms, self._inputs, self._sent)
+        self._inputs = InputPorts(self.segment, self.writing, {}, alarms)
+        self.ports = OutputPorts(
+            self.segment, self.writing, {"point": NAME}, alarms, self._inputs, self._sent
+        )
 
     def restart_writer(self) -> None:
         """Replace the writing task, as a restart does."""
@@ -58,11 +62,12 @@ class QueueLink:
     def write(self, tick: int, count: int) -> None:
         """Do the writer's cycle, and send that many messages."""
         self._inputs.read(tick)
-        message = self.ports.messages.point
+        port = self.writing.ports["point"]
+        message = port.message
         for _ in range(count):
             self.serial += 1
             message.id, message.row = self.serial, self.serial
-            if not message.send():
+            if not port.send():
                 self.refused.append(self.serial)
         self.ports.write(tick, tick)
         # A late message is one whose cycle has ended before: this is its end.
@@ -71,7 +76,7 @@ class QueueLink:
 
     def read(self, tick: int) -> Reading:
         self.reads.read(tick)
-        reading: Reading = self.reads.values.point
+        reading: Reading[Any] = self.reading.ports["point"]
         if reading.is_new:
             self.taken += [message.id for message in (*reading.earlier, reading.message)]
         return reading
@@ -155,10 +160,10 @@ def test_order_and_fullness_depend_on_ticks_alone(
         try:
             most = 0
             for tick in range(80):
-                rack.room = rooms[tick % len(rooms)]
+                rack.reading.most = rooms[tick % len(rooms)]
                 rack.run(tick, tick + 1, lambda tick: bursts[tick % len(bursts)], reader_first)
                 most = max(most, rack.serial - len(rack.refused) - len(rack.taken))
-            rack.room = 99
+            rack.reading.most = 99
             rack.run(80, 100, lambda tick: 0, reader_first)
         finally:
             rack.close()
@@ -171,15 +176,15 @@ def test_order_and_fullness_depend_on_ticks_alone(
 
 def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
     rack = link(2)
-    rack.room = 0
+    rack.reading.most = 0
     rack.run(0, 30, lambda tick: 1)
     assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
     assert rack.refused == [*range(3, 31)]
-    rack.room = 9
+    rack.reading.most = 9
     rack.run(30, 34, lambda tick: 0)
     assert rack.taken == [1, 2]
     rack.run(34, 80, lambda tick: tick % 2)
-    rack.room = 0
+    rack.reading.most = 0
     rack.run(80, 90, lambda tick: 1)
     assert rack.alarms("writer") == [Alarm.QUEUE_FULL]
 
@@ -187,7 +192,7 @@ def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
 def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) -> None:
     rack = link(2, sends=False)
     for tick in range(6):
-        message = rack.ports.messages.point
+        message = rack.writing.ports["point"]
         message.id, message.row = tick + 1, tick + 1
         rack.write(tick, 0)
         if tick == 3:

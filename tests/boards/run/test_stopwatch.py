@@ -17,6 +17,7 @@ from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.boards.run.stopwatch import BUS_COUNT_CYCLES, Stopwatch
 from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
+from tests.bare_level import BareLevel
 from tests.boards.test_events import box
 
 PERIOD_NS = 2_500_000
@@ -34,8 +35,11 @@ class Site:
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
         alarms = AlarmWriter(segment, "level")
-        self.inputs = InputPorts(segment, {"point": NAME}, alarms)
-        self.outputs = OutputPorts(segment, {"status": "level.status"}, alarms, self.inputs)
+        self.level = BareLevel()
+        self.inputs = InputPorts(segment, self.level, {"point": NAME}, alarms)
+        self.outputs = OutputPorts(
+            segment, self.level, {"status": "level.status"}, alarms, self.inputs
+        )
         self.watch = Stopwatch(segment, "level", self.inputs, self.outputs)
         self.block = segment.block("level")
         self._ring = trace_ring(segment, "level")
@@ -76,7 +80,9 @@ def stepped(site: Site) -> Site:
     alarms = AlarmWriter(site.segment, "level")
     for writer in site.outputs.writers.values():
         writer.close()
-    site.outputs = OutputPorts(site.segment, {"status": "level.status"}, alarms, site.inputs)
+    site.outputs = OutputPorts(
+        site.segment, site.level, {"status": "level.status"}, alarms, site.inputs
+    )
     site.watch = Stopwatch(site.segment, "level", site.inputs, site.outputs)
     return site
 
@@ -141,7 +147,7 @@ def test_a_cycle_is_late_if_it_is_the_first_follows_skipped_ones_or_begins_late(
 def test_a_change_of_the_levels_state_has_its_tick(site: Site) -> None:
     site.cycle(1000)
     assert site.counts(Block.LEVEL_STATE, Block.LEVEL_SINCE) == [0, 0]
-    site.outputs.messages.status.state = State.EXECUTING
+    site.level.ports["status"].state = State.EXECUTING
     site.cycle(1001)
     assert site.traced()["state"] == State.EXECUTING
     site.cycle(1002)

@@ -50,7 +50,7 @@ def test_grip_is_weighed_against_friction_with_both_forces(turn: float) -> None:
         Refused, match=r"payload 'block1' 6 kg needs 88\.3 N of grip; the gripper holds 48\.0 N"
     ) as got:
         Payloads(made, SCENE.objects).check_grip(BLOCK1, turned)
-    assert got.message.code == Error.OVERLOAD
+    assert got.value.code == Error.OVERLOAD
     light = weighing(3.2)
     Payloads(light, SCENE.objects).check_grip(BLOCK1, turned)
     # What the fingers do not meet is not judged.
@@ -95,4 +95,4 @@ def test_any_move_with_what_is_held_is_weighed_an_operators_goto_too() -> None:
         Refused, match=r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'; its motor carries"
     ) as got:
         motion.plan(move, made.home, empty.holding(BLOCK1, grip_of(made, BLOCK1)))
-    assert got.message.code == Error.OVERLOAD
+    assert got.value.code == Error.OVERLOAD

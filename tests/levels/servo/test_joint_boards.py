@@ -130,12 +130,12 @@ MISSING: dict[str, tuple[Callable[[dict[str, Reading]], object], int, str]] = {
         "no torque from board 'fast' yet",
     ),
     "sent before the arm's first status": (
-        lambda read: setattr(read["fast"].value, "sampled", -1),
+        lambda read: setattr(read["fast"].message, "sampled", -1),
         0,
         "no torque from board 'fast' yet",
     ),
     "stale, by its own cycle": (
-        lambda read: setattr(read["slow"].value, "sampled", TICK - 8),
+        lambda read: setattr(read["slow"].message, "sampled", TICK - 8),
         0,
         "stale torque from board 'slow': based on a status more than 7 ticks old",
     ),

@@ -11,7 +11,7 @@ import pytest
 from rack.backplane.message import REASON_BYTES, State
 from rack.levels.errors import Refused
 from rack.levels.level import LevelContext, Pace
-from rack.levels.messages import Error, TaskPlan, Verb
+from rack.levels.messages import Error, Verb
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.pose import Pose
@@ -158,6 +158,4 @@ def test_time_of_another_rack_is_not_refused_for_the_rounding_of_its_offset() ->
     )
     for offset in np.random.default_rng(1).uniform(-20.0, 0.0, 200):
         planner._ahead_s = float(offset)  # the move is slowed down to end just in time
-        planner._promise(
-            planner._with_times([Rehearsed(home, 1.0)]), 0.0, TaskPlan.zeros(rack.sizes)
-        )
+        planner._promise(planner._with_times([Rehearsed(home, 1.0)]), 0.0)

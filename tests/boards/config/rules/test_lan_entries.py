@@ -90,21 +90,21 @@ MISTAKES = {
         ),
     ),
     "an unknown type": (
-        ["adapter.lan.import.other.type=lan_levels:PLUSE"],
+        ["adapter.lan.import.other.type=lan_levels:Plus"],
         (
-            "adapter.lan.import.other.type = \"lan_levels:PLUSE\": module 'lan_levels' has no"
-            " message type 'PLUSE'"
+            "adapter.lan.import.other.type = \"lan_levels:Plus\": module 'lan_levels' has no"
+            " message class 'Plus'"
         ),
     ),
     "a type with sizes of an arm": (
         [
             "adapter.lan.import.more={ from = 'two/servo.command', type ="
-            " 'rack.levels.messages:JOINT_SET_POINT', max_age_ms = 500 }"
+            " 'rack.levels.messages:JointCommand', max_age_ms = 500 }"
         ],
-        'adapter.lan.import.more.type = "rack.levels.messages:JOINT_SET_POINT": ',
+        'adapter.lan.import.more.type = "rack.levels.messages:JointCommand": ',
     ),
     "another type than the level reads": (
-        ["adapter.lan.import.other.type=lan_levels:HEARD"],
+        ["adapter.lan.import.other.type=lan_levels:Heard"],
         'board.echo.reads.other = "lan.other": carries heard 1; the port needs pulse 1',
     ),
     "too short an age": (
@@ -125,7 +125,10 @@ MISTAKES = {
         ),
     ),
     "a port of the adapter's own": (
-        ["adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PulseStatus', 500 }"],
+        [
+            "adapter.lan.import.status={ from = 'two/a.b', type = 'lan_levels:PulseStatus',"
+            " max_age_ms = 500 }"
+        ],
         "adapter.lan.import.status: the adapter writes its status under this name; rename the port",
     ),
     "a board of its name": (

@@ -66,16 +66,16 @@ MISTAKES = {
     ),
     "port of no executor": (
         "board.upper.exchange={ command = { every = 2 } }",
-        "board.upper.exchange.command: no such port of the executor; ports: status",
+        "board.upper.exchange.command: no such port of the executor; ports: below",
     ),
     "exchange in no cycle": (
-        "board.upper.exchange={ status = { every = 3, phase = 3 } }",
-        "board.upper.exchange.status.phase = 3: must be less than every; permitted: 0 to 2 cycles",
+        "board.upper.exchange={ below = { every = 3, phase = 3 } }",
+        "board.upper.exchange.below.phase = 3: must be less than every; permitted: 0 to 2 cycles",
     ),
     "rarely and at once": (
-        "board.upper.exchange={ status = { every = 2, asynchronous = true } }",
+        "board.upper.exchange={ below = { every = 2, asynchronous = true } }",
         (
-            "board.upper.exchange.status.every = 2: an asynchronous port is read in every cycle;"
+            "board.upper.exchange.below.every = 2: an asynchronous port is read in every cycle;"
             " permitted: 1"
         ),
     ),
@@ -112,16 +112,16 @@ MISTAKES = {
         "class 'Unfinished' lacks: process",
     ),
     "nobody writes": (
-        "board.upper.reads={ status = 'lower.state' }",
+        "board.upper.reads={ below = 'lower.state' }",
         "no task writes it; mailboxes: upper.command",
     ),
     "type": (
-        "board.upper.reads={ status = 'upper.command' }",
+        "board.upper.reads={ below = 'upper.command' }",
         "carries count_command 1; the port needs count_status 1",
     ),
     "no port": (
         "board.upper.reads={ state = 'lower.status' }",
-        "the executor has no such port; ports: status",
+        "the executor has no such port; ports: below",
     ),
     "two writers": ("board.lower.executor='two_levels:PlanWriter'", "mailbox lower.plan"),
     "protocol": (
@@ -242,8 +242,8 @@ STRICT = {
         'protocol.mailbox.lower.status = "double-buffer"',
     ),
     "input": (
-        "board.upper.exchange={ status = { asynchronous = true } }",
-        "board.upper.exchange.status.asynchronous = true",
+        "board.upper.exchange={ below = { asynchronous = true } }",
+        "board.upper.exchange.below.asynchronous = true",
     ),
 }
 

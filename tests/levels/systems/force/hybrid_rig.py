@@ -106,7 +106,7 @@ class HybridRig:
         return self.ik.tool_at(self.output("arm", "status").position).position
 
     def output(self, board: str, port: str) -> Message:
-        return cast(Message, getattr(self.rack.tasks[board].write, port))
+        return cast(Message, self.rack.tasks[board].written[port])
 
     @property
     def force(self) -> Message:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.hand.messages import GraspKind
@@ -29,7 +28,7 @@ class Crate:
 
     def __init__(self) -> None:
         self.messages = {
-            port: Message(source.type.dtype(SIZES)) for port, source in Workstation.inputs.items()
+            port: source.message.zeros(SIZES) for port, source in Workstation.inputs.items()
         }
         self.sends: list[dict[str, Any]] = []
         self.looks = 20

@@ -17,8 +17,10 @@ from rack.boards.config import load
 from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.run.control_loop import VirtualControlLoop
 from rack.levels.level import Executor
+from rack.levels.messages import WorldState
 from rack.levels.systems.state_table.elemental_move import STILL_M_S, MoveTable
 from rack.levels.systems.state_table.level import WordCommand
+from rack.levels.systems.state_table.primitive import JointMoveStatus
 
 LEVEL = "elemental_move"
 LAST = {"words": "pick block1", "in_state": "reaching", "sent": 7, "reached": 1, "put": -1}
@@ -48,9 +50,9 @@ class Bench:
         task = VirtualControlLoop(self.segment, wiring, level)
         assert isinstance(level, MoveTable)
         task.inputs.read(50)
-        level.recall(task.inputs.values, task.outputs.messages)
-        level.give(task.outputs.messages, 50)
-        return level, task.outputs.messages.command
+        level.recall()
+        level.give(50)
+        return level, level.command
 
 
 @pytest.fixture
@@ -109,19 +111,18 @@ class Arm:
         task = VirtualControlLoop(bench.segment, wiring, level)
         task.inputs.read(50)
         self.level = level
-        self.values = task.inputs.values
-        self.messages = task.outputs.messages
-        self.world = Message(self.values.world.message.record.dtype)
-        self.below = Message(self.values.status.message.record.dtype)
+        self.world = WorldState(level.world.message.record.dtype)
+        self.below = JointMoveStatus(level.below.message.record.dtype)
         self.world.revision = 1
         self.place = np.array([0.4, -0.2, 0.1])
         self.world.position[0] = self.place
         self.world.quaternion[:] = (1.0, 0.0, 0.0, 0.0)
 
     def look(self, *, lost: bool = False) -> dict[str, str]:
-        self.values.world = Reading(self.world, Verdict.NEW, lost)
-        self.values.status = Reading(self.below, Verdict.NEW)
-        return self.level.look(self.values, 50)
+        vars(self.level).update(
+            world=Reading(self.world, Verdict.NEW, lost), below=Reading(self.below, Verdict.NEW)
+        )
+        return self.level.look(50)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ def test_levels_are_read_from_a_config_alone() -> None:
 
 def test_a_rack_without_levels_above_each_other_has_no_two(tmp_path: Path) -> None:
     path = tmp_path / "lone.toml"
-    path.write_text(PLAIN.replace('below = "wave"', 'reads = { status = "wave.status" }'))
+    path.write_text(PLAIN.replace('below = "wave"', 'reads = { below = "wave.status" }'))
     verdict = judge_layers([str(path)])
     assert verdict.ruling is Ruling.FAILS
     assert "_levels 0, not >= 2" in describe_unmet(verdict.checks)
