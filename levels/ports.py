@@ -157,6 +157,9 @@ class Sender(Generic[M]):
         room: Returns how many messages may still be sent in this cycle.
     """
 
+    # A field that is set here in place of in the message is an error.
+    __slots__ = ("message", "room", "send")
+
     def __init__(self, message: M, send: Callable[..., bool], room: Callable[[], int]) -> None:
         self.message = message
         self.send = send

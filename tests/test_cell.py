@@ -37,7 +37,7 @@ others = ["lan.shared", "lan.third"]
 
 [adapter.lan.import.third]
 from = "cell-other/servo.shared"
-type = "rack.levels.systems.cell.shared_bodies:SHARED_BODIES"
+type = "rack.levels.systems.cell.shared_bodies:SharedBodies"
 rate_hz = 50
 max_age_ms = 200
 """

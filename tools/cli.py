@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rack.boards.crate.line import CrateLine
 
 
-class Command(NamedTuple):
+class CommandEntry(NamedTuple):
     """A command.
 
     Attributes:
@@ -45,120 +45,128 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "Run": (
-        Command(
+        CommandEntry(
             "run",
             "rack.tools.commands.run:run",
             "Run a rack until its task ends, and report on the run.",
         ),
-        Command("stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."),
-        Command(
+        CommandEntry(
+            "stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."
+        ),
+        CommandEntry(
             "pause", "rack.tools.commands.pause:pause", "Pause a rack, or the motion of its arm."
         ),
-        Command("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
-        Command(
+        CommandEntry("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
+        CommandEntry(
             "step",
             "rack.tools.commands.step:step",
             "Let a rack in lockstep go on by single cycles.",
         ),
-        Command(
+        CommandEntry(
             "rewind",
             "rack.tools.commands.rewind:rewind",
             "Go back to any tick of a recorded run, and branch off.",
         ),
-        Command("list", "rack.tools.commands.list:list_racks", "List the racks on this machine."),
-        Command(
+        CommandEntry(
+            "list", "rack.tools.commands.list:list_racks", "List the racks on this machine."
+        ),
+        CommandEntry(
             "clean",
             "rack.tools.commands.clean:clean",
             "Remove the shared memory that killed racks left behind.",
         ),
     ),
     "Watch": (
-        Command("status", "rack.tools.commands.status:status", "Show a running rack once."),
-        Command("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
-        Command(
+        CommandEntry("status", "rack.tools.commands.status:status", "Show a running rack once."),
+        CommandEntry("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
+        CommandEntry(
             "watch",
             "rack.tools.commands.watch:watch",
             "Show signals of a running rack, or what was around a moment.",
         ),
-        Command(
+        CommandEntry(
             "mailbox",
             "rack.tools.commands.mailbox:mailbox",
             "Show what is in a mailbox of a running rack.",
         ),
-        Command("record", "rack.tools.commands.record:record", "Record a running rack."),
-        Command(
+        CommandEntry("record", "rack.tools.commands.record:record", "Record a running rack."),
+        CommandEntry(
             "replay",
             "rack.tools.commands.replay:replay",
             "Open recordings in the viewer, of several racks on one time line.",
         ),
-        Command(
+        CommandEntry(
             "export", "rack.tools.commands.export:export", "Write a recorded run as an MCAP file."
         ),
-        Command(
+        CommandEntry(
             "report",
             "rack.tools.commands.report:report",
             "Report on a recorded run, or compare two runs.",
         ),
     ),
     "Command and disturb": (
-        Command(
+        CommandEntry(
             "command", "rack.tools.commands.command:command", "Command one level of a running rack."
         ),
-        Command(
+        CommandEntry(
             "set", "rack.tools.commands.set:set_param", "Set a live parameter of a running rack."
         ),
-        Command(
+        CommandEntry(
             "prompt",
             "rack.tools.commands.prompt:prompt",
             "Open a Python prompt on the host side of a rack.",
         ),
-        Command(
+        CommandEntry(
             "estop",
             "rack.tools.commands.estop:estop",
             "Engage the brakes of the arm at once, until --reset.",
         ),
-        Command("inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."),
-        Command(
+        CommandEntry(
+            "inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."
+        ),
+        CommandEntry(
             "campaign",
             "rack.tools.commands.campaign:campaign",
             "Inject random faults into many runs, and judge each.",
         ),
     ),
     "Predict": (
-        Command(
+        CommandEntry(
             "check", "rack.tools.commands.check:check", "Validate a config and predict its timing."
         ),
-        Command(
+        CommandEntry(
             "analyze",
             "rack.tools.commands.analyze:analyze",
             "Compare a run with the timing model, equation by equation.",
         ),
-        Command(
+        CommandEntry(
             "gantt",
             "rack.tools.commands.gantt:gantt",
             "Draw a Gantt chart of a config's schedule, or of a run.",
         ),
     ),
     "Compare": (
-        Command("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
-        Command(
+        CommandEntry("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
+        CommandEntry(
             "reproduce",
             "rack.tools.commands.reproduce:reproduce",
             "Reproduce the paper, claim by claim, as one page.",
         ),
     ),
     "Bring up": (
-        Command("robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."),
+        CommandEntry(
+            "robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."
+        ),
     ),
     "Reach others": (
-        Command(
+        CommandEntry(
             "lan",
             "rack.tools.network.group:app",
             "Prepare racks that work together over a network.",
         ),
     ),
     "Look up": (
-        Command(
+        CommandEntry(
             "schema",
             "rack.tools.commands.schema:schema",
             "Show the keys of a config with their units and defaults.",
@@ -369,7 +377,7 @@ def commands() -> TyperGroup:
     class LazyCommand(TyperCommand):
         """A command of which only the name and one line of help are known."""
 
-        def __init__(self, command: Command) -> None:
+        def __init__(self, command: CommandEntry) -> None:
             super().__init__(command.name, short_help=command.line)
             self._command = command
 
@@ -411,7 +419,7 @@ def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
     return typer.Typer(add_completion=add_completion, rich_markup_mode=None, **settings)
 
 
-def _loaded(command: Command) -> Any:
+def _loaded(command: CommandEntry) -> Any:
     """Import a command."""
     import typer
 

@@ -174,7 +174,9 @@ class LanAdapter(Adapter):
             return MadePorts(is_whole=False)
         known = {port: entry for port, entry in table.exports.items() if entry.source in types}
         inputs = {port: Input(types[entry.source], entry.source) for port, entry in known.items()}
-        status = Output(status_of(table.exports, table.imports))
+        # It rests on what is exported under the same name, if there is such a port.
+        rests_on = inputs.get(STATUS)
+        status = Output(status_of(table.exports, table.imports), rests_on=rests_on)
         outputs: dict[str, Output[Any]] = {STATUS: status}
         for port, entry in table.imports.items():
             try:

@@ -58,8 +58,8 @@ class Asking(Executor):
         """Send the cycle's requests, and count those refused."""
         params: Mapping[str, Any] = self.context.params
         for number in range(params["burst"] if tick < params.get("until", 1 << 60) else 0):
-            self.requests.id = request_id(self.context, tick, number)
-            self.requests.made_at = tick
+            self.requests.message.id = request_id(self.context, tick, number)
+            self.requests.message.made_at = tick
             if self.requests.send():
                 self.status.sent += 1
             else:
@@ -111,8 +111,8 @@ class Stepping(Planner):
     def plan(self, tick: int) -> None:
         """Queue the steps as far as there is room."""
         for _ in range(min(int(self.context.params["burst"]), self.output.room())):
-            self.output.id += 1
-            self.output.made_at = tick
+            self.output.message.id += 1
+            self.output.message.made_at = tick
             assert self.output.send(), "there was room"
 
 
@@ -126,7 +126,7 @@ class Filing(Planner):
         return bool(self.requests.is_new)
 
     def plan(self, tick: int) -> None:
-        count(self.requests)
+        count(self.requests, self.output)
 
 
 class Filed(Executor):

@@ -58,7 +58,7 @@ class PathLevel(Executor):
             self.command.position[:] = [tick, 2 * tick, 3 * tick]
         self.command.operator = self.orders.rests_on(0)
         for at, joint in enumerate(self.joints.values()):
-            self.status.position[at] = joint.value.position[at]
+            self.status.position[at] = joint.message.position[at]
             self.status.lost[at] = joint.is_lost
         self.orders.done()
         self.orders.report(self.status)

@@ -83,7 +83,7 @@ def test_a_command_that_the_level_does_not_take_is_refused_and_changes_nothing(
     # The torque still rests on the one before.
     assert shown.operator == 1
     unknown = said(3, Operation.NONE)
-    unknown.value.what = 99
+    unknown.message.what = 99
     assert not orders.take(unknown)
     assert report(orders).objection.startswith("99 is not a command of this level")
 

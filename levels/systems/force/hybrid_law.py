@@ -70,7 +70,7 @@ class ForceTask(NamedTuple):
     speed: Array  # (6,), m/s, rad/s: most on axes of force
 
 
-class JointCommand(NamedTuple):
+class JointMotion(NamedTuple):
     """What the joints are to do, (joints,) each."""
 
     position: Array  # rad
@@ -132,7 +132,7 @@ class HybridLaw:
 
     def step(
         self, motion: Motion, task: ForceTask | None, passed_s: float, payload: Payload
-    ) -> JointCommand:
+    ) -> JointMotion:
         """Return the command for a `motion`, `passed_s` after the last; without a `task` all axes
         are of motion."""
         q = motion.position
@@ -154,7 +154,7 @@ class HybridLaw:
         if task is None:
             self._base[:] = self._away
         gained = motion.acceleration + (self._speed - before) / passed_s
-        return JointCommand(
+        return JointMotion(
             position, velocity, gained, *self._loads(task, position, velocity, passed_s, payload)
         )
 

@@ -26,8 +26,7 @@ def test_levels_do_what_they_do_in_a_rack_in_lockstep(
         assert rack.serials
         for name, serial in rack.serials.items():
             (row,) = np.flatnonzero(recording.signal(name, "serial") == serial)
-            box = recording.layout.mailbox(name)
-            assert rack.newest(name).record[()] == recording.messages(box)[row], name
+            assert rack.newest(name).record[()] == recording.rows(name)["message"][row], name
 
 
 def test_what_is_not_there_is_said(small: Path) -> None:

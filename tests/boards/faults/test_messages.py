@@ -243,4 +243,4 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
         if not is_killed:
             os.kill(pid, signal.SIGCONT)
             assert exit_status(pid) == 0
-            assert rack.reader.cycle(6).value.id == 4
+            assert rack.reader.cycle(6).message.id == 4

@@ -41,7 +41,9 @@ class Echo(Executor):
         """Add what is new, and count the cycles in which the writer is lost."""
         other = self.other
         if other.is_new:
-            self.status.backward += other.value.count <= self.status.count and self.status.total > 0
-            self.status.count = other.value.count
-            self.status.total += other.value.count
+            self.status.backward += (
+                other.message.count <= self.status.count and self.status.total > 0
+            )
+            self.status.count = other.message.count
+            self.status.total += other.message.count
         self.status.lost += other.is_lost

@@ -63,8 +63,8 @@ class QueueLink:
         """Do the writer's cycle, and send that many messages."""
         self._inputs.read(tick)
         port = self.writing.ports["point"]
-        message = port.message
         for _ in range(count):
+            message = port.message
             self.serial += 1
             message.id, message.row = self.serial, self.serial
             if not port.send():
@@ -192,7 +192,7 @@ def test_a_full_queue_is_one_alarm_an_episode(link: MakeQueue) -> None:
 def test_a_level_that_does_not_send_queues_one_message_a_cycle(link: MakeQueue) -> None:
     rack = link(2, sends=False)
     for tick in range(6):
-        message = rack.writing.ports["point"]
+        message = rack.ports.writers["point"].message
         message.id, message.row = tick + 1, tick + 1
         rack.write(tick, 0)
         if tick == 3:

@@ -64,7 +64,7 @@ def asked(run: Path, monkeypatch: pytest.MonkeyPatch) -> Asked:
 
 def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> None:
     found = asked(
-        *("goto 1.2", "show wave.status", "show wave.status.message", "step", "step 10", "back 3"),
+        *("goto 1.2", "show wave.status", "show wave.status.value", "step", "step 10", "back 3"),
         *("show wave.status", "goto 0", "back", "show wave.status", "quit", "goto 1"),
     )
     value = dict(
@@ -91,7 +91,7 @@ def test_a_condition_leads_to_where_it_begins_to_hold_forwards_and_backwards(
     held = value > limit
     begins = ticks[held & ~held.astype(bool).take(range(-1, len(held) - 1))] + 1
     begins = begins[begins > 1].tolist()
-    condition = f'--when "wave.status.message > {limit!r}"'
+    condition = f'--when "wave.status.value > {limit!r}"'
     found = asked(*(f"goto {condition}" for _ in range(len(begins) + 1)), f"back {condition}")
     assert [one["tick"] for one in found[: len(begins)]] == begins
     assert "does not begin to hold after" in found[len(begins)]["error"]
@@ -175,11 +175,11 @@ def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
         f"events {DIGITS}": "permitted: 0 to 1e+09 s",
         f"branch --seconds {DIGITS}": "permitted: 0 to 1e+09 s",
         f"branch --set seed={DIGITS}": "integer too long; permitted: 64 bits",
-        f"show wave.status.message[{DIGITS}]": "no such signal; nearest: wave.status.message",
-        f"show wave.status.message[{12 * DIGITS}]": "wave.status.message[9",
-        'goto --when "wave.status.valeu > 1"': "nearest: wave.status.message",
+        f"show wave.status.value[{DIGITS}]": "no such signal; nearest: wave.status.value",
+        f"show wave.status.value[{12 * DIGITS}]": "wave.status.value[9",
+        'goto --when "wave.status.valeu > 1"': "nearest: wave.status.value",
         "show wavf": "wavf: no such level, mailbox or signal; nearest: wave",
-        "show wave.status.message[3]": "no such index",
+        "show wave.status.value[3]": "no such index",
         "events -1": "-1: permitted: 0 to 1e+09 s",
         'show "wave': "No closing quotation",
         "help got": "got: no such command; nearest: goto",
@@ -196,13 +196,11 @@ def test_a_mistake_is_one_line_with_what_is_permitted(asked: Asked) -> None:
 
 
 def test_a_script_without_json_prints_text(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        sys, "stdin", StringIO("goto 1.2\nshow wave.status.message\nevents 5\nhelp")
-    )
+    monkeypatch.setattr(sys, "stdin", StringIO("goto 1.2\nshow wave.status.value\nevents 5\nhelp"))
     done = rack("rewind", run)
     assert done.returncode == 0
     lines = done.stdout.splitlines()
     assert lines[0] == "1.2 s, tick 480"
-    assert lines[1].startswith("wave.status.message = ")
+    assert lines[1].startswith("wave.status.value = ")
     assert any("time over after 800 ticks" in line for line in lines)
     assert rack("rewind", run.parent).returncode == 2

@@ -40,7 +40,7 @@ class Chain(NamedTuple):
                 "core": cores[-1 - number % len(cores)],
                 "every": 1,
                 "priority": PRIORITY,
-                "executor": f"{relay.__name__}:{'Relay' if number else 'Sender'}",
+                "executor": f"{relay.__name__}:{'Relay' if number else 'FirstBoard'}",
             }
             if number:
                 boards[name]["reads"] = {"message": f"board{number}.status"}

@@ -12,7 +12,7 @@ class Relayed(Status, version=1):
     sent: int = field(unit="tick", doc="cycle in which the first board sent this message")
 
 
-class Sender(Executor):
+class FirstBoard(Executor):
     """Sends a message in every cycle."""
 
     status = Output(Relayed)

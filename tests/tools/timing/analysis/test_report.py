@@ -39,7 +39,7 @@ MS = 1_000_000
 def test_the_messages_of_other_systems_have_the_names_that_the_report_looks_for() -> None:
     assert arm_outcome.DRIVING == DRIVING
     for kind in (ForceStatus, Wrench, HandStatus):
-        assert getattr(arm_outcome, kind.name.upper()) == kind.name
+        assert getattr(arm_outcome, kind.message_type.name.upper()) == kind.message_type.name
 
 
 class Watchful(Display):
