@@ -26,26 +26,18 @@ class Terse(Message, version=1):
 
 
 class CountCommand(Command, version=1):
-    """Count command."""
-
     goal: int = field(unit="1", doc="count to reach")
 
 
 class CountStatus(Status, version=1):
-    """Count status."""
-
     count: int = field(unit="1", doc="count reached")
 
 
 class CountPlan(Message, version=1):
-    """Count plan."""
-
     steps: np.ndarray = field("i8", unit="1", doc="counts to go, by joint", shape="joints")
 
 
 class SmallPlan(Message, version=1):
-    """Small plan."""
-
     steps: int = field(unit="1", doc="counts to go")
 
 

@@ -22,8 +22,6 @@ SIZES = {"row": 24}
 
 
 class Point(Message, version=3):
-    """Point."""
-
     id: int = field("u4", unit="1", doc="serial of the message")
     row: np.ndarray = field(
         "i8", unit="1", doc="the serial again in every place: half a message shows", shape="row"

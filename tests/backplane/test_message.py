@@ -25,15 +25,11 @@ from rack.backplane.message_type import Field, MessageType
 
 
 class Pose(Message, version=1):
-    """Pose."""
-
     position: np.ndarray = field(unit="m", doc="", shape=3)
     valid: int = field("u1", unit="1", doc="")
 
 
 class Track(Message, version=2):
-    """Track."""
-
     count: int = field("u2", unit="1", doc="poses")
     poses: np.ndarray = field(Pose, doc="way", shape="poses")
     angle: np.ndarray = field(unit="rad", doc="joints", shape=("joints", 2))

@@ -15,15 +15,11 @@ from rack.levels.tables import LIVE, Table, read_params, set_live
 
 
 class Step(Command, version=1):
-    """Step."""
-
     operator: int = RESTS_ON
     hold: bool = field(doc="1: hold")
 
 
 class Counted(AnsweringStatus, version=1):
-    """Counted."""
-
     count: int = field(unit="1", doc="cycles that were not held")
 
 

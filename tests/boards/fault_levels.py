@@ -10,8 +10,6 @@ from rack.levels.level import Executor, LevelContext, Output
 
 
 class Place(Status, version=1):
-    """Place."""
-
     position: float = field(unit="rad", doc="where it is")
     mode: int = field("i2", unit="1", doc="how it moves")
 

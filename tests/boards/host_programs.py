@@ -25,15 +25,11 @@ class Colour(IntEnum):
 
 
 class Number(Command, version=1):
-    """Number."""
-
     value: float = field(unit="1", doc="a number")
     colour: Colour = field(doc="its colour")
 
 
 class Sum(Status, version=1):
-    """Sum."""
-
     sum: float = field(unit="1", doc="of all numbers read")
     last: int = field("u4", unit="1", doc="newest id read")
 

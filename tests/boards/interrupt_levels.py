@@ -12,8 +12,6 @@ BOARDS = 5
 
 
 class Heard(Status, version=1):
-    """Heard."""
-
     cycle: np.ndarray = field(
         "i8",
         unit="tick",
@@ -24,8 +22,6 @@ class Heard(Status, version=1):
 
 
 class Order(Message, version=1):
-    """Order."""
-
     number: int = field("u4", unit="1", doc="number of the order")
 
 

@@ -11,21 +11,15 @@ from rack.levels.level import Executor, Input, LevelContext, Output, Planner, Qu
 
 
 class Request(Command, version=1):
-    """Request."""
-
     made_at: int = field(unit="tick", doc="release of the cycle that sent it")
 
 
 class Sent(Status, version=1):
-    """Sent."""
-
     sent: int = field(unit="1", doc="requests sent")
     refused: int = field(unit="1", doc="refused: queue full")
 
 
 class Taken(Status, version=1):
-    """Taken."""
-
     taken: int = field(unit="1", doc="requests taken")
     newest: int = field("u4", unit="1", doc="id of the newest request taken")
     repeated: int = field(unit="1", doc="requests not newer than the one before")

@@ -33,14 +33,10 @@ SILENT = 40
 
 
 class LevelStatus(Status, version=1):
-    """Level status."""
-
     moves: int = field("u2", unit="1", doc="of its program")
 
 
 class Braked(Status, version=1, message="arm_status"):
-    """Braked."""
-
     braked: bool = field(doc="1: brakes are engaged")
 
 
@@ -51,8 +47,6 @@ class Scene(Message, version=1):
 
 
 class Order(Message, version=1):
-    """Order."""
-
     id: int = field("u4", unit="1", doc="serial")
 
 

@@ -19,22 +19,16 @@ JOINTS = 3
 
 
 class TestPath(Command, version=1):
-    """Test path."""
-
     operator: int = RESTS_ON
     position: np.ndarray = field(unit="1", doc="of every joint", shape=JOINTS)
 
 
 class TestPart(Command, version=1):
-    """Test part."""
-
     operator: int = RESTS_ON
     position: np.ndarray = field(unit="1", doc="of this board's joint; others 0", shape=JOINTS)
 
 
 class TestSeen(AnsweringStatus, version=1):
-    """Test seen."""
-
     position: np.ndarray = field(unit="1", doc="", shape=JOINTS)
     lost: np.ndarray = field("u1", unit="1", doc="", shape=JOINTS)
 

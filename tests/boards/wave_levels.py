@@ -24,8 +24,6 @@ class WaveStatus(Status, version=1, message="wave"):
 
 
 class Gain(Message, version=1):
-    """Gain."""
-
     gain: float = field(unit="1", doc="factor")
     made_at: int = field(unit="tick", doc="release")
 

@@ -29,7 +29,7 @@ TAKES = {Operation.HOLD: (), Operation.RESUME: (), Operation.GOTO: (Goal.JOINTS,
 
 
 class Answering(AnsweringStatus, version=1):
-    """Answering."""
+    """A status that answers an operator."""
 
 
 RANGES = np.array([[-1.0, 1.0], [0.0, 2.0]])

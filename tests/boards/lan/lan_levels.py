@@ -14,8 +14,6 @@ class PulseStatus(Status, version=1, message="pulse"):
 
 
 class Heard(Status, version=1):
-    """Heard."""
-
     count: int = field(unit="1", doc="count last heard")
     total: int = field(unit="1", doc="sum of all counts heard")
     lost: int = field(unit="1", doc="cycles in which the other rack's writer was lost")

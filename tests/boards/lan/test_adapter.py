@@ -115,8 +115,6 @@ def test_a_rack_that_comes_is_sent_everything_anew(make: MakeAdapter) -> None:
 
 
 class Sent(Message, version=1):
-    """Sent."""
-
     value: float = field(unit="1", doc="a number")
 
 

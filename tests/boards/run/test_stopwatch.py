@@ -24,8 +24,6 @@ PERIOD_NS = 2_500_000
 
 
 class LevelStatus(Status, version=1):
-    """Level status."""
-
     value: float = field(unit="1", doc="a number")
 
 

@@ -23,14 +23,10 @@ class Gait(IntEnum):
 
 
 class Leg(Message, version=1):
-    """Leg."""
-
     angle: np.ndarray = field(unit="rad", doc="of hip and knee", shape=2)
 
 
 class Walker(Message, version=1):
-    """Walker."""
-
     gait: Gait = field(doc="what it does")
     speed: float = field(unit="m/s", doc="forwards")
     name: str = field("S8", doc="its name")

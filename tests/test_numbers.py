@@ -8,20 +8,41 @@ import inspect
 import pkgutil
 from collections.abc import Iterator
 from dataclasses import MISSING, fields, is_dataclass
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import pytest
+
 from rack.backplane.message_type import MessageType
-from tests.snapshots import ROOT, Snapshots, digest
+from tests.snapshots import Snapshots, digest
 
 KINDS = (bool, int, float, str, tuple, frozenset, dict, MessageType)
 
 
-def check_numbers(test: str) -> None:
-    """Compare the numbers of the room that a file of tests mirrors with those beside it."""
-    room = Path(test).parent.relative_to(ROOT / "tests")
-    name = ".".join(("rack", *room.parts))
+SNAPSHOTS = Snapshots(__file__)
+ROOMS = (
+    "backplane",
+    "backplane/clock",
+    "backplane/mailbox",
+    "backplane/watch",
+    "boards",
+    "boards/config",
+    "boards/config/rules",
+    "boards/crate",
+    "boards/faults",
+    "boards/host",
+    "boards/lan",
+    "boards/run",
+    "levels/systems/state_table",
+    "levels/timing",
+    "tools/faults",
+    "tools/faults/campaigns",
+)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_no_number_changes_unseen(room: str) -> None:
+    name = ".".join(("rack", *room.split("/")))
     package = importlib.import_module(name)
     found = {}
     for info in pkgutil.iter_modules(package.__path__, f"{name}."):
@@ -29,7 +50,7 @@ def check_numbers(test: str) -> None:
             numbers = dict(_numbers(importlib.import_module(info.name)))
             if numbers:
                 found[info.name] = numbers
-    Snapshots(test).check(str(room), found)
+    SNAPSHOTS.check(room, found)
 
 
 def _numbers(module: ModuleType) -> Iterator[tuple[str, Any]]:
