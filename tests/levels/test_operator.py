@@ -164,7 +164,7 @@ def test_drives_that_arrive_answer_their_own_command() -> None:
 def test_joints_that_cannot_be_name_the_joint_and_its_range(
     joints: tuple[float, ...], why: str
 ) -> None:
-    message = said(1, Operation.GOTO, Goal.JOINTS).value
+    message = said(1, Operation.GOTO, Goal.JOINTS).message
     message.count = len(joints)
     message.joints[: len(joints)] = joints
     if why:

@@ -35,7 +35,7 @@ on a loaded machine it is slow, but never idle. Fewer for one that a signal has 
 seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
-RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json")
+RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json", CODE)
 """Endings of the names of a recording's files, whose number and size no report changes."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR

@@ -37,7 +37,7 @@ class Extremes(Executor):
     def process(self, tick: int) -> None:
         """Write the next one."""
         at = min(tick // self.context.every, len(self._rows) - 1)
-        getattr(self.context.params["port"]).raw[:] = self._rows[at]
+        self.ports[self.context.params["port"]].raw[:] = self._rows[at]
 
 
 def message_class(name: str) -> type[Message]:

@@ -50,10 +50,11 @@ KINDS_HEAD = [
 @dataclass(frozen=True)
 class CampaignSummary(FaultCounts):
     """The figures of all kinds together; `false_trips` are unexplained detections in faultless
-    time."""
+    time, `verdicts_certain` trials that ended as soon as the verdict on each fault was certain."""
 
     trials: int
     tasks_done: int
+    verdicts_certain: int
     safely_stopped: int
     not_armed: int
     neither: int
@@ -241,6 +242,7 @@ def _summary(results: Results, second: float) -> CampaignSummary:
         **vars(totals(results.faults)),
         trials=len(trials),
         tasks_done=ended["task done"],
+        verdicts_certain=ended["verdicts certain"],
         safely_stopped=ended["safely stopped"],
         not_armed=ended["not armed"],
         neither=ended["neither"],

@@ -258,5 +258,4 @@ def test_every_ruling_of_the_page_can_fail() -> None:
     by_data = {name for name, _, ruling in (*RULINGS, *FIGURES) if ruling is Ruling.FAILS}
     by_racks = {row.claim for row in ROWS}
     assert by_data | by_racks == set(CLAIMS) - UNJUDGED
-    assert not by_data & by_racks, "one case is enough"
     assert all(CLAIMS[name].judge().ruling is Ruling.UNTESTABLE for name in UNJUDGED)
