@@ -101,7 +101,7 @@ class Interrupt:
         """Kill this process's children, remove its racks, and end at once."""
         try:
             signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
-            family = list(descendants(os.getpid(), os.getsid(0)))
+            family = [pid for pid in descendants(os.getpid(), os.getsid(0)) if not _cleans_up(pid)]
             for step in (partial(_kill, family), partial(_remove_racks, family), self._take_leave):
                 # A step that fails must not prevent the others, nor the end.
                 with suppress(Exception):
@@ -127,6 +127,14 @@ class Interrupt:
 
 INTERRUPT = Interrupt()
 """The only one: signals belong to the process."""
+
+
+def _cleans_up(pid: int) -> bool:
+    """Say whether a process is Python's own that removes the semaphores of a pool of processes: it
+    does so, and ends, when this process has ended."""
+    with suppress(OSError):
+        return b"multiprocessing.resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    return False
 
 
 def _interrupted() -> None:

@@ -85,6 +85,7 @@ def test_a_signal_ends_trials_in_the_middle_of_their_launch_and_keeps_those_befo
     text = small.read_text().replace("python_path = [", f'python_path = ["{tmp_path}", ')
     small.write_text(text.replace("two_levels:Upper", "stalling:Stalling"))
     out = tmp_path / "campaign"
+    before = semaphores_of_python()
     process = subprocess.Popen(
         [
             *RACK,
@@ -123,6 +124,12 @@ def test_a_signal_ends_trials_in_the_middle_of_their_launch_and_keeps_those_befo
     wait_until(lambda: not [name for name in racks if named(name)])
     left = [path.name for path in SHM_FOLDER.iterdir()]
     assert not [name for name in left if any(rack in name for rack in racks)]
+    # Those of tests beside this one go with them.
+    wait_until(lambda: semaphores_of_python() <= before, BOUND_S)
+
+
+def semaphores_of_python() -> set[str]:
+    return {path.name for path in SHM_FOLDER.glob("sem.mp-*")}
 
 
 @pytest.mark.slow
