@@ -114,7 +114,7 @@ class HandExecutor(Executor):
             torn[int(fault.parameters["side"])] |= struck
             if struck.any():
                 self._torn[place] = True
-        self.hand.tear(torn)
+        self.hand.tear_tendons(torn)
 
     def process(self, tick: int) -> None:
         """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
@@ -131,22 +131,22 @@ class HandExecutor(Executor):
             self._closed_at = tick
         self.orders.take(self.operator)
         sample = hand.sense()
-        self.findings += self._slack.look(sample.tension, hand.wanted)
+        self.findings += self._slack.check_tensions(sample.tension, hand.wanted)
         self.acted |= self._torn
-        self._drive(tick)
-        self._report(self.status, sample, tick)
+        self._command_valves(tick)
+        self._fill_status(self.status, sample, tick)
         self.orders.report(self.status, self.wanted_tensions.rests_on)
         hand.save(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             hand.look(self.scene)
 
-    def _drive(self, tick: int) -> None:
+    def _command_valves(self, tick: int) -> None:
         """Give the valves the tensions of the boards above, or close them and say why."""
         since = self._closed_at if self._opened else 0
         self._waiting = self.wanted_tensions.missing(self.tensions, tick, since or 0)
         if not self._waiting:
-            self.wanted_tensions.join(self.tensions)
-            found, self._waiting = self.wanted_tensions.check()
+            self.wanted_tensions.merge_commands(self.tensions)
+            found, self._waiting = self.wanted_tensions.limit_tensions()
             if found is not None:
                 self.hand.refuse(found)
         held = self.orders.holds
@@ -157,15 +157,15 @@ class HandExecutor(Executor):
         if self._waiting:
             if self._closed_at is None:
                 self._closed_at = tick
-            self.hand.close()
+            self.hand.close_valves()
             if held:
                 self.orders.done()
         else:
             self._closed_at = None
             self._opened = True
-            self.hand.pull(self.wanted_tensions.tension)
+            self.hand.apply_tensions(self.wanted_tensions.tension)
 
-    def _report(self, status: HandStatus, sample: HandSample, tick: int) -> None:
+    def _fill_status(self, status: HandStatus, sample: HandSample, tick: int) -> None:
         """Fill the status."""
         hand = self.hand
         status.tick = tick
@@ -215,7 +215,7 @@ class SlackMonitor:
         self._any = False  # one was, in the last cycle
         self.note = ""  # which tendons are slack, readable; empty: none
 
-    def look(self, tension: Array, wanted: Array) -> list[Finding]:
+    def check_tensions(self, tension: Array, wanted: Array) -> list[Finding]:
         """Return new findings of a cycle; tensions as sensed, and as wanted of the valves, are (2,
         joints), N."""
         if tension.min() >= self._slack and not self._any:
@@ -248,7 +248,7 @@ class Tensions(CommandsAbove):
         self.tension = np.zeros((2, len(hand.most)))  # N
         self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
 
-    def join(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
+    def merge_commands(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
         """Set `tension` and `rests_on`, while nothing is `missing`."""
         self.rests_on = 0
         for board in self.oldest:
@@ -256,7 +256,7 @@ class Tensions(CommandsAbove):
             self.rests_on = max(self.rests_on, value.operator)
             np.copyto(self.tension, value.tension, where=value.driven != 0)
 
-    def check(self) -> tuple[Finding | None, str]:
+    def limit_tensions(self) -> tuple[Finding | None, str]:
         """Cut `tension` to its limits. Return what was cut, or refused, and why it is refused;
         empty: it is not."""
         tension = self.tension

@@ -79,7 +79,9 @@ class GraspExecutor(Executor):
             params=params,
             names=names,
             joints=context.robot.joints,
-            postures={name: self._posture(given) for name, given in self._program.posture.items()},
+            postures={
+                name: self._join_posture(given) for name, given in self._program.posture.items()
+            },
             period_s=context.period_s,
             fingers=FingersBelow(context, kinematics.joints),
             target=GraspTarget.zeros(context.sizes),
@@ -88,7 +90,7 @@ class GraspExecutor(Executor):
         )
         self._work: StepWork | None = None  # on the step under way
         self._done = 0  # steps that are done
-        self._passed_s = 0.0  # since the step under way began, without waiting
+        self._elapsed_s = 0.0  # since the step under way began, without waiting
         self._waited_s = 0.0  # in a row, other than for an operator
         self._failed = Refused(Error.NONE, "")
         self._plan = GraspPlan.zeros(context.sizes)  # in use; id 0: none
@@ -123,19 +125,19 @@ class GraspExecutor(Executor):
         report."""
         grasp = self._grasp
         self._orders.take(self.operator)
-        grasp.fingers.look(self.fingers)
+        grasp.fingers.read_statuses(self.fingers)
         if self.world.message.revision:
             # Find the object in the world model.
-            close = self._closing()
+            close = self._find_close_step()
             if close is not None:
-                row = self._row(close)
+                row = self._find_row(close)
                 self._grasp.object = self._from_world @ Pose(
                     self.world.message.position[row], self.world.message.quaternion[row]
                 )
         if not self._started:
             self._started = True
-            self._recall()
-        waits = self._waits()
+            self._restore_progress()
+        waits = self._waiting_reason()
         # Fail when something has kept the program for too long.
         is_over = self._done == len(self._program.step) or self._orders.holds
         self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
@@ -144,18 +146,18 @@ class GraspExecutor(Executor):
                 Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}"
             )
         if not waits and not self._failed.code and self._done < len(self._program.step):
-            self._go_on()
+            self._run_step()
         if waits or self._failed.code:
             grasp.target.velocity[:] = grasp.target.tip_velocity[:] = 0.0
         grasp.target.id += 1
         grasp.target.operator = self._orders.basis
         self.command.copy_from(grasp.target)
-        self._report(self.status, waits)
+        self._fill_status(self.status, waits)
 
-    def _row(self, close: CloseStep) -> int:
+    def _find_row(self, close: CloseStep) -> int:
         return self.context.scene.objects.index(close.object)
 
-    def _posture(self, posture: Posture) -> Array:
+    def _join_posture(self, posture: Posture) -> Array:
         """Return a posture of all fingers as one of all joints, (joints,), rad."""
         hand = self.context.robot.hand
         joints = self.context.robot.joints
@@ -165,64 +167,66 @@ class GraspExecutor(Executor):
             position[[joints.index(joint) for joint in finger.joints]] = posture[finger.name]
         return position
 
-    def _closing(self) -> CloseStep | None:
+    def _find_close_step(self) -> CloseStep | None:
         """Return the newest step that has closed, or closes, on an object; None: there is none
         yet."""
         steps = self._program.step[: self._done + 1]
         return next((step for step in reversed(steps) if isinstance(step, CloseStep)), None)
 
-    def _waits(self) -> str:
+    def _waiting_reason(self) -> str:
         """Return why the step under way does not go on; empty: it does."""
         if self._grasp.fingers.awaited:
             return self._grasp.fingers.awaited
         if self._orders.holds:
             self._orders.done()
             return self._orders.keeps(self.context.board)
-        if self.world.is_lost or (self._closing() is not None and self._grasp.object is None):
+        if self.world.is_lost or (
+            self._find_close_step() is not None and self._grasp.object is None
+        ):
             return NO_WORLD
-        if self.plan and not self._newest(self.plan).id and self._awaits_plan():
+        if self.plan and not self._find_newest_plan(self.plan).id and self._needs_plan():
             return NO_PLAN.format(", ".join(self.plan))
         return ""
 
     @staticmethod
-    def _newest(plans: Mapping[str, Reading[GraspPlan]]) -> GraspPlan:
+    def _find_newest_plan(plans: Mapping[str, Reading[GraspPlan]]) -> GraspPlan:
         return max((reading.message for reading in plans.values()), key=lambda plan: plan.id)
 
-    def _awaits_plan(self) -> bool:
+    def _needs_plan(self) -> bool:
         """Return whether the step under way is to be planned: a CLOSE, or a PRESHAPE before it."""
         kinds = [type(step) for step in self._program.step[self._done : self._done + 2]]
         return kinds[:1] == [CloseStep] or kinds == [PreshapeStep, CloseStep]
 
-    def _go_on(self) -> None:
+    def _run_step(self) -> None:
         """Begin the step under way, or go on with it."""
         if self._work is None:
-            if self.plan and self._awaits_plan() and not self._passed_s:
-                self._plan.copy_from(self._newest(self.plan))
-            self._begin()
+            if self.plan and self._needs_plan() and not self._elapsed_s:
+                self._plan.copy_from(self._find_newest_plan(self.plan))
+            self._begin_step()
         assert self._work is not None
         try:
-            done = self._work.do(self._passed_s)
+            done = self._work.run(self._elapsed_s)
         except Refused as failure:
             self._failed = failure
             return
-        self._passed_s += self.context.period_s
+        self._elapsed_s += self.context.period_s
         if done:
             self._work = None
-            self._passed_s = 0.0
+            self._elapsed_s = 0.0
             self._done += 1
 
-    def _begin(self) -> None:
+    def _begin_step(self) -> None:
         """Begin a step, for the first time or after a restart."""
         grasp = self._grasp
-        step = self._prepared(self._done)
+        step = self._prepare_step(self._done)
         if isinstance(step, CloseStep):
-            self._take_up(step)
-            if not self._passed_s:
+            self._adopt_close_step(step)
+            if not self._elapsed_s:
                 grasp.touching[:] = False
         grasp.target.active = True
-        self._work = WORKS[type(step)](grasp, step, self._passed_s)
+        self._work = WORKS[type(step)](grasp, step, self._elapsed_s)
 
-    def _take_up(self, close: CloseStep) -> None:
+    def _adopt_close_step(self, close: CloseStep) -> None:
         """Grip by a CLOSE from now on."""
         grasp = self._grasp
         gripping = np.array([name in close.points for name in grasp.names])
@@ -230,7 +234,7 @@ class GraspExecutor(Executor):
         grasp.base = 0.0
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
-    def _prepared(self, index: int) -> Step:
+    def _prepare_step(self, index: int) -> Step:
         """Return a step of the program with what the plan says, and with ways in the frame of the
         palm."""
         step = self._program.step[index]
@@ -250,12 +254,12 @@ class GraspExecutor(Executor):
         after = self._program.step[index - 1] if isinstance(step, SqueezeStep) else None
         if isinstance(after, CloseStep):
             return step.model_copy(update={"grip": plan.grip})
-        if isinstance(step, PreshapeStep) and self._awaits_plan():
+        if isinstance(step, PreshapeStep) and self._needs_plan():
             self._grasp.postures[PLANNED] = plan.posture.copy()
             return step.model_copy(update={"posture": PLANNED})
         return step
 
-    def _recall(self) -> None:
+    def _restore_progress(self) -> None:
         """Continue after a restart, from the level's own last messages."""
         if not (self.last_status.is_there and self.last_command.is_there):
             return
@@ -263,13 +267,13 @@ class GraspExecutor(Executor):
         grasp = self._grasp
         grasp.target.copy_from(self.last_command.message)
         self._done = status.step
-        self._passed_s = status.passed
+        self._elapsed_s = status.passed
         if status.plan and self.plan:
-            self._plan.copy_from(self._newest(self.plan))
+            self._plan.copy_from(self._find_newest_plan(self.plan))
         for index in range(min(self._done + 1, len(self._program.step))):
-            step = self._prepared(index)
+            step = self._prepare_step(index)
             if isinstance(step, CloseStep):
-                self._take_up(step)
+                self._adopt_close_step(step)
             elif isinstance(step, SqueezeStep):
                 grasp.base = step.grip if index < self._done else status.grip
         grasp.grip.force = status.grip
@@ -281,7 +285,7 @@ class GraspExecutor(Executor):
         if status.state == State.ERROR:
             self._failed = Refused(status.error, status.reason)
 
-    def _report(self, status: GraspStatus, waits: str) -> None:
+    def _fill_status(self, status: GraspStatus, waits: str) -> None:
         grasp = self._grasp
         steps = self._program.step
         status.echo = grasp.target.id
@@ -290,10 +294,10 @@ class GraspExecutor(Executor):
         status.kind = GraspKind.NONE
         if self._work is not None:
             status.kind = GraspKind[self._work.step.do.upper()]
-        status.passed = self._passed_s
+        status.passed = self._elapsed_s
         status.touching = grasp.touching
         status.grip = grasp.grip.force
-        status.object = -1 if grasp.close is None else self._row(grasp.close)
+        status.object = -1 if grasp.close is None else self._find_row(grasp.close)
         status.load = grasp.grip.load
         status.anchor = grasp.anchor
         status.plan = self._plan.id

@@ -121,17 +121,17 @@ class GraspProgram(Program):
                 f"the hand has no such finger; fingers: {', '.join(names)}",
             )
         for name, posture in self.posture.items():
-            yield from _misfits_of_posture(f"posture.{name}", posture, hand)
+            yield from _check_posture(f"posture.{name}", posture, hand)
         gripped = False
         for k, step in enumerate(self.step):
             if isinstance(step, PreshapeStep) and step.posture not in self.posture:
                 yield (
                     f"step[{k}].posture",
                     step.posture,
-                    f"no such posture; postures: {_listed(self.posture)}",
+                    f"no such posture; postures: {_list_names(self.posture)}",
                 )
             if isinstance(step, CloseStep):
-                yield from _misfits_of_close(f"step[{k}]", step, self.opposing, names, scene)
+                yield from _check_close_step(f"step[{k}]", step, self.opposing, names, scene)
             if isinstance(step, GRIPPING) and not gripped:
                 yield (
                     f"step[{k}].do",
@@ -147,7 +147,7 @@ class GraspProgram(Program):
             gripped = isinstance(step, CloseStep) or (gripped and not isinstance(step, ReleaseStep))
 
 
-def _misfits_of_posture(key: str, posture: Posture, hand: HandConfig) -> Misfits:
+def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Misfits:
     names = {finger.name: len(finger.joints) for finger in hand.finger}
     for name, values in posture.items():
         if name not in names:
@@ -166,11 +166,15 @@ def _misfits_of_posture(key: str, posture: Posture, hand: HandConfig) -> Misfits
         yield key, list(posture), f"it lacks: {', '.join(missing)}"
 
 
-def _misfits_of_close(
+def _check_close_step(
     key: str, step: CloseStep, opposing: str, names: list[str], scene: SceneConfig
 ) -> Misfits:
     if step.object not in scene.objects:
-        yield f"{key}.object", step.object, f"not in the scene; objects: {_listed(scene.objects)}"
+        yield (
+            f"{key}.object",
+            step.object,
+            f"not in the scene; objects: {_list_names(scene.objects)}",
+        )
     for name in step.points:
         if name not in names:
             yield (
@@ -186,5 +190,5 @@ def _misfits_of_close(
         )
 
 
-def _listed(names: Any) -> str:
+def _list_names(names: Any) -> str:
     return ", ".join(names) or "none"

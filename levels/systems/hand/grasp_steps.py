@@ -2,7 +2,7 @@
 fingers next.
 
 A step is begun once, and again after a restart of its board: from where the fingers are, with the
-time that it was under way. Its `do` returns whether it is done, and raises `Refused` when it has
+time that it was under way. Its `run` returns whether it is done, and raises `Refused` when it has
 failed.
 """
 
@@ -53,7 +53,7 @@ class FingersBelow:
         self.error = Error.NONE  # of the hand
         self.rests_on = 0  # newest command of an operator that all boards rest on
 
-    def look(self, statuses: Mapping[str, Reading[FingerStatus]]) -> None:
+    def read_statuses(self, statuses: Mapping[str, Reading[FingerStatus]]) -> None:
         """Read the statuses of all boards."""
         self.awaited = ""
         self.error = Error.NONE
@@ -111,44 +111,44 @@ class Grasp:
     farthest: float = 0.0  # m: largest such distance since it was gripped
 
     @property
-    def object_at(self) -> Array:
+    def object_position(self) -> Array:
         """Where the object is, (3,), m."""
         return self.anchor if self.object is None else self.object.position
 
     @property
-    def missing(self) -> list[str]:
+    def missing_fingers(self) -> list[str]:
         """Names of the fingers that should touch the object, and do not."""
         return [self.names[finger] for finger in np.flatnonzero(self.grip.fingers & ~self.touching)]
 
 
 class StepWork(ABC):
-    """A step at work, begun `begun_s` after it began first."""
+    """A step at work, begun `resumed_s` after it began first."""
 
-    def __init__(self, grasp: Grasp, step: Any, begun_s: float) -> None:
+    def __init__(self, grasp: Grasp, step: Any, resumed_s: float) -> None:
         self.grasp = grasp
         self.step = step
-        self.begun_s = begun_s
-        self.begin()
+        self.resumed_s = resumed_s
+        self.set_start()
 
     @abstractmethod
-    def begin(self) -> None:
+    def set_start(self) -> None:
         """Note from where the step goes on."""
 
     @abstractmethod
-    def do(self, passed_s: float) -> bool:
-        """Fill the target, `passed_s` after the step began; return whether it is done."""
+    def run(self, elapsed_s: float) -> bool:
+        """Fill the target, `elapsed_s` after the step began; return whether it is done."""
 
-    def progress(self, passed_s: float) -> tuple[float, float]:
+    def find_progress(self, elapsed_s: float) -> tuple[float, float]:
         """Return the part of what was left at the beginning that is done by now, 0 to 1, and its
         rate, 1/s."""
-        part, rate = least_jerk(passed_s / self.step.seconds)
-        before, _ = least_jerk(self.begun_s / self.step.seconds)
+        part, rate = minimum_jerk(elapsed_s / self.step.seconds)
+        before, _ = minimum_jerk(self.resumed_s / self.step.seconds)
         if before >= 1.0:
             return 1.0, 0.0
         return (part - before) / (1.0 - before), rate / self.step.seconds / (1.0 - before)
 
 
-def least_jerk(time: float) -> tuple[float, float]:
+def minimum_jerk(time: float) -> tuple[float, float]:
     """Return the way, 0 to 1, at `time`, 0 to 1, of the motion of least jerk (Flash and Hogan,
     1985), and its rate."""
     x = min(max(time, 0.0), 1.0)
@@ -160,16 +160,16 @@ class PreshapeWork(StepWork):
 
     step: PreshapeStep
 
-    def begin(self) -> None:
+    def set_start(self) -> None:
         """Start at the targets that the joints have."""
         self._start = self.grasp.fingers.target.copy()
         self._posture = self.grasp.postures[self.step.posture]
 
-    def do(self, passed_s: float) -> bool:
+    def run(self, elapsed_s: float) -> bool:
         """Move the joints."""
         grasp = self.grasp
         target = grasp.target
-        part, rate = self.progress(passed_s)
+        part, rate = self.find_progress(elapsed_s)
         way = self._posture - self._start
         target.mode[:] = FingerMode.JOINTS
         target.force[:] = 0.0
@@ -180,7 +180,7 @@ class PreshapeWork(StepWork):
         away = np.abs(grasp.fingers.position - self._posture)
         if (away < grasp.params.astray).all():
             return True
-        if passed_s > self.step.seconds + grasp.params.patience:
+        if elapsed_s > self.step.seconds + grasp.params.patience:
             joint = int(away.argmax())
             far = (
                 f"joint '{grasp.joints[joint]}' is {away[joint]:.2g} rad from posture"
@@ -196,7 +196,7 @@ class CloseWork(StepWork):
 
     step: CloseStep
 
-    def begin(self) -> None:
+    def set_start(self) -> None:
         """Start where the tips are."""
         grasp = self.grasp
         step = self.step
@@ -211,23 +211,25 @@ class CloseWork(StepWork):
         # N: with which the opposing one presses.
         self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])
 
-    def do(self, passed_s: float) -> bool:
+    def run(self, elapsed_s: float) -> bool:
         """Move the tips."""
         grasp = self.grasp
         target = grasp.target
-        part = min((passed_s - self.begun_s) / self._seconds, 1.0)
+        part = min((elapsed_s - self.resumed_s) / self._seconds, 1.0)
         for finger in np.flatnonzero(grasp.grip.fingers & ~grasp.touching).tolist():
             way = self._ways[finger]
             if norm(grasp.fingers.force[finger]) >= self.step.touch:
                 grasp.touching[finger] = True
-                self._stay(finger, grasp.grip.shares[finger] * self._touch * way / norm(way))
+                self._hold_contact(
+                    finger, grasp.grip.shares[finger] * self._touch * way / norm(way)
+                )
             else:
                 target.mode[finger] = FingerMode.POINT
                 target.tip[finger] = self._start[finger] + part * way
                 target.tip_velocity[finger] = way / self._seconds if part < 1.0 else 0.0
-        missing = grasp.missing
-        at_the_end = passed_s - self.begun_s > self._seconds + grasp.params.patience
-        if missing and (at_the_end or passed_s > self.step.seconds):
+        missing = grasp.missing_fingers
+        at_the_end = elapsed_s - self.resumed_s > self._seconds + grasp.params.patience
+        if missing and (at_the_end or elapsed_s > self.step.seconds):
             raise Refused(
                 Error.GRASP_MISSED,
                 f"missed '{self.step.object}': touched nothing: {', '.join(missing)}",
@@ -235,7 +237,7 @@ class CloseWork(StepWork):
         grasp.base = grasp.grip.force = self._touch
         return not missing
 
-    def _stay(self, finger: int, force: Array) -> None:
+    def _hold_contact(self, finger: int, force: Array) -> None:
         """Let a finger stay where its tip is, as a spring, and press with `force`, (3,), N."""
         grasp = self.grasp
         target = grasp.target
@@ -250,35 +252,35 @@ class GrippingWork(StepWork):
     """Base of the steps while the fingers have the object: they keep the grip, and notice when it
     is lost."""
 
-    def begin(self) -> None:
+    def set_start(self) -> None:
         """Start with every finger at the object."""
         # (fingers,), s: time for which one has not touched.
         self._silent_s = np.zeros(len(self.grasp.names))
 
-    def keep(self) -> None:
+    def keep_grip(self) -> None:
         """Press with the grip that the load asks for; raises `Refused` when the object is lost."""
         grasp = self.grasp
         fingers = grasp.fingers
-        away = grasp.object_at - grasp.anchor
+        away = grasp.object_position - grasp.anchor
         grasp.moved = norm(away)
         grasp.farthest = max(grasp.farthest, grasp.moved)
-        grasp.grip.follow(grasp.target.tip, fingers.tip)
-        grasp.grip.recover(away)
-        grasp.grip.adapt(grasp.base, fingers.force)
-        self.press()
+        grasp.grip.follow_creep(grasp.target.tip, fingers.tip)
+        grasp.grip.recover_position(away)
+        grasp.grip.adapt_force(grasp.base, fingers.force)
+        self.apply_grip()
 
-    def press(self) -> None:
+    def apply_grip(self) -> None:
         """Press with the grip as it is; raises `Refused` when the object is lost."""
         grasp = self.grasp
         params = grasp.params
         close = grasp.close
-        grasp.target.force = grasp.grip.forces(grasp.fingers.tip)
+        grasp.target.force = grasp.grip.find_forces(grasp.fingers.tip)
         assert close is not None, "checked with the program"
         felt = np.array([norm(force) for force in grasp.fingers.force])
         silent = felt < SLIPPED_PART * close.touch
         self._silent_s = np.where(silent, self._silent_s + grasp.period_s, 0.0)
         grasp.touching[:] = grasp.grip.fingers & (self._silent_s < params.lost)
-        if missing := grasp.missing:
+        if missing := grasp.missing_fingers:
             raise Refused(
                 Error.OBJECT_LOST,
                 f"lost '{close.object}': no longer touched by {', '.join(missing)}",
@@ -297,18 +299,18 @@ class SqueezeWork(GrippingWork):
 
     step: SqueezeStep
 
-    def begin(self) -> None:
+    def set_start(self) -> None:
         """Start with the grip as it is."""
-        super().begin()
+        super().set_start()
         self._from = self.grasp.base
 
-    def do(self, passed_s: float) -> bool:
+    def run(self, elapsed_s: float) -> bool:
         """Squeeze."""
         grasp = self.grasp
-        part, _ = self.progress(passed_s)
-        grasp.anchor[:] = grasp.object_at
+        part, _ = self.find_progress(elapsed_s)
+        grasp.anchor[:] = grasp.object_position
         grasp.base = grasp.grip.force = self._from + part * (self.step.grip - self._from)
-        self.press()
+        self.apply_grip()
         return part >= 1.0
 
 
@@ -318,24 +320,24 @@ class ShiftWork(GrippingWork):
 
     step: ShiftStep
 
-    def begin(self) -> None:
+    def set_start(self) -> None:
         """Start with the way that is left."""
-        super().begin()
-        done, _ = least_jerk(self.begun_s / self.step.seconds)
+        super().set_start()
+        done, _ = minimum_jerk(self.resumed_s / self.step.seconds)
         self._way = (1.0 - done) * np.array(self.step.by)
         self._part = 0.0
 
-    def do(self, passed_s: float) -> bool:
+    def run(self, elapsed_s: float) -> bool:
         """Move the object."""
         grasp = self.grasp
         target = grasp.target
-        part, rate = self.progress(passed_s)
+        part, rate = self.find_progress(elapsed_s)
         gone = (part - self._part) * self._way
         self._part = part
         grasp.anchor += gone
         target.tip[grasp.grip.fingers] += gone
         target.tip_velocity[grasp.grip.fingers] = rate * self._way
-        self.keep()
+        self.keep_grip()
         return part >= 1.0
 
 
@@ -344,10 +346,10 @@ class HoldWork(GrippingWork):
 
     step: HoldStep
 
-    def do(self, passed_s: float) -> bool:
+    def run(self, elapsed_s: float) -> bool:
         """Keep it."""
-        self.keep()
-        return passed_s >= self.step.seconds
+        self.keep_grip()
+        return elapsed_s >= self.step.seconds
 
 
 class ReleaseWork(StepWork):
@@ -355,27 +357,27 @@ class ReleaseWork(StepWork):
 
     step: ReleaseStep
 
-    def begin(self) -> None:
+    def set_start(self) -> None:
         """Start with the grip as it is, where the tips are."""
         grasp = self.grasp
         self._force = grasp.grip.force
         self._load = grasp.grip.load.copy()
         self._start = grasp.fingers.tip.copy()
-        self._out = grasp.grip.outwards(grasp.fingers.tip)
+        self._out = grasp.grip.find_outward_directions(grasp.fingers.tip)
 
-    def do(self, passed_s: float) -> bool:
+    def run(self, elapsed_s: float) -> bool:
         """Let go."""
         grasp = self.grasp
         target = grasp.target
         half = 0.5 * self.step.seconds
-        if passed_s < half:
-            left = 1.0 - passed_s / half
+        if elapsed_s < half:
+            left = 1.0 - elapsed_s / half
             grasp.grip.force = left * self._force
             grasp.grip.load[:] = left * self._load
-            target.force = grasp.grip.forces(grasp.fingers.tip)
+            target.force = grasp.grip.find_forces(grasp.fingers.tip)
             self._start[:] = target.tip
             return False
-        part, rate = least_jerk(passed_s / half - 1.0)
+        part, rate = minimum_jerk(elapsed_s / half - 1.0)
         grasp.grip.force = 0.0
         grasp.grip.load[:] = 0.0
         grasp.touching[:] = False

@@ -60,21 +60,21 @@ class HandGrip:
         self.force = 0.0  # N: of the opposing finger
         self.load = np.zeros(3)  # N: by which the tips together press against weight and pull
 
-    def adapt(self, base: float, sensed: Array) -> None:
+    def adapt_force(self, base: float, sensed: Array) -> None:
         """Set the grip to `base`, N, and more by the load on the tips; `sensed`, (fingers, 3), N:
         on the tips."""
         borne = norm(sensed[self._others].sum(axis=0) + sensed[self._opposing])
         wanted = min(base + self._gains.reserve * borne, self._gains.most_grip)
         self.force = max(wanted, self.force - FALL_N_S * self._period_s)
 
-    def recover(self, away: Array) -> None:
+    def recover_position(self, away: Array) -> None:
         """Press more against what holds the object `away`, (3,), m, from its anchor."""
         self.load -= self._gains.recover * self._period_s * away
         excess = norm(self.load)
         if excess > self._gains.most_load:
             self.load *= self._gains.most_load / excess
 
-    def follow(self, points: Array, tips: Array) -> None:
+    def follow_creep(self, points: Array, tips: Array) -> None:
         """Let the `points` of the springs, (fingers, 3), m, follow the tips, all by the same
         way."""
         stiffness = self.stiffness[:, None]
@@ -83,14 +83,15 @@ class HandGrip:
         points[self.fingers] += way
         self.load -= whole * way
 
-    def forces(self, tips: Array) -> Array:
+    def find_forces(self, tips: Array) -> Array:
         """Return the force of every finger with its tip at `tips`, (fingers, 3), m: (fingers, 3),
         N."""
         return np.asarray(
-            self.shares[:, None] * (0.5 * self.load - self.force * self.outwards(tips))
+            self.shares[:, None]
+            * (0.5 * self.load - self.force * self.find_outward_directions(tips))
         )
 
-    def outwards(self, tips: Array) -> Array:
+    def find_outward_directions(self, tips: Array) -> Array:
         """Return the directions in which the tips leave the object, (fingers, 3), length 1; 0 for
         other fingers."""
         directions = np.zeros_like(tips)

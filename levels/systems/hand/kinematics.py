@@ -41,21 +41,21 @@ class FingerKinematics:
         # From the palm's frame into the world's.
         self.rotation = d.site_xmat[cell.tool].reshape(3, 3).copy()
 
-    def look(self, position: Array) -> None:
+    def set_position(self, position: Array) -> None:
         """Go to joint positions, (joints,), rad: tips and Jacobians are for these from now on."""
         self._data.qpos[self._cell.qpos] = position
         mujoco.mj_kinematics(self._cell.model, self._data)
         mujoco.mj_comPos(self._cell.model, self._data)
 
-    def tip(self, finger: int) -> Array:
+    def find_tip(self, finger: int) -> Array:
         """Return the tip of a finger, (3,), m."""
-        return self.from_world(self._data.site_xpos[self._tips[finger]])
+        return self.to_palm_frame(self._data.site_xpos[self._tips[finger]])
 
-    def from_world(self, point: Array) -> Array:
+    def to_palm_frame(self, point: Array) -> Array:
         """Return a point of the world, (3,), m, in the frame of the palm."""
         return transposed_mat_vec(self.rotation, point - self.palm.position)
 
-    def jacobian(self, finger: int) -> Array:
+    def find_jacobian(self, finger: int) -> Array:
         """Return the Jacobian of the tip of a finger by its own joints, (3, joints of the finger),
         m/rad."""
         mujoco.mj_jacSite(self._cell.model, self._data, self._whole, None, self._tips[finger])
@@ -64,7 +64,7 @@ class FingerKinematics:
         mujoco.mju_mulMatTMat(rotated, self.rotation, own)
         return rotated
 
-    def step(self, finger: int, position: Array, way: Array, homing: Array) -> None:
+    def step_towards(self, finger: int, position: Array, way: Array, homing: Array) -> None:
         """Move the joints of a finger in `position`, (joints,), rad, so that its tip goes `way`,
         (3,), m: one step.
 
@@ -72,7 +72,7 @@ class FingerKinematics:
         that do so it takes the one nearest to `homing`, (joints of the finger,), rad.
         """
         own = self.joints[finger]
-        jacobian = self.jacobian(finger)
+        jacobian = self.find_jacobian(finger)
         square = np.empty((3, 3))
         mujoco.mju_mulMatMatT(square, jacobian, jacobian)
         square.flat[::4] += DAMPING_M2

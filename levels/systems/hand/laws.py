@@ -98,15 +98,15 @@ class FingertipLaw:
         """Begin with targets, and a posture, at `position`, (joints,), rad."""
         self.wanted[:] = self._rest[:] = position
 
-    def sense(self, position: Array) -> Array:
+    def find_tips(self, position: Array) -> Array:
         """Take the joint positions sensed, (joints,), rad; return the tips, (fingers, 3), m, of
         this law's fingers."""
-        self.kinematics.look(position)
+        self.kinematics.set_position(position)
         for finger in self._fingers:
-            self._tips[finger] = self.kinematics.tip(finger)
+            self._tips[finger] = self.kinematics.find_tip(finger)
         return self._tips
 
-    def targets(self, grasp: GraspTarget, ahead_s: float, out: FingerTarget) -> None:
+    def set_targets(self, grasp: GraspTarget, ahead_s: float, out: FingerTarget) -> None:
         """Fill a `FingerTarget` from a `GraspTarget`, taken on by `ahead_s` at its velocities;
         after `sense`."""
         before = self.wanted.copy()
@@ -122,14 +122,14 @@ class FingertipLaw:
                 self.wanted[own] = grasp.position[own] + ahead_s * grasp.velocity[own]
                 self._rest[own] = self.wanted[own]
             elif mode == FingerMode.FORCE:
-                jacobian = self.kinematics.jacobian(finger)
+                jacobian = self.kinematics.find_jacobian(finger)
                 out.torque[own] = transposed_mat_vec(jacobian, grasp.force[finger])
                 out.spring[np.ix_(own, own)] = grasp.stiffness[finger] * gram(jacobian)
                 out.stiff[own] = self._posture
             if mode != FingerMode.JOINTS:
                 reaching.append(finger)
         if reaching:
-            self._reach(reaching, points)
+            self._approach_points(reaching, points)
         moved = np.clip(self.wanted - before, -self._most, self._most)
         self.wanted[:] = before + moved
         for finger in self._fingers:
@@ -137,16 +137,16 @@ class FingertipLaw:
             out.position[own] = self.wanted[own]
             out.velocity[own] = moved[own] / self._period_s
 
-    def _reach(self, fingers: Sequence[int], points: Array) -> None:
+    def _approach_points(self, fingers: Sequence[int], points: Array) -> None:
         """Bring the targets of `fingers` closer to where their tips are at `points`, (fingers, 3),
         m."""
         for _ in range(STEPS):
-            self.kinematics.look(self.wanted)
+            self.kinematics.set_position(self.wanted)
             for finger in fingers:
                 own = self.kinematics.joints[finger]
                 homing = HOMING * (self._rest[own] - self.wanted[own])
-                self.kinematics.step(
-                    finger, self.wanted, points[finger] - self.kinematics.tip(finger), homing
+                self.kinematics.step_towards(
+                    finger, self.wanted, points[finger] - self.kinematics.find_tip(finger), homing
                 )
 
 
@@ -176,7 +176,7 @@ class JointLaw:
         self._set = set_joint_torques.load()
         self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
 
-    def torques(
+    def set_torques(
         self, hand: HandStatus, target: FingerTarget, age_s: float, ahead_s: float, out: Array
     ) -> None:
         """Set `out`, (joints,), N m, for when the sample in a `HandStatus` is `age_s` old; the
@@ -290,7 +290,7 @@ class TendonLaw:
         self._valves[2] = 0.0
         self._sampled = status.tick
 
-    def tensions(self, status: HandStatus, torque: Array, out: Array) -> None:
+    def set_tensions(self, status: HandStatus, torque: Array, out: Array) -> None:
         """Set `out`, (2, joints), N, for `torque`, (joints,), N m, at a `HandStatus`."""
         # Valves that are closed do not follow their commands: nothing is to be learned from them.
         elapsed = 0 if status.holding else status.tick - self._sampled

@@ -105,11 +105,11 @@ class HandLoop(Executor):
                 yield place, [], "it needs a board there"
 
     @abstractmethod
-    def meet(self, hand: HandStatus) -> None:
+    def start_from(self, hand: HandStatus) -> None:
         """Begin with the first `HandStatus`, or continue from the level's own last messages."""
 
     @abstractmethod
-    def follow(self, hand: HandStatus, tick: int) -> None:
+    def follow_command(self, hand: HandStatus, tick: int) -> None:
         """Write the level's command for `self.followed`, and what its status says of fingers or
         joints."""
 
@@ -127,27 +127,27 @@ class HandLoop(Executor):
                 status.reason = NO_HAND_YET
                 return
             self._met = True
-            self.meet(hand.message)
-        self._take(self.above, tick)
-        kept = self._kept(tick)
-        self.follow(hand.message, tick)
+            self.start_from(hand.message)
+        self._take_command(self.above, tick)
+        kept = self._holding_reason(tick)
+        self.follow_command(hand.message, tick)
         self.command.id += 1
         self.command.operator = self.orders.rests_on(self.followed.operator)
-        self._report(self.status, kept)
+        self._fill_status(self.status, kept)
         self.orders.report(self.status, self.followed.operator)
 
-    def age_s(self, hand: HandStatus, tick: int) -> float:
+    def sample_age_s(self, hand: HandStatus, tick: int) -> float:
         """Return how old the sample of a `HandStatus` is when what this cycle commands acts, s."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )
 
-    def ahead_s(self, tick: int) -> float:
+    def command_age_s(self, tick: int) -> float:
         """Return the time by which the command is to be taken on at its velocities, s: a cycle of
         the level above."""
         return min(tick - self._taken, self._period) * self.context.tick_s
 
-    def _take(self, command: Reading[RelayedCommand], tick: int) -> None:
+    def _take_command(self, command: Reading[RelayedCommand], tick: int) -> None:
         """Follow what is new, unless an operator holds the loop."""
         released = self._held
         self._held = self.orders.holds
@@ -170,7 +170,7 @@ class HandLoop(Executor):
                 self.commanded = True
                 self._taken = tick
 
-    def _kept(self, tick: int) -> str:
+    def _holding_reason(self, tick: int) -> str:
         """Return why the hand does not follow the level above; empty: it does."""
         hand = self.hand.message
         if self.hand.is_lost or tick - hand.tick > self._oldest:
@@ -185,7 +185,7 @@ class HandLoop(Executor):
                 return below.message.reason
         return self.orders.keeps(self.context.board)
 
-    def _report(self, status: LoopStatus | FingerStatus, kept: str) -> None:
+    def _fill_status(self, status: LoopStatus | FingerStatus, kept: str) -> None:
         """Fill the status."""
         hand = self.hand.message
         lost = self.commanded and self.above.is_lost
@@ -230,15 +230,15 @@ class FingertipLoop(HandLoop):
         gains = read_params(FingertipGains, context.params)
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
-    def meet(self, hand: HandStatus) -> None:
+    def start_from(self, hand: HandStatus) -> None:
         """Begin where the joints are, or with the last targets."""
         last = self.last.message
         begin = last if self.last.is_there and last.active else hand
         self._law.start(begin.position)
 
-    def follow(self, hand: HandStatus, tick: int) -> None:
+    def follow_command(self, hand: HandStatus, tick: int) -> None:
         """Write the targets of the joints."""
-        follow_grasp(self, self._law, hand, self.command, self.status, tick)
+        set_finger_targets(self, self._law, hand, self.command, self.status, tick)
 
 
 class JointLoop(HandLoop):
@@ -263,15 +263,19 @@ class JointLoop(HandLoop):
         self.driven = np.full(len(context.robot.joints), True)
         self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
 
-    def meet(self, hand: HandStatus) -> None:
+    def start_from(self, hand: HandStatus) -> None:
         """Hold the joints where they are, until there are targets."""
         self.followed.position = hand.position
         self.followed.stiff[:] = 1.0
 
-    def follow(self, hand: HandStatus, tick: int) -> None:
+    def follow_command(self, hand: HandStatus, tick: int) -> None:
         """Write the torques for the newest targets."""
-        self._law.torques(
-            hand, self.followed, self.age_s(hand, tick), self.ahead_s(tick), self.command.torque
+        self._law.set_torques(
+            hand,
+            self.followed,
+            self.sample_age_s(hand, tick),
+            self.command_age_s(tick),
+            self.command.torque,
         )
         self.command.sampled = hand.tick
         self.status.clipped = self._law.clipped
@@ -299,17 +303,17 @@ class TendonLoop(HandLoop):
         gains = read_params(TendonGains, context.params)
         self._law = TendonLaw(self.hand_model, self.driven, gains, context)
 
-    def meet(self, hand: HandStatus) -> None:
+    def start_from(self, hand: HandStatus) -> None:
         """Begin with the tensions that are there."""
         self._law.start(hand)
 
-    def follow(self, hand: HandStatus, tick: int) -> None:
+    def follow_command(self, hand: HandStatus, tick: int) -> None:
         """Write the tensions for the newest torques."""
         command = self.command
         command.driven = self.driven
         command.sampled = min(hand.tick, self.followed.sampled) if self.commanded else -1
         if command.sampled >= 0:
-            self._law.tensions(hand, self.followed.torque, command.tension)
+            self._law.set_tensions(hand, self.followed.torque, command.tension)
         self.status.clipped = self._law.clipped
 
 
@@ -364,23 +368,25 @@ class FingerExecutor(HandLoop):
         if hand is not None and name not in (names := [finger.name for finger in hand.finger]):
             yield "params.finger", name, f"the hand has no such finger; fingers: {', '.join(names)}"
 
-    def meet(self, hand: HandStatus) -> None:
+    def start_from(self, hand: HandStatus) -> None:
         """Hold the joints where they are."""
         self._tip.start(hand.position)
         self._tendons.start(hand)
         self._target.position = hand.position
         self._target.stiff[:] = 1.0
 
-    def follow(self, hand: HandStatus, tick: int) -> None:
+    def follow_command(self, hand: HandStatus, tick: int) -> None:
         """Write the tensions of the finger's tendons."""
-        follow_grasp(self, self._tip, hand, self._target, self.status, tick)
-        self._servo.torques(hand, self._target, self.age_s(hand, tick), 0.0, self._torque)
-        self._tendons.tensions(hand, self._torque, self.command.tension)
+        set_finger_targets(self, self._tip, hand, self._target, self.status, tick)
+        self._servo.set_torques(
+            hand, self._target, self.sample_age_s(hand, tick), 0.0, self._torque
+        )
+        self._tendons.set_tensions(hand, self._torque, self.command.tension)
         self.command.driven = self._joints
         self.command.sampled = hand.tick
 
 
-def follow_grasp(
+def set_finger_targets(
     loop: FingertipLoop | FingerExecutor,
     law: FingertipLaw,
     hand: HandStatus,
@@ -390,10 +396,10 @@ def follow_grasp(
 ) -> None:
     """Fill a `FingerTarget` for the `GraspTarget` that a loop follows, and the
     `FingerStatus`."""
-    status.tip = law.sense(hand.position)
+    status.tip = law.find_tips(hand.position)
     target.active = loop.followed.active
     if loop.followed.active:
-        law.targets(loop.followed, loop.ahead_s(tick), target)
+        law.set_targets(loop.followed, loop.command_age_s(tick), target)
     status.position = hand.position
     status.target = law.wanted
     status.force[loop.driven] = hand.force[loop.driven]

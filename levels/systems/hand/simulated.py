@@ -46,7 +46,7 @@ class SimulatedHand(Simulation):
         self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
         self.waited = self.patience
         self._palm = np.array(self._data.site_xmat[cell.tool]).reshape(3, 3)
-        self._start_with(_carrying(cell, self._data))
+        self._set_initial_tensions(_find_carrying_tensions(cell, self._data))
         self.begin(scene, clock_ns)
         pull = hand.closed * hand.arms
         self._spring = np.stack((-pull, pull))  # (2, joints), N/rad: of closed valves
@@ -55,7 +55,7 @@ class SimulatedHand(Simulation):
         # (2, joints): tensions behind valves that take time; None: they take none.
         self._acts = acts if (acts >= 0).all() else None
 
-    def _start_with(self, tension: Array) -> None:
+    def _set_initial_tensions(self, tension: Array) -> None:
         """Let the valves have had tensions, (2, joints), N, for ever."""
         model = self.cell.model
         d = self._data
@@ -87,18 +87,18 @@ class SimulatedHand(Simulation):
         in_palm = (force[:, :, None] * self._palm).sum(axis=1)
         return HandSample(position, velocity, self._steps.seen[-1, 2], tension, in_palm)
 
-    def pull(self, tension: Array) -> None:
+    def apply_tensions(self, tension: Array) -> None:
         """Open the valves, and let them follow tensions, (2, joints), N, which are within the
         limits."""
         self.waited = 0
         self.braked = False
         self._data.ctrl[self.hand.actuators] = tension
 
-    def tear(self, torn: Mask) -> None:
+    def tear_tendons(self, torn: Mask) -> None:
         """Let the tendons marked, (2, joints), give no tension, and all others theirs."""
         self._model.actuator_gainprm[self.hand.actuators, 0] = np.where(torn, 0.0, 1.0)
 
-    def close(self) -> None:
+    def close_valves(self) -> None:
         """Close the valves."""
         self.braked = True
 
@@ -134,7 +134,7 @@ class SimulatedHand(Simulation):
             self._data.act[self._acts] = np.maximum(self._data.act[self._acts] + drawn, 0.0)
 
 
-def _carrying(cell: Cell, data: mujoco.MjData) -> Array:
+def _find_carrying_tensions(cell: Cell, data: mujoco.MjData) -> Array:
     """Return the tensions, (2, joints), N, that carry the hand's weight where it starts."""
     hand = cell.hand
     assert hand is not None, "it is a hand"

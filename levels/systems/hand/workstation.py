@@ -97,27 +97,29 @@ class GraspPlanner:
         self._data.qpos[address : address + 7] = *position, *quaternion
         self._data.qpos[self._cell.qpos] = self._cell.home
         mujoco.mj_kinematics(self._cell.model, self._data)
-        lines = (self._along(row, 2.0 * math.pi * number / LINES) for number in range(LINES))
+        lines = (
+            self._plan_along_line(row, 2.0 * math.pi * number / LINES) for number in range(LINES)
+        )
         grasps = [grasp for grasp in lines if grasp is not None]
         return max(grasps, key=lambda grasp: grasp.margin, default=None)
 
-    def _along(self, row: int, angle: float) -> PlannedGrasp | None:
+    def _plan_along_line(self, row: int, angle: float) -> PlannedGrasp | None:
         """Return the grasp along one line across the palm, if it is possible."""
         across, _, out = self._kinematics.rotation.T
         line = math.cos(angle) * across + math.sin(angle) * out
         contact, normal = np.zeros((2, len(self._bases), 3))
         for finger, base in enumerate(self._bases):
             way = -line if finger != self._opposing else line
-            touched = self._touched(row, base, way)
+            touched = self._find_contact(row, base, way)
             if touched is None:
                 return None
             contact[finger] = touched
             normal[finger] = way
-        closed = self._reach(contact - self._rules.pad * normal, self._cell.home)
+        closed = self._find_joints(contact - self._rules.pad * normal, self._cell.home)
         if closed is None:
             return None
-        posture = self._reach(contact - self._rules.clear * normal, closed)
-        if posture is None or self._touches(posture):
+        posture = self._find_joints(contact - self._rules.clear * normal, closed)
+        if posture is None or self._has_contact(posture):
             return None
         low, high = self._cell.limits.position.T
         margin = float((np.minimum(closed - low, high - closed) / (high - low)).min())
@@ -128,11 +130,11 @@ class GraspPlanner:
             contact=np.array([transposed_mat_vec(turned, point - origin) for point in contact]),
             normal=np.array([transposed_mat_vec(turned, way) for way in normal]),
             posture=posture,
-            grip=self._grip(row),
+            grip=self._find_grip_force(row),
             margin=margin,
         )
 
-    def _touched(self, row: int, base: Array, way: Array) -> Array | None:
+    def _find_contact(self, row: int, base: Array, way: Array) -> Array | None:
         """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it
         does not."""
         model = self._cell.model
@@ -143,7 +145,7 @@ class GraspPlanner:
         centre = centre + float(((base - centre) * along).sum()) * along
         start = centre - OUTSIDE_M * way
         nearest = math.inf
-        for geom in self._geoms(row):
+        for geom in self._object_geoms(row):
             if not model.geom_contype[geom]:
                 continue
             size = model.geom_size[geom]
@@ -155,28 +157,30 @@ class GraspPlanner:
                 nearest = distance
         return None if nearest > OUTSIDE_M else start + nearest * way
 
-    def _geoms(self, row: int) -> Ints:
+    def _object_geoms(self, row: int) -> Ints:
         """Return the geoms of the object."""
         return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
 
-    def _reach(self, tips: Array, start: Array) -> Array | None:
+    def _find_joints(self, tips: Array, start: Array) -> Array | None:
         """Return joint positions, (joints,), rad, at which the tips are at points of the world,
         (fingers, 3), m; sought from `start` on. None: there are none."""
         kinematics = self._kinematics
         position = start.copy()
-        wanted = [kinematics.from_world(point) for point in tips]
+        wanted = [kinematics.to_palm_frame(point) for point in tips]
         for _ in range(STEPS):
-            kinematics.look(position)
-            ways = [point - kinematics.tip(finger) for finger, point in enumerate(wanted)]
+            kinematics.set_position(position)
+            ways = [point - kinematics.find_tip(finger) for finger, point in enumerate(wanted)]
             lengths = [norm(way) for way in ways]
             if max(lengths) < REACHED_M:
                 return position
             for finger, (way, length) in enumerate(zip(ways, lengths, strict=True)):
                 homing = np.zeros(len(kinematics.joints[finger]))
-                kinematics.step(finger, position, way * (STEP_M / max(length, STEP_M)), homing)
+                kinematics.step_towards(
+                    finger, position, way * (STEP_M / max(length, STEP_M)), homing
+                )
         return None
 
-    def _touches(self, position: Array) -> bool:
+    def _has_contact(self, position: Array) -> bool:
         """Return whether the hand touches anything at joint positions, also itself."""
         model = self._cell.model
         data = self._data
@@ -185,12 +189,12 @@ class GraspPlanner:
         hand = np.isin(data.contact.geom, self._cell.gripper_geoms).any(axis=1)
         return bool((hand & (data.contact.dist < 0.0)).any())
 
-    def _grip(self, row: int) -> float:
+    def _find_grip_force(self, row: int) -> float:
         """Return the force of each finger, N, with which friction on both sides bears weight and
         pull."""
         model = self._cell.model
         body = self._cell.bodies[row]
-        friction = float(model.geom_friction[self._geoms(row), 0].max())
+        friction = float(model.geom_friction[self._object_geoms(row), 0].max())
         weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)
         load = self._rules.reserve * (weight + self._rules.pull)
         return load / (2.0 * friction * (len(self._bases) - 1))
@@ -269,10 +273,10 @@ class Workstation(HostProgram):
         """Return the functions that a prompt offers."""
         return {
             "plan": lambda: self.plan_grasp(bus),
-            "boards": lambda: self.boards(bus),
+            "boards": lambda: self.read_counts(bus),
         }
 
-    def boards(self, bus: Bus) -> dict[str, dict[str, int]]:
+    def read_counts(self, bus: Bus) -> dict[str, dict[str, int]]:
         """Return the counts of every task, from the words of its control block."""
         counts = {"cycles": Block.CYCLES, "missed": Block.MISSED, "skipped": Block.SKIPPED}
         blocks = {task: bus.address(task) for task in bus.tasks}

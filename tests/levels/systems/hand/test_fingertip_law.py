@@ -38,22 +38,22 @@ class Tips:
 
     def run(self, cycles: int, sensed: Array | None = None) -> Array:
         for _ in range(cycles):
-            tips = self.law.sense(self.law.wanted if sensed is None else sensed)
-            self.law.targets(self.grasp, 0.0, self.target)
+            tips = self.law.find_tips(self.law.wanted if sensed is None else sensed)
+            self.law.set_targets(self.grasp, 0.0, self.target)
         return tips.copy()
 
 
 def test_the_jacobian_is_the_derivative_of_the_tip() -> None:
     kinematics, step = the_kinematics(), 1e-6
-    kinematics.look(BENT)
+    kinematics.set_position(BENT)
     for finger, own in enumerate(kinematics.joints):
-        kinematics.look(BENT)
-        jacobian, tip = kinematics.jacobian(finger), kinematics.tip(finger)
+        kinematics.set_position(BENT)
+        jacobian, tip = kinematics.find_jacobian(finger), kinematics.find_tip(finger)
         for column, joint in enumerate(own):
             moved = BENT.copy()
             moved[joint] += step
-            kinematics.look(moved)
-            assert (kinematics.tip(finger) - tip) / step == pytest.approx(
+            kinematics.set_position(moved)
+            assert (kinematics.find_tip(finger) - tip) / step == pytest.approx(
                 jacobian[:, column], abs=1e-5
             )
 
@@ -87,8 +87,8 @@ def test_torques_of_a_force_do_its_work() -> None:
     tips.grasp.force[FINGER] = (1.0, -2.0, 3.0)
     tips.run(1, BENT)
     kinematics, small = the_kinematics(), 1e-6 * np.arange(16)
-    kinematics.look(BENT + small)
-    work = float(tips.grasp.force[FINGER] @ (kinematics.tip(FINGER) - start[FINGER]))
+    kinematics.set_position(BENT + small)
+    work = float(tips.grasp.force[FINGER] @ (kinematics.find_tip(FINGER) - start[FINGER]))
     assert float(tips.target.torque @ small) == pytest.approx(work, rel=1e-3)
     own = kinematics.joints[FINGER]
     assert (tips.target.stiff[own] == FingertipGains().posture).all()
@@ -104,12 +104,12 @@ def test_a_tip_that_is_pushed_away_is_a_spring_of_its_stiffness_in_all_direction
     kinematics = the_kinematics()
     own = kinematics.joints[FINGER]
     for pushed in np.eye(4) * 1e-5:
-        kinematics.look(BENT)
-        jacobian = kinematics.jacobian(FINGER)
+        kinematics.set_position(BENT)
+        jacobian = kinematics.find_jacobian(FINGER)
         away = np.zeros(16)
         away[own] = pushed
-        kinematics.look(BENT + away)
-        force = -200.0 * (kinematics.tip(FINGER) - start[FINGER])
+        kinematics.set_position(BENT + away)
+        force = -200.0 * (kinematics.find_tip(FINGER) - start[FINGER])
         torque = -tips.target.spring @ away
         assert torque[own] == pytest.approx(jacobian.T @ force, rel=1e-3, abs=1e-9)
         assert np.delete(torque, own).tolist() == [0.0] * 12

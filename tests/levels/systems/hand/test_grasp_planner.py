@@ -34,8 +34,8 @@ def tips(posture: Array) -> Array:
     """Return the tips at joint positions, (fingers, 3), m, in the palm's frame."""
     assert HAND.hand is not None
     kinematics = FingerKinematics(HAND, HAND.hand)
-    kinematics.look(posture)
-    return np.array([kinematics.tip(finger) for finger in range(4)])
+    kinematics.set_position(posture)
+    return np.array([kinematics.find_tip(finger) for finger in range(4)])
 
 
 @pytest.mark.slow

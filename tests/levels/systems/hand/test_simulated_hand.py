@@ -46,7 +46,7 @@ def test_tension_follows_its_command_after_the_delay_with_the_time_constant_of_t
     before = hand.sense().tension[FLEXOR, INDEX1]
     wanted, risen = flexed(hand, INDEX1, 65.0), []
     for _ in range(40):
-        hand.pull(wanted)
+        hand.apply_tensions(wanted)
         hand.step(1)
         risen.append((hand.sense().tension[FLEXOR, INDEX1] - before) / (65.0 - before))
     times = TICK_S * np.arange(1, 41) - 0.001
@@ -72,7 +72,7 @@ def test_no_pull_breaks_a_limit_at_any_step() -> None:
         flex = rng.random(16) < 0.5
         tension = np.where([flex, ~flex], hand.hand.most, hand.hand.least)
         for _ in range(20):
-            hand.pull(tension)
+            hand.apply_tensions(tension)
             hand.step(EVERY)
     assert (hand.violations, hand.pushed, hand.first_violation, hand.fault) == (0, 0, "", "")
 
@@ -87,7 +87,7 @@ def test_contact_pushes_a_fingertip_away_from_what_it_touches() -> None:
             20.0 + torque / (2 * hand.hand.arms),
             20.0 - torque / (2 * hand.hand.arms),
         )
-        hand.pull(tension.clip(hand.hand.least, hand.hand.most))
+        hand.apply_tensions(tension.clip(hand.hand.least, hand.hand.most))
         hand.step(EVERY)
     force = hand.sense().force
     assert force[:3, 0].min() > 0.2  # fingers and thumb are on either side of the can
@@ -111,9 +111,9 @@ def test_a_restored_hand_continues_bit_for_bit(closes: bool) -> None:
     def run(hand: SimulatedHand, cycles: range) -> None:
         for cycle in cycles:
             if closes and cycle > 40:
-                hand.close()
+                hand.close_valves()
             else:
-                hand.pull(flexed(hand, INDEX1, 40.0 + 20.0 * np.sin(0.3 * cycle)))
+                hand.apply_tensions(flexed(hand, INDEX1, 40.0 + 20.0 * np.sin(0.3 * cycle)))
             hand.step(EVERY)
 
     first, again, middle = hand_of(), hand_of(), ArmState.zeros(sizes(hand_of().cell))

@@ -45,7 +45,7 @@ class Valves:
     def run(self, torque: Array, seconds: float) -> None:
         for _ in range(round(seconds / PERIOD_S)):
             sensed, wanted = self.tension.copy(), self.wanted.copy()
-            self.law.tensions(self.status, torque, self.wanted)
+            self.law.set_tensions(self.status, torque, self.wanted)
             for _ in range(SUBSTEPS):
                 aim = self._gain * self.wanted + self._offset
                 self.tension += (aim - self.tension) * (
@@ -67,7 +67,7 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
     valves = Valves()
     hand = valves.hand
     torque = part * hand.torque
-    valves.law.tensions(valves.status, torque, valves.wanted)
+    valves.law.set_tensions(valves.status, torque, valves.wanted)
     flexors, extensors = valves.wanted
     assert hand.arms * (flexors - extensors) == pytest.approx(torque)
     assert valves.wanted.min() >= hand.least
@@ -83,7 +83,7 @@ def test_tensions_give_the_torque_about_the_mean_or_a_higher_one_and_none_is_sla
 
 def test_a_torque_beyond_the_tendons_is_clipped_and_counted() -> None:
     valves = Valves()
-    valves.law.tensions(valves.status, 3.0 * valves.hand.torque, valves.wanted)
+    valves.law.set_tensions(valves.status, 3.0 * valves.hand.torque, valves.wanted)
     assert valves.wanted[0] == pytest.approx(valves.hand.most)
     assert valves.wanted[1] == pytest.approx(valves.hand.least)
     assert valves.law.clipped == 1
@@ -126,10 +126,10 @@ def test_valves_that_are_closed_teach_nothing() -> None:
     for _ in range(500):
         valves.status.tick += EVERY
         valves.status.tension += 0.1
-        valves.law.tensions(valves.status, torque, valves.wanted)
+        valves.law.set_tensions(valves.status, torque, valves.wanted)
     assert valves.wanted == pytest.approx(before)
     # Nor does a sensor that gives no number.
     valves.status.holding, valves.status.tension[0, 0] = 0, math.nan
     valves.status.tick += EVERY
-    valves.law.tensions(valves.status, np.zeros(16), valves.wanted)
+    valves.law.set_tensions(valves.status, np.zeros(16), valves.wanted)
     assert np.isfinite(valves.wanted).all()
