@@ -1,5 +1,4 @@
-"""The executor of a board of a hand: gives its valves the tensions of the boards above, or closes
-them."""
+"""The executor of the board that drives a hand: it passes tensions to the valves or closes them."""
 
 from __future__ import annotations
 
@@ -38,16 +37,17 @@ from rack.levels.tables import Table
 HELD = "held by the operator: valves closed; `resume` opens them"
 DEMANDED = "demand '{}' on the hand: valves closed until boards and emergency stop are in order"
 TENDONS = ("flexor", "extensor")
-"""In words, by row of tensions."""
+"""Names of the rows of tensions."""
 
 
 class HandExecutor(Executor):
-    """Drives a hand with the tensions of the boards above: all of its tendons, or none.
+    """Drives a hand with the tensions of the boards above.
 
-    A hand has no brakes, and one that lets go is not safe either. So on a demand, an emergency stop
-    too, on an operator's HOLD, while a board above is lost or late, and while a tension is NaN, the
-    valves close: the grip is kept and moving fingers come to rest, see `SimulatedHand`. They open
-    when all boards above have seen it, with what these want then.
+    A hand has no brakes, and releasing its grip is not safe. The valves of all tendons therefore
+    close on a safety demand (including an emergency stop), on an operator's HOLD, while a board
+    above is lost or late, and while a tension is NaN. Closed valves keep the grip and bring moving
+    fingers to rest, see `SimulatedHand`. They open again, with the current commands, when all
+    boards above have seen that they were closed.
     """
 
     tensions = Inputs(TensionCommand, "above.command")
@@ -71,19 +71,18 @@ class HandExecutor(Executor):
         self.wanted_tensions = Tensions(context, cell.hand, cell.patience)
         self.orders = Orders(self.commands)
         self._started = False  # the first cycle has begun
-        # Tick of the first status that said so; None: the valves are open.
+        # Tick of the first status with closed valves. None while they are open.
         self._closed_at: int | None = 0
-        self._opened = False  # the valves have been open on this board, or before it was restarted
-        self._waiting = ""  # why the boards above do not drive the hand; empty: they do
+        self._opened = False  # the valves were open before, also before a restart
+        self._waiting = ""  # reason for closed valves, empty while they are open
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
-        self._torn: dict[int, bool] = {}  # the injected faults that tear tendons, as in `acted`
+        self._torn: dict[int, bool] = {}  # injected faults that tore a tendon, as in `acted`
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield every joint that not exactly one board above drives: the one of its finger, or the
-        one of all."""
+        """Yield every joint that is not driven by exactly one board above."""
         hand = context.robot.hand
         if hand is None:
             yield (
@@ -105,7 +104,7 @@ class HandExecutor(Executor):
                 yield "above", [other.board for other in above], why
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the torn tendons; one of a joint that the hand lacks has no effect."""
+        """Replace the set of torn tendons. Faults for joints that the hand lacks have no effect."""
         joints = np.arange(len(self.hand.hand.arms))
         torn = np.zeros((2, len(joints)), dtype=bool)
         self._torn = {}
@@ -117,7 +116,7 @@ class HandExecutor(Executor):
         self.hand.tear_tendons(torn)
 
     def process(self, tick: int) -> None:
-        """Advance the hand to `tick`, sense, give tensions or close the valves, report."""
+        """Advance the hand to `tick`, sense, command the valves, report."""
         hand = self.hand
         # Advance the hand to tick. A restarted board first restores it.
         if not self._started:
@@ -141,7 +140,7 @@ class HandExecutor(Executor):
             hand.look(self.scene)
 
     def _command_valves(self, tick: int) -> None:
-        """Give the valves the tensions of the boards above, or close them and say why."""
+        """Apply the tensions of the boards above, or close the valves and note the reason."""
         since = self._closed_at if self._opened else 0
         self._waiting = self.wanted_tensions.missing(self.tensions, tick, since or 0)
         if not self._waiting:
@@ -197,27 +196,30 @@ class HandExecutor(Executor):
 
 
 SLACK_CYCLES = 5
-"""Cycles in a row in which a tendon must be slack: a valve that opens takes up to four to tighten
-one."""
+"""Consecutive slack cycles after which a tendon counts as torn. An opening valve takes up to four
+cycles to tighten a tendon."""
 SLACK_PART = 0.5
-"""Part of the least tension below which a tendon is slack: a sound one never gets there, wherever
-its tension came from."""
+"""Fraction of the least tension below which a tendon is slack; an intact one never gets there."""
 
 
 class SlackMonitor:
-    """Judges the tensions sensed in every cycle."""
+    """Detects torn tendons from the sensed tensions."""
 
     def __init__(self, hand: Hand, joints: Sequence[str]) -> None:
         self._joints = joints
         self._least = hand.least
         self._slack = SLACK_PART * hand.least
-        self._cycles = np.zeros((2, len(joints)), dtype=int)  # for which each tendon has been slack
-        self._any = False  # one was, in the last cycle
-        self.note = ""  # which tendons are slack, readable; empty: none
+        self._cycles = np.zeros((2, len(joints)), dtype=int)  # consecutive slack cycles
+        self._any = False  # whether a tendon was slack in the last cycle
+        self.note = ""  # text that lists the slack tendons, empty without any
 
     def check_tensions(self, tension: Array, wanted: Array) -> list[Finding]:
-        """Return new findings of a cycle; tensions as sensed, and as wanted of the valves, are (2,
-        joints), N."""
+        """Return the findings of a cycle.
+
+        Args:
+            tension: Sensed tensions, (2, joints), N.
+            wanted: Commanded tensions, (2, joints), N.
+        """
         if tension.min() >= self._slack and not self._any:
             return []
         slack = (tension < self._slack) & (wanted >= self._least)
@@ -231,25 +233,25 @@ class SlackMonitor:
 
 
 MARGIN = 1e-3
-"""Part of its largest tension by which one may miss its limits without count: rounding of whoever
-kept them."""
+"""Fraction of the largest tension by which a command may exceed its limits without a finding, for
+rounding errors."""
 
 
 class Tensions(CommandsAbove):
-    """Joins the `TensionCommand`s of the boards above, each for the joints that it drives."""
+    """Merges the `TensionCommand`s of the boards above, each for the joints that it drives."""
 
     def __init__(self, context: LevelContext, hand: Hand, patience: MotorPatience) -> None:
-        # A tension takes a cycle of its board, and one of the board that gave that the torque.
+        # A tension is delayed by a cycle of its board and by a cycle of the joint loop above that.
         super().__init__(context, patience, 2, "tensions", "valves closed")
         self._joints = context.robot.joints
         self._low = hand.least
         self._high = hand.most
         self._margin = MARGIN * hand.most
         self.tension = np.zeros((2, len(hand.most)))  # N
-        self.rests_on = 0  # serial of the newest command of an operator that the tensions rest on
+        self.rests_on = 0  # serial of the newest operator command on which the tensions depend
 
     def merge_commands(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
-        """Set `tension` and `rests_on`, while nothing is `missing`."""
+        """Set `tension` and `rests_on`. Only valid if `missing` returned no reason."""
         self.rests_on = 0
         for board in self.oldest:
             value = tensions[board].message
@@ -257,13 +259,17 @@ class Tensions(CommandsAbove):
             np.copyto(self.tension, value.tension, where=value.driven != 0)
 
     def limit_tensions(self) -> tuple[Finding | None, str]:
-        """Cut `tension` to its limits. Return what was cut, or refused, and why it is refused;
-        empty: it is not."""
+        """Limit `tension` to its range.
+
+        Returns:
+            The finding if a tension was limited or is NaN, else None; and the reason for rejecting
+            the tensions, empty if they are accepted.
+        """
         tension = self.tension
         low = self._low
         high = self._high
         found = None
-        within = (tension >= low - self._margin) & (tension <= high + self._margin)  # NaN is not
+        within = (tension >= low - self._margin) & (tension <= high + self._margin)  # False for NaN
         if not within.all():
             finite = np.isfinite(tension)
             if not finite.all():

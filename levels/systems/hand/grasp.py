@@ -1,5 +1,4 @@
-"""The grasp loop: does a program of steps, from the open hand around an object to the open hand
-again."""
+"""The grasp loop, which executes a program of steps from an open hand to an open hand."""
 
 from __future__ import annotations
 
@@ -38,18 +37,19 @@ from rack.levels.systems.hand.messages import (
 from rack.levels.tables import read_params
 
 PLANNED = "planned"
-"""Name of the posture of a plan."""
-NO_WORLD = "no world model: waiting for where the object is"
+"""Name of the posture that a plan defines."""
+NO_WORLD = "no world model: waiting for the position of the object"
 NO_PLAN = "no plan of the grasp yet: waiting for one from '{}'"
 
 
 class GraspExecutor(Executor):
-    """Does the steps of a program in their order; the fingers keep what they do while it waits.
+    """Executes the steps of a program in order.
 
-    It waits while a finger does not follow, and on an operator's hold; then the step under way goes
-    on. A step that fails, or waits for too long, ends the program with an error: the fingers stay.
-    With a planner above, the posture before a CLOSE, its points and the grip after it are those of
-    the newest plan. After a restart it continues from its own last messages.
+    The current step is suspended while a finger does not follow and during an operator's hold; the
+    fingers keep their targets and forces in the meantime. A step that fails or is suspended for too
+    long ends the program with an error, and the fingers stay as they are. With a planner above, the
+    newest plan defines the posture before a CLOSE step, its points, and the grip after it. After a
+    restart the level continues from its own last messages.
     """
 
     fingers = Inputs(FingerStatus, "below.status")
@@ -70,7 +70,7 @@ class GraspExecutor(Executor):
         assert cell.hand is not None, "checked with the config"
         self._program = GraspProgram.model_validate(dict(context.task))
         kinematics = FingerKinematics(cell, cell.hand)
-        self._from_world = kinematics.palm.inverse()  # from the world's frame into the palm's
+        self._from_world = kinematics.palm.inverse()  # pose of the world in the frame of the palm
         self._orders = Orders(self.commands)
         names = cell.hand.names
         params = read_params(GraspParams, context.params)
@@ -88,23 +88,23 @@ class GraspExecutor(Executor):
             grip=HandGrip(params, np.full(len(names), False), self._opposing, context.period_s),
             touching=np.full(len(names), False),
         )
-        self._work: StepWork | None = None  # on the step under way
-        self._done = 0  # steps that are done
-        self._elapsed_s = 0.0  # since the step under way began, without waiting
-        self._waited_s = 0.0  # in a row, other than for an operator
+        self._work: StepWork | None = None  # the current step, once it has begun
+        self._done = 0  # number of completed steps
+        self._elapsed_s = 0.0  # execution time of the current step, without suspensions
+        self._waited_s = 0.0  # duration of the current suspension, except holds of an operator
         self._failed = Refused(Error.NONE, "")
-        self._plan = GraspPlan.zeros(context.sizes)  # in use; id 0: none
-        self._started = False  # the first cycle has begun
+        self._plan = GraspPlan.zeros(context.sizes)  # plan in use, id 0 without one
+        self._started = False  # whether the first cycle has begun
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield a robot without a hand, and every finger that not exactly one board below
-        drives."""
+        """Yield a robot without a hand, and every finger that is not driven by exactly one board
+        below."""
         hand = context.robot.hand
         if hand is None:
-            yield "executor", cls.__name__, "it drives a hand; there is no [robot.hand]"
+            yield "executor", cls.__name__, "it drives a hand, but there is no [robot.hand]"
             return
         names = [finger.name for finger in hand.finger]
         for name in names:
@@ -121,8 +121,7 @@ class GraspExecutor(Executor):
             yield "above", [], "a step 'close' without points needs a planner of grasps there"
 
     def process(self, tick: int) -> None:
-        """Look at fingers and object, go on with the step under way, write what is wanted,
-        report."""
+        """Read fingers and object, continue the current step, write targets and status."""
         grasp = self._grasp
         self._orders.take(self.operator)
         grasp.fingers.read_statuses(self.fingers)
@@ -138,7 +137,7 @@ class GraspExecutor(Executor):
             self._started = True
             self._restore_progress()
         waits = self._waiting_reason()
-        # Fail when something has kept the program for too long.
+        # Fail if the program has been suspended for too long.
         is_over = self._done == len(self._program.step) or self._orders.holds
         self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
         if self._waited_s > self._grasp.params.stalled and not self._failed.code:
@@ -158,7 +157,7 @@ class GraspExecutor(Executor):
         return self.context.scene.objects.index(close.object)
 
     def _join_posture(self, posture: Posture) -> Array:
-        """Return a posture of all fingers as one of all joints, (joints,), rad."""
+        """Return the joint positions, (joints,), rad, of a posture that is given by finger."""
         hand = self.context.robot.hand
         joints = self.context.robot.joints
         assert hand is not None
@@ -168,13 +167,12 @@ class GraspExecutor(Executor):
         return position
 
     def _find_close_step(self) -> CloseStep | None:
-        """Return the newest step that has closed, or closes, on an object; None: there is none
-        yet."""
+        """Return the newest CLOSE step that has begun, None without one."""
         steps = self._program.step[: self._done + 1]
         return next((step for step in reversed(steps) if isinstance(step, CloseStep)), None)
 
     def _waiting_reason(self) -> str:
-        """Return why the step under way does not go on; empty: it does."""
+        """Return the reason for which the current step is suspended, empty if it continues."""
         if self._grasp.fingers.awaited:
             return self._grasp.fingers.awaited
         if self._orders.holds:
@@ -193,12 +191,13 @@ class GraspExecutor(Executor):
         return max((reading.message for reading in plans.values()), key=lambda plan: plan.id)
 
     def _needs_plan(self) -> bool:
-        """Return whether the step under way is to be planned: a CLOSE, or a PRESHAPE before it."""
+        """Return whether the current step takes its numbers from a plan: a CLOSE, or the PRESHAPE
+        before it."""
         kinds = [type(step) for step in self._program.step[self._done : self._done + 2]]
         return kinds[:1] == [CloseStep] or kinds == [PreshapeStep, CloseStep]
 
     def _run_step(self) -> None:
-        """Begin the step under way, or go on with it."""
+        """Begin or continue the current step."""
         if self._work is None:
             if self.plan and self._needs_plan() and not self._elapsed_s:
                 self._plan.copy_from(self._find_newest_plan(self.plan))
@@ -216,7 +215,7 @@ class GraspExecutor(Executor):
             self._done += 1
 
     def _begin_step(self) -> None:
-        """Begin a step, for the first time or after a restart."""
+        """Begin the current step, for the first time or after a restart."""
         grasp = self._grasp
         step = self._prepare_step(self._done)
         if isinstance(step, CloseStep):
@@ -227,7 +226,7 @@ class GraspExecutor(Executor):
         self._work = WORKS[type(step)](grasp, step, self._elapsed_s)
 
     def _adopt_close_step(self, close: CloseStep) -> None:
-        """Grip by a CLOSE from now on."""
+        """Grip with the fingers of a CLOSE step from now on."""
         grasp = self._grasp
         gripping = np.array([name in close.points for name in grasp.names])
         grasp.close = close
@@ -235,8 +234,8 @@ class GraspExecutor(Executor):
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
     def _prepare_step(self, index: int) -> Step:
-        """Return a step of the program with what the plan says, and with ways in the frame of the
-        palm."""
+        """Return a step of the program, completed from the plan, with displacements in the frame of
+        the palm."""
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):
@@ -260,7 +259,7 @@ class GraspExecutor(Executor):
         return step
 
     def _restore_progress(self) -> None:
-        """Continue after a restart, from the level's own last messages."""
+        """Restore the state of the program from the level's own last messages, after a restart."""
         if not (self.last_status.is_there and self.last_command.is_there):
             return
         status = self.last_status.message

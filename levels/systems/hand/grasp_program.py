@@ -1,5 +1,5 @@
-"""A program of a grasp, in `[task]`: named postures of the fingers, and steps from the open hand to
-the open hand."""
+"""The program of a grasp, in `[task]`: named postures of the fingers, and steps that begin and end
+with an open hand."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ Posture = Mapping[str, tuple[Finite, ...]]
 
 
 class PreshapeStep(Table):
-    """Bring the joints to a posture."""
+    """Move the joints to a posture."""
 
     do: Literal["preshape"] = "preshape"
     """the kind of step"""
     posture: str
     """name of the posture, in [task.posture]"""
     seconds: Positive = 1.0
-    """time that it takes, s"""
+    """duration, s"""
 
 
 class CloseStep(Table):
-    """Move the tips evenly towards points in an object until each touches it; a tip that arrives
-    there has missed.
+    """Move the tips at constant speed towards points in an object until each touches it. A tip that
+    reaches its point has missed the object.
 
-    Without points, they and the fingers are those of a plan from the level above.
+    Without points, a plan from the level above defines fingers and points.
     """
 
     do: Literal["close"] = "close"
@@ -39,15 +39,15 @@ class CloseStep(Table):
     object: str
     """object of the scene"""
     points: Mapping[str, Vector] = {}
-    """where the tips would go if nothing were in the way, in the object's frame, m, by finger"""
+    """target points of the tips inside the object, in its frame, m, by finger"""
     depth: Positive = Field(0.01, le=0.2)
-    """distance of such a point from a planned contact, inwards, m"""
+    """depth of a target point below a planned contact, m"""
     speed: Positive = Field(0.03, le=1.0)
-    """of the tip with the longest way, m/s"""
+    """speed of the tip with the longest way, m/s"""
     touch: Positive = 0.3
     """force at which a tip touches the object, N"""
     seconds: Positive = 3.0
-    """time by which all must touch it, s"""
+    """time within which all tips must touch the object, s"""
 
 
 class SqueezeStep(Table):
@@ -56,9 +56,9 @@ class SqueezeStep(Table):
     do: Literal["squeeze"] = "squeeze"
     """the kind of step"""
     grip: Positive
-    """force of the finger that opposes the others, which share it, N"""
+    """force of the opposing finger, shared by the others, N"""
     seconds: Positive = 0.5
-    """time in which they rise, s"""
+    """duration of the rise, s"""
 
 
 class ShiftStep(Table):
@@ -67,49 +67,49 @@ class ShiftStep(Table):
     do: Literal["shift"] = "shift"
     """the kind of step"""
     by: Vector
-    """way of the object in the world's frame, m"""
+    """displacement of the object in the world's frame, m"""
     seconds: Positive = 1.0
-    """time that it takes, s"""
+    """duration, s"""
 
 
 class HoldStep(Table):
-    """Keep the object where it is."""
+    """Hold the object in place."""
 
     do: Literal["hold"] = "hold"
     """the kind of step"""
     seconds: Positive
-    """for how long, s"""
+    """duration, s"""
 
 
 class ReleaseStep(Table):
-    """Let the forces fall, then withdraw the tips from the object."""
+    """Reduce the forces to zero, then withdraw the tips from the object."""
 
     do: Literal["release"] = "release"
     """the kind of step"""
     way: Positive = Field(0.015, le=0.2)
-    """by which the tips withdraw, m"""
+    """distance by which the tips withdraw, m"""
     seconds: Positive = 1.0
-    """time that it takes, s; half of it for the forces"""
+    """duration, s, half of it for the forces"""
 
 
 Step = PreshapeStep | CloseStep | SqueezeStep | ShiftStep | HoldStep | ReleaseStep
 GRIPPING = (SqueezeStep, ShiftStep, HoldStep, ReleaseStep)
-"""Steps that need an object in the grip of the fingers."""
+"""Steps that need a gripped object."""
 
 
 class GraspProgram(Program):
     """Postures and steps."""
 
     opposing: str = "thumb"
-    """the finger that opposes all others"""
+    """name of the finger that opposes all others"""
     posture: Mapping[str, Posture] = {}
     """joint positions of every finger, rad, by posture"""
     step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field((), max_length=MAX_STEPS)
-    """steps, done in their order"""
+    """steps, executed in order"""
 
     def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
         """Yield key, value and reason of everything that the hand or the scene lacks, and of steps
-        out of order."""
+        in the wrong order."""
         if robot is None or robot.hand is None:
             return
         hand = robot.hand
@@ -136,13 +136,13 @@ class GraspProgram(Program):
                 yield (
                     f"step[{k}].do",
                     step.do,
-                    "it needs an object in the fingers: a 'close' must come before it",
+                    "it needs a gripped object: a 'close' must come before it",
                 )
             if gripped and isinstance(step, (PreshapeStep, CloseStep)):
                 yield (
                     f"step[{k}].do",
                     step.do,
-                    "the fingers have an object: a 'release' must come before it",
+                    "an object is gripped: a 'release' must come before it",
                 )
             gripped = isinstance(step, CloseStep) or (gripped and not isinstance(step, ReleaseStep))
 
@@ -160,10 +160,10 @@ def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Misfits:
             yield (
                 f"{key}.{name}",
                 list(values),
-                f"{len(values)} values; permitted: {names[name]}, one per joint",
+                f"{len(values)} values; it needs {names[name]}, one per joint",
             )
     if missing := [name for name in names if name not in posture]:
-        yield key, list(posture), f"it lacks: {', '.join(missing)}"
+        yield key, list(posture), f"the posture lacks {', '.join(missing)}"
 
 
 def _check_close_step(

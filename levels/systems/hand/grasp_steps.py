@@ -1,9 +1,8 @@
-"""The steps of a grasp at work: from what is sensed of fingers and object, what is wanted of the
-fingers next.
+"""Execution of the steps of a grasp: from the sensed fingers and object to targets of the fingers.
 
-A step is begun once, and again after a restart of its board: from where the fingers are, with the
-time that it was under way. Its `run` returns whether it is done, and raises `Refused` when it has
-failed.
+A step begins once, and again after a restart of its board: from the current position of the
+fingers, with the time for which it was executed before. `run` returns whether the step is done, and
+raises `Refused` if it has failed.
 """
 
 from __future__ import annotations
@@ -33,28 +32,33 @@ from rack.levels.systems.hand.messages import FingerMode, FingerStatus, GraspTar
 from rack.levels.tables import Positive, Table
 
 SLIPPED_PART = 0.2
-"""Part of the force at which a tip touched, below which it touches no more."""
+"""Fraction of the touch force below which a tip no longer touches."""
 
 
 class FingersBelow:
-    """Merges `FingerStatus`es; each board fills what is its own. Points and forces are in the
-    frame of the palm."""
+    """State of all fingers, merged from the `FingerStatus` of each board. Points and forces are in
+    the frame of the palm."""
 
     def __init__(self, context: LevelContext, fingers: Sequence[Ints]) -> None:
-        """`fingers` are the joints of each finger, as indices of `robot.joints`."""
+        """Start without statuses.
+
+        Args:
+            context: Context of the grasp level.
+            fingers: Indices in `robot.joints` of the joints of each finger.
+        """
         self._joints = fingers
         joints = context.sizes["joints"]
         count = len(fingers)
-        self.position = np.zeros(joints)  # (joints,), rad: as sensed
-        self.target = np.zeros(joints)  # (joints,), rad: wanted by the loops below
+        self.position = np.zeros(joints)  # (joints,), rad: sensed
+        self.target = np.zeros(joints)  # (joints,), rad: targets of the loops below
         self.tip = np.zeros((count, 3))  # m
-        self.force = np.zeros((count, 3))  # N: of the surroundings on the tips
-        self.awaited = ""  # why the fingers do not follow; empty: they do
-        self.error = Error.NONE  # of the hand
-        self.rests_on = 0  # newest command of an operator that all boards rest on
+        self.force = np.zeros((count, 3))  # N: of the environment on the tips
+        self.awaited = ""  # reason for which a finger does not follow, empty if all do
+        self.error = Error.NONE  # error of the hand
+        self.rests_on = 0  # newest operator command on which all boards depend
 
     def read_statuses(self, statuses: Mapping[str, Reading[FingerStatus]]) -> None:
-        """Read the statuses of all boards."""
+        """Merge the statuses of all boards."""
         self.awaited = ""
         self.error = Error.NONE
         for board, reading in statuses.items():
@@ -78,51 +82,57 @@ class GraspParams(GripGains):
     """`[board.<name>.params]` of a grasp loop."""
 
     astray: Positive = 0.03
-    """distance from a posture at which a joint has reached it, rad"""
+    """largest position error of a joint in a posture, rad"""
     patience: Positive = 1.0
-    """time in excess of its own after which a step has failed, s"""
+    """time beyond its duration after which a step has failed, s"""
     stalled: Positive = 60.0
-    """time of waiting, other than for an operator, that fails the program, s"""
+    """duration of a suspension, except holds of an operator, that fails the program, s"""
     lost: Positive = 0.2
-    """time without touch after which a finger has lost the object, s"""
+    """time without contact after which a finger has lost the object, s"""
     tolerance: Positive = 0.02
-    """distance of a gripped object from its place: it is lost, m"""
+    """distance from its anchor at which a gripped object is lost, m"""
 
 
 @dataclass
 class Grasp:
-    """What the steps share: the fingers as sensed, the object, and what is wanted. Points are in
-    the palm's frame."""
+    """State that all steps share: sensed fingers, object, and targets. Points are in the frame of
+    the palm."""
 
     params: GraspParams
-    names: tuple[str, ...]  # of the fingers
+    names: tuple[str, ...]  # names of the fingers
     joints: tuple[str, ...]
     postures: dict[str, Array]  # (joints,), rad, by name
     period_s: float
     fingers: FingersBelow
-    target: GraspTarget  # that the steps fill
+    target: GraspTarget  # filled by the steps
     grip: HandGrip
     touching: Mask  # (fingers,)
-    close: CloseStep | None = None  # by which the object was, or is, gripped
-    base: float = 0.0  # N: the grip wanted without a load
-    object: Pose | None = None  # as sensed
-    anchor: Array = field(default_factory=lambda: np.zeros(3))  # m: where the object is to be
-    moved: float = 0.0  # m: distance of the object from there
+    close: CloseStep | None = None  # the step that gripped the object
+    base: float = 0.0  # N: grip force without a load
+    object: Pose | None = None  # sensed pose
+    anchor: Array = field(default_factory=lambda: np.zeros(3))  # m: target position of the object
+    moved: float = 0.0  # m: distance of the object from its anchor
     farthest: float = 0.0  # m: largest such distance since it was gripped
 
     @property
     def object_position(self) -> Array:
-        """Where the object is, (3,), m."""
+        """Position of the object, (3,), m."""
         return self.anchor if self.object is None else self.object.position
 
     @property
     def missing_fingers(self) -> list[str]:
-        """Names of the fingers that should touch the object, and do not."""
+        """Names of the gripping fingers that do not touch the object."""
         return [self.names[finger] for finger in np.flatnonzero(self.grip.fingers & ~self.touching)]
 
 
 class StepWork(ABC):
-    """A step at work, begun `resumed_s` after it began first."""
+    """Execution of one step.
+
+    Args:
+        grasp: State that all steps share; `grasp.target` is filled.
+        step: The step of the program.
+        resumed_s: Time for which the step was executed before a restart, s.
+    """
 
     def __init__(self, grasp: Grasp, step: Any, resumed_s: float) -> None:
         self.grasp = grasp
@@ -132,15 +142,18 @@ class StepWork(ABC):
 
     @abstractmethod
     def set_start(self) -> None:
-        """Note from where the step goes on."""
+        """Take the current state as the start of the step."""
 
     @abstractmethod
     def run(self, elapsed_s: float) -> bool:
-        """Fill the target, `elapsed_s` after the step began; return whether it is done."""
+        """Fill the target for time `elapsed_s` of the step, s; return whether it is done.
+
+        Raises:
+            Refused: The step has failed.
+        """
 
     def find_progress(self, elapsed_s: float) -> tuple[float, float]:
-        """Return the part of what was left at the beginning that is done by now, 0 to 1, and its
-        rate, 1/s."""
+        """Return the progress since `resumed_s`, 0 to 1, and its rate, 1/s."""
         part, rate = minimum_jerk(elapsed_s / self.step.seconds)
         before, _ = minimum_jerk(self.resumed_s / self.step.seconds)
         if before >= 1.0:
@@ -149,19 +162,19 @@ class StepWork(ABC):
 
 
 def minimum_jerk(time: float) -> tuple[float, float]:
-    """Return the way, 0 to 1, at `time`, 0 to 1, of the motion of least jerk (Flash and Hogan,
-    1985), and its rate."""
+    """Return position, 0 to 1, and rate of a minimum-jerk motion (Flash and Hogan, 1985) at
+    `time`, 0 to 1."""
     x = min(max(time, 0.0), 1.0)
     return x * x * x * (10.0 - 15.0 * x + 6.0 * x * x), 30.0 * x * x * (1.0 - x) * (1.0 - x)
 
 
 class PreshapeWork(StepWork):
-    """Brings all joints to a posture; done when they are there."""
+    """Moves all joints to a posture, and ends when they have reached it."""
 
     step: PreshapeStep
 
     def set_start(self) -> None:
-        """Start at the targets that the joints have."""
+        """Start at the current joint targets."""
         self._start = self.grasp.fingers.target.copy()
         self._posture = self.grasp.postures[self.step.posture]
 
@@ -186,18 +199,18 @@ class PreshapeWork(StepWork):
                 f"joint '{grasp.joints[joint]}' is {away[joint]:.2g} rad from posture"
                 f" '{self.step.posture}'"
             )
-            raise Refused(Error.FOLLOWING, f"{far}: it is in the way of something, or too weak")
+            raise Refused(Error.FOLLOWING, f"{far}: it is blocked, or too weak")
         return False
 
 
 class CloseWork(StepWork):
-    """Moves tips evenly towards points in the object, until each touches it; one that touches
-    stays, and presses."""
+    """Moves the tips at constant speed towards points in the object until each touches it. A tip
+    that touches stays there and presses."""
 
     step: CloseStep
 
     def set_start(self) -> None:
-        """Start where the tips are."""
+        """Start at the current tip positions."""
         grasp = self.grasp
         step = self.step
         self._start = grasp.fingers.tip.copy()
@@ -208,7 +221,7 @@ class CloseWork(StepWork):
             inside = grasp.object @ Pose(np.array(point), np.array([1.0, 0.0, 0.0, 0.0]))
             self._ways[finger] = inside.position - self._start[finger]
         self._seconds = max(norm(way) for way in self._ways) / step.speed
-        # N: with which the opposing one presses.
+        # N: force of the opposing finger.
         self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])
 
     def run(self, elapsed_s: float) -> bool:
@@ -238,7 +251,7 @@ class CloseWork(StepWork):
         return not missing
 
     def _hold_contact(self, finger: int, force: Array) -> None:
-        """Let a finger stay where its tip is, as a spring, and press with `force`, (3,), N."""
+        """Hold the tip of a finger at its position as a spring, and press with `force`, (3,), N."""
         grasp = self.grasp
         target = grasp.target
         target.mode[finger] = FingerMode.FORCE
@@ -249,16 +262,16 @@ class CloseWork(StepWork):
 
 
 class GrippingWork(StepWork):
-    """Base of the steps while the fingers have the object: they keep the grip, and notice when it
-    is lost."""
+    """Base of the steps during which the fingers grip the object: they maintain the grip and detect
+    its loss."""
 
     def set_start(self) -> None:
-        """Start with every finger at the object."""
-        # (fingers,), s: time for which one has not touched.
+        """Start with every finger in contact."""
+        # (fingers,), s: time without contact.
         self._silent_s = np.zeros(len(self.grasp.names))
 
     def keep_grip(self) -> None:
-        """Press with the grip that the load asks for; raises `Refused` when the object is lost."""
+        """Adapt the grip to the load and apply it. Raises `Refused` if the object is lost."""
         grasp = self.grasp
         fingers = grasp.fingers
         away = grasp.object_position - grasp.anchor
@@ -270,7 +283,7 @@ class GrippingWork(StepWork):
         self.apply_grip()
 
     def apply_grip(self) -> None:
-        """Press with the grip as it is; raises `Refused` when the object is lost."""
+        """Apply the current grip. Raises `Refused` if the object is lost."""
         grasp = self.grasp
         params = grasp.params
         close = grasp.close
@@ -287,25 +300,24 @@ class GrippingWork(StepWork):
             )
         if grasp.moved > params.tolerance:
             far = (
-                f"{1e3 * grasp.moved:.1f} mm from its place; permitted:"
-                f" {1e3 * params.tolerance:g} mm"
+                f"{1e3 * grasp.moved:.1f} mm from its place (at most {1e3 * params.tolerance:g} mm)"
             )
             raise Refused(Error.OBJECT_LOST, f"lost '{close.object}': {far}")
 
 
 class SqueezeWork(GrippingWork):
-    """Raises the grip. The object settles between the fingers meanwhile: its place is where it is
-    afterwards."""
+    """Raises the grip force. The object settles between the fingers, and its anchor is its position
+    at the end."""
 
     step: SqueezeStep
 
     def set_start(self) -> None:
-        """Start with the grip as it is."""
+        """Start with the current grip force."""
         super().set_start()
         self._from = self.grasp.base
 
     def run(self, elapsed_s: float) -> bool:
-        """Squeeze."""
+        """Raise the grip force."""
         grasp = self.grasp
         part, _ = self.find_progress(elapsed_s)
         grasp.anchor[:] = grasp.object_position
@@ -315,13 +327,13 @@ class SqueezeWork(GrippingWork):
 
 
 class ShiftWork(GrippingWork):
-    """Moves the place of the object, and the points of the tips with it; `by` is a way in the
-    palm's frame."""
+    """Moves the anchor of the object and the points of the tips by `step.by`, in the frame of the
+    palm."""
 
     step: ShiftStep
 
     def set_start(self) -> None:
-        """Start with the way that is left."""
+        """Start with the remaining displacement."""
         super().set_start()
         done, _ = minimum_jerk(self.resumed_s / self.step.seconds)
         self._way = (1.0 - done) * np.array(self.step.by)
@@ -342,23 +354,23 @@ class ShiftWork(GrippingWork):
 
 
 class HoldWork(GrippingWork):
-    """Keeps the object where it is."""
+    """Holds the object in place."""
 
     step: HoldStep
 
     def run(self, elapsed_s: float) -> bool:
-        """Keep it."""
+        """Hold the object."""
         self.keep_grip()
         return elapsed_s >= self.step.seconds
 
 
 class ReleaseWork(StepWork):
-    """Lets the forces fall in the first half of its time; the tips withdraw in the second."""
+    """Reduces the forces to zero in the first half of its time, then withdraws the tips."""
 
     step: ReleaseStep
 
     def set_start(self) -> None:
-        """Start with the grip as it is, where the tips are."""
+        """Start with the current forces and tip positions."""
         grasp = self.grasp
         self._force = grasp.grip.force
         self._load = grasp.grip.load.copy()
@@ -366,7 +378,7 @@ class ReleaseWork(StepWork):
         self._out = grasp.grip.find_outward_directions(grasp.fingers.tip)
 
     def run(self, elapsed_s: float) -> bool:
-        """Let go."""
+        """Reduce the forces, or withdraw the tips."""
         grasp = self.grasp
         target = grasp.target
         half = 0.5 * self.step.seconds
@@ -398,4 +410,4 @@ WORKS: dict[type[Table], type[StepWork]] = {
     HoldStep: HoldWork,
     ReleaseStep: ReleaseWork,
 }
-"""What is at work in a step, by the step's class."""
+"""Class that executes a step, by the class of the step."""

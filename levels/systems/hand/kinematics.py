@@ -1,8 +1,8 @@
-"""Kinematics of the fingers: tips and their Jacobians in the frame of the palm, and joint positions
-for a tip.
+"""Kinematics of the fingers: tips and their Jacobians in the frame of the palm, and inverse
+kinematics.
 
-Evaluated on separate data, like the arm's (`rack.levels.robot.dynamics`): a pure function of joint
-positions. The palm does not move.
+Evaluated on separate MuJoCo data, like the dynamics of an arm (`rack.levels.robot.dynamics`), so
+that results depend on the joint positions alone. The palm does not move.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
 
 DAMPING_M2 = 1e-5
-"""Damping of an inverse step, in squared tip motion per rad: 3 mm per rad, of 80 that a finger has
-when it is bent."""
+"""Damping of a step of inverse kinematics, (3 mm/rad)^2. The tip of a bent finger moves by 80
+mm/rad."""
 MARGIN_RAD = 0.01
-"""Distance that targets keep from the ends of a joint's range."""
+"""Distance of targets from the ends of a joint's range."""
 
 
 class FingerKinematics:
@@ -28,7 +28,7 @@ class FingerKinematics:
     def __init__(self, cell: Cell, hand: Hand) -> None:
         self._cell = cell
         self._tips = hand.tips
-        # Of each finger, as indices of `robot.joints`.
+        # Indices in `robot.joints` of the joints of each finger.
         self.joints = [np.flatnonzero(row) for row in hand.fingers]
         self._data = d = mujoco.MjData(cell.model)
         mujoco.mj_resetDataKeyframe(cell.model, d, 0)
@@ -37,12 +37,12 @@ class FingerKinematics:
         self._high = self.limits.position[:, 1] - MARGIN_RAD
         self._whole = np.zeros((3, cell.model.nv))
         mujoco.mj_kinematics(cell.model, d)
-        self.palm = site_pose(d, cell.tool)  # in the world
-        # From the palm's frame into the world's.
+        self.palm = site_pose(d, cell.tool)  # pose in the world
+        # Rotates vectors from the frame of the palm into the world.
         self.rotation = d.site_xmat[cell.tool].reshape(3, 3).copy()
 
     def set_position(self, position: Array) -> None:
-        """Go to joint positions, (joints,), rad: tips and Jacobians are for these from now on."""
+        """Evaluate tips and Jacobians at joint positions, (joints,), rad, from now on."""
         self._data.qpos[self._cell.qpos] = position
         mujoco.mj_kinematics(self._cell.model, self._data)
         mujoco.mj_comPos(self._cell.model, self._data)
@@ -52,12 +52,12 @@ class FingerKinematics:
         return self.to_palm_frame(self._data.site_xpos[self._tips[finger]])
 
     def to_palm_frame(self, point: Array) -> Array:
-        """Return a point of the world, (3,), m, in the frame of the palm."""
+        """Convert a point from the world to the frame of the palm, (3,), m."""
         return transposed_mat_vec(self.rotation, point - self.palm.position)
 
     def find_jacobian(self, finger: int) -> Array:
-        """Return the Jacobian of the tip of a finger by its own joints, (3, joints of the finger),
-        m/rad."""
+        """Return the Jacobian of a finger's tip with respect to the joints of the finger, (3,
+        joints of the finger), m/rad."""
         mujoco.mj_jacSite(self._cell.model, self._data, self._whole, None, self._tips[finger])
         own = np.take(self._whole, self._cell.dof[self.joints[finger]], axis=1)
         rotated = np.empty_like(own)
@@ -65,11 +65,16 @@ class FingerKinematics:
         return rotated
 
     def step_towards(self, finger: int, position: Array, way: Array, homing: Array) -> None:
-        """Move the joints of a finger in `position`, (joints,), rad, so that its tip goes `way`,
-        (3,), m: one step.
+        """Make one damped step of inverse kinematics; call `set_position(position)` before.
 
-        `look(position)` comes before. A finger has more joints than its tip needs: of the motions
-        that do so it takes the one nearest to `homing`, (joints of the finger,), rad.
+        A finger has a redundant joint. Of all joint motions that move the tip by `way` this takes
+        the one nearest to `homing`.
+
+        Args:
+            finger: Index of the finger.
+            position: Joint positions, (joints,), rad; those of the finger are changed.
+            way: Displacement of the tip, (3,), m.
+            homing: Preferred joint motion, (joints of the finger,), rad.
         """
         own = self.joints[finger]
         jacobian = self.find_jacobian(finger)

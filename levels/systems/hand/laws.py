@@ -1,43 +1,42 @@
-"""The laws of the fingertips, the joints and the tendons of a hand.
+"""Control laws of a hand, for fingertips, joints and tendons.
 
-The law of the fingertips: joint targets from what is wanted of the fingers, each in one of three
-modes.
+The fingertip law computes joint targets. Each finger is in one of three modes:
 
-JOINTS: the targets are those given. POINT: inverse kinematics, a few damped steps a cycle from the
-targets before. FORCE: torque = J^T force + J^T k J (joints at the point - joints), a spring of
-stiffness k about a point, the same in all directions (Salisbury, "Active stiffness control of a
-manipulator in Cartesian coordinates", 1980). The stiffness by joints, J^T k J, goes to the joint
-loop: closed at its rate the spring is stable at a stiffness at which, closed at the rate of this
-loop, it is not. The joint loop also damps it, and a small part of its own stiffness keeps the
-posture: the tip leaves one joint of a finger undetermined.
+- JOINTS: the targets are commanded directly.
+- POINT: the targets follow by inverse kinematics, with a few damped steps per cycle.
+- FORCE: torque = J^T force + J^T k J (joints at the point - joints), an isotropic spring of
+  stiffness k about a point (Salisbury, "Active stiffness control of a manipulator in Cartesian
+  coordinates", 1980). The joint stiffness J^T k J is passed to the joint loop, because the spring
+  is stable at a higher stiffness if it is closed at the rate of that loop. The joint loop also
+  damps the spring, and a small part of its stiffness keeps the posture, since the position of the
+  tip leaves one joint of a finger undetermined.
 
-The law of the joints: torques that make every joint's error that of a damped oscillator, as
-stiff as is wanted.
+The joint law computes torques with which the error of every joint behaves like a damped oscillator
+of the desired stiffness.
 
 torque = M(q) (2 d w (qd_wanted - qd) + s w^2 e) + S e + torque of tip forces + weight(q) +
 friction(qd_wanted)
 
-e = q_wanted - q. `s`, 0 to 1 a joint, is the part of the stiffness that acts; S is that of tips
-which are springs. The damping always acts, so a finger that only exerts a force is still slow. The
-weight of a finger is small, but at a joint that is soft it would cost degrees. Viscous friction is
-fed forward for the velocity wanted, not for the one sensed: what damps is not cancelled. The sample
-is taken on to when the torque acts, a valve's lag included, at the velocity sensed.
+e = q_wanted - q. `s`, 0 to 1 for each joint, scales the stiffness; S is the stiffness of tips in
+mode FORCE. The damping always acts, so that a finger which only exerts a force moves slowly. The
+weight of a finger is small, but would displace a soft joint by degrees. Viscous friction is fed
+forward for the target velocity, not the sensed one, so that its damping is not cancelled. The
+sample is extrapolated at the sensed velocity to the time at which the torque acts, including the
+lag of a valve.
 
-The law of the tendons: tensions for a torque, early enough for slow valves, and corrected by
-what is sensed.
+The tendon law computes tensions for a torque. It compensates the lag of the valves and their
+lasting errors.
 
-A pair turns its joint with torque = a (Tf - Te), a being its moment arm. Of all tensions that give
-a torque, those about a mean T0 are Tf = T0 + torque / 2a and Te = T0 - torque / 2a: the statics of
-a symmetric pair. Tendons only pull: where one would go slack, the mean is raised; where the other
-could then not pull enough, the torque is clipped.
+A pair of tendons turns its joint with torque = a (Tf - Te), where a is the moment arm. For a mean
+tension T0, Tf = T0 + torque / 2a and Te = T0 - torque / 2a. Tendons can only pull: if one would
+become slack, the mean is raised; if the other then exceeds its limit, the torque is clipped.
 
-A valve follows its command with a lag [assumed: of first order]. `lead` commands more than is
-wanted while the tension, by a model of the valve, has not arrived: it is then there (1 + lead)
-times as soon, and nothing sensed is fed back, so the delays on the way to and from the hand cannot
-make it unstable. What the model lacks, gain and offset of a valve, is an error that lasts: `trim`
-integrates the difference of the sensed tension from that of the model, far slower than the lag. The
-model for this runs on the commands that the hand reports with each sample: both are of the same
-time.
+A valve follows its command with a first-order lag (assumed). `lead` commands an excess tension
+while the tension of a model of the valve has not arrived, which makes the response (1 + lead) times
+as fast. It uses no feedback, so delays to and from the hand cannot make it unstable. Gain and
+offset errors of a valve remain; `trim` integrates the difference between the sensed tension and the
+model, much more slowly than the lag. The model for this uses the commands that the hand reports
+with each sample, so both belong to the same time.
 """
 
 from __future__ import annotations
@@ -60,20 +59,20 @@ from rack.levels.systems.hand.messages import FingerMode, FingerTarget, GraspTar
 from rack.levels.tables import NotNegative, Positive, Table
 
 HOMING = 0.02
-"""Part of the way to the finger's posture that its undetermined joint goes in a step."""
+"""Fraction of the distance to its posture by which a redundant joint moves in a step."""
 STEPS = 2
-"""Steps of inverse kinematics in a cycle."""
+"""Steps of inverse kinematics per cycle."""
 
 
 class FingertipGains(Table):
     """Gains of the fingertip loop."""
 
     posture: NotNegative = Field(0.2, le=1.0)
-    """part of the joint loop's stiffness that keeps the posture of a finger in mode FORCE"""
+    """fraction of the joint loop's stiffness that keeps the posture of a finger in mode FORCE"""
 
 
 class FingertipLaw:
-    """Sets the joint targets of some fingers of a hand."""
+    """Computes the joint targets of some fingers of a hand."""
 
     def __init__(
         self,
@@ -82,33 +81,45 @@ class FingertipLaw:
         gains: FingertipGains,
         period_s: float,
     ) -> None:
-        """Drive `fingers`, by index, every `period_s`."""
+        """Start at zero targets; call `start` before the first cycle.
+
+        Args:
+            kinematics: Kinematics of the whole hand.
+            fingers: Indices of the fingers to drive.
+            gains: Gains of the law.
+            period_s: Time between two cycles, s.
+        """
         self.kinematics = kinematics
         self._fingers = fingers
         self._posture = gains.posture
         self._period_s = period_s
-        # (joints,), rad: farthest that a target goes in a cycle.
+        # (joints,), rad: largest change of a target in a cycle.
         self._most = kinematics.limits.velocity * period_s
         self.wanted = np.zeros(len(self._most))  # (joints,), rad: targets of the last cycle
-        # (joints,), rad: posture to which an undetermined joint tends.
+        # (joints,), rad: posture to which a redundant joint returns.
         self._rest = self.wanted.copy()
-        self._tips = np.zeros((len(kinematics.joints), 3))  # (fingers, 3), m: as sensed
+        self._tips = np.zeros((len(kinematics.joints), 3))  # (fingers, 3), m: sensed
 
     def start(self, position: Array) -> None:
-        """Begin with targets, and a posture, at `position`, (joints,), rad."""
+        """Set targets and posture to `position`, (joints,), rad."""
         self.wanted[:] = self._rest[:] = position
 
     def find_tips(self, position: Array) -> Array:
-        """Take the joint positions sensed, (joints,), rad; return the tips, (fingers, 3), m, of
-        this law's fingers."""
+        """Return the tips, (fingers, 3), m, of the driven fingers at sensed joint positions,
+        (joints,), rad."""
         self.kinematics.set_position(position)
         for finger in self._fingers:
             self._tips[finger] = self.kinematics.find_tip(finger)
         return self._tips
 
     def set_targets(self, grasp: GraspTarget, ahead_s: float, out: FingerTarget) -> None:
-        """Fill a `FingerTarget` from a `GraspTarget`, taken on by `ahead_s` at its velocities;
-        after `sense`."""
+        """Fill a `FingerTarget` from a `GraspTarget`; call `find_tips` before.
+
+        Args:
+            grasp: The command, which is extrapolated at its velocities.
+            ahead_s: Time by which it is extrapolated, s.
+            out: The targets of the driven fingers are set.
+        """
         before = self.wanted.copy()
         points = grasp.tip + ahead_s * grasp.tip_velocity
         reaching = []
@@ -138,8 +149,8 @@ class FingertipLaw:
             out.velocity[own] = moved[own] / self._period_s
 
     def _approach_points(self, fingers: Sequence[int], points: Array) -> None:
-        """Bring the targets of `fingers` closer to where their tips are at `points`, (fingers, 3),
-        m."""
+        """Move the targets of `fingers` towards joint positions with tips at `points`, (fingers,
+        3), m."""
         for _ in range(STEPS):
             self.kinematics.set_position(self.wanted)
             for finger in fingers:
@@ -156,16 +167,16 @@ class JointGains(Table):
     bandwidth: Positive = Field(35.0, le=400.0)
     """natural frequency of the error in every joint, rad/s"""
     damping: Positive = Field(0.7, le=5.0)
-    """damping ratio that the loop adds to the friction of joints"""
+    """damping ratio of the loop, in addition to the friction of joints"""
     ahead: NotNegative = Field(0.006, le=0.1)
-    """time from a command of tensions until they have come, s"""
+    """time from a command until the tensions have followed it, s"""
 
 
 class JointLaw:
-    """Sets the torques of some joints of a hand."""
+    """Computes the torques of some joints of a hand."""
 
     def __init__(self, cell: Cell, driven: Mask, gains: JointGains) -> None:
-        """Drive the joints `driven`, (joints,)."""
+        """Drive the joints of the mask `driven`, (joints,)."""
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(len(driven))
         viscous = cell.model.dof_damping[cell.dof]
@@ -174,13 +185,20 @@ class JointLaw:
         self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
         self._ahead = gains.ahead
         self._set = set_joint_torques.load()
-        self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
+        self.clipped = 0  # cycles in which a torque was limited
 
     def set_torques(
         self, hand: HandStatus, target: FingerTarget, age_s: float, ahead_s: float, out: Array
     ) -> None:
-        """Set `out`, (joints,), N m, for when the sample in a `HandStatus` is `age_s` old; the
-        `FingerTarget` is taken on by `ahead_s`."""
+        """Set the torques `out`.
+
+        Args:
+            hand: Status with the newest sample.
+            target: Joint targets.
+            age_s: Age of the sample when the torque acts, s.
+            ahead_s: Time by which the target is extrapolated, s.
+            out: Torques, (joints,), N m; set.
+        """
         terms = self._dynamics.terms(hand.position, self._still)
         is_cut = self._set(
             self._gains,
@@ -203,20 +221,20 @@ class JointLaw:
 )
 def set_joint_torques(
     gains: tuple[float, float],  # stiffness, 1/s2, and damping, 1/s
-    times: tuple[float, float],  # s: by which the sample, and the target, are taken on
+    times: tuple[float, float],  # s: extrapolation of the sample, and of the target
     constants: Array,  # (4, joints): rows as below
     state: Array,  # (2, joints): rad, rad/s
-    wanted: Array,  # (4, joints): rad, rad/s, part of the stiffness, N m
+    wanted: Array,  # (4, joints): rad, rad/s, scale of the stiffness, N m
     spring: Array,  # (joints, joints), N m/rad
     inertia: Array,  # (joints, joints), kg m2
     weight: Array,  # (joints,), N m
     torque: Array,  # (joints,), N m: set; 0 for joints of other boards
 ) -> bool:
-    """Set the torques; return whether a limit cut one."""
+    """Set the torques; return whether one was limited."""
     dry = constants[0]  # N m
     viscous = constants[1]  # N m s/rad
     limit = constants[2]  # N m
-    driven = constants[3]  # 1: a joint of this board; 0: of another
+    driven = constants[3]  # 1 for the joints of this board
     joints = len(torque)
     clipped = False
     for j in range(joints):
@@ -241,30 +259,30 @@ def set_joint_torques(
 
 
 MOST_LEARNED = 0.1
-"""Largest part of an error that one sample corrects, after however many that were missed."""
+"""Largest fraction of an error that one sample corrects, however many were missed before it."""
 
 
 class TendonGains(Table):
-    """What the law knows of the valves, and its gains."""
+    """Model of the valves, and gains of the tendon law."""
 
     lag: Positive = Field(0.008, le=1.0)
     """time constant of a valve, s"""
     lead: NotNegative = Field(1.0, le=4.0)
-    """part of the tension still missing that is commanded in excess"""
+    """excess command, as a fraction of the tension that has not arrived"""
     trim: NotNegative = Field(4.0, le=20.0)
-    """rate at which a valve's lasting error is corrected, 1/s"""
+    """rate of correction of a valve's lasting error, 1/s"""
     most_trim: NotNegative = 10.0
-    """largest such correction, N"""
+    """largest correction, N"""
     margin: NotNegative = 1.0
-    """tension kept above the hand's least, for a valve's error, N"""
+    """margin above the hand's least tension for errors of a valve, N"""
 
 
 class TendonLaw:
-    """Sets the tensions of some joints of a hand. What it has learned of valves it learns anew
-    after a restart."""
+    """Computes the tensions for some joints of a hand. Corrections of valves are lost in a
+    restart and learned again."""
 
     def __init__(self, hand: Hand, driven: Mask, gains: TendonGains, context: LevelContext) -> None:
-        """Drive the joints `driven`, (joints,), in every cycle of a level."""
+        """Drive the joints of the mask `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
         least = np.full(joints, hand.least + gains.margin)
         # In the rows of `set_tensions`.
@@ -281,18 +299,24 @@ class TendonLaw:
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
         self._set = set_tensions.load()
         self._sampled = 0  # tick of the last sample
-        self.clipped = 0  # cycles in which a torque was cut to what the tendons can give
+        self.clipped = 0  # cycles in which a torque was limited
 
     def start(self, status: HandStatus) -> None:
-        """Begin with the tensions of a `HandStatus`."""
+        """Initialise the models with the tensions of a `HandStatus`."""
         self._valves[0] = status.wanted
         self._valves[1] = status.tension
         self._valves[2] = 0.0
         self._sampled = status.tick
 
     def set_tensions(self, status: HandStatus, torque: Array, out: Array) -> None:
-        """Set `out`, (2, joints), N, for `torque`, (joints,), N m, at a `HandStatus`."""
-        # Valves that are closed do not follow their commands: nothing is to be learned from them.
+        """Set the tensions `out`.
+
+        Args:
+            status: Status with the newest sample.
+            torque: Torques to exert, (joints,), N m.
+            out: Tensions, (2, joints), N; set.
+        """
+        # Closed valves do not follow their commands, so nothing can be learned from them.
         elapsed = 0 if status.holding else status.tick - self._sampled
         self._sampled = status.tick
         elapsed_s = elapsed * self._tick_s
@@ -309,12 +333,12 @@ class TendonLaw:
     "UniTuple(f8, 4), UniTuple(f8, 2), f8[:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[:,::1]"
 )
 def set_tensions(
-    # Mean tension, N, lead, share of a cycle in the lag, largest trim, N.
+    # Mean tension, N; lead; response of a valve in a cycle, 0 to 1; largest trim, N.
     numbers: tuple[float, float, float, float],
-    shares: tuple[float, float],  # of the time since the sample before: in the lag, and in the trim
+    shares: tuple[float, float],  # response since the last sample, 0 to 1: of a valve, of the trim
     constants: Array,  # (4, joints): rows as below
     valves: Array,  # (3, 2, joints), N: rows as below
-    sensed: Array,  # (4 joints,), N: tensions as sensed, then as they were commanded; flexors first
+    sensed: Array,  # (4 * joints,), N: sensed, then commanded tensions, flexors first
     torque: Array,  # (joints,), N m
     tension: Array,  # (2, joints), N: set; 0 for joints of other boards
 ) -> bool:
@@ -323,9 +347,9 @@ def set_tensions(
     arm = constants[0]  # m
     least = constants[1]  # N
     most = constants[2]  # N
-    driven = constants[3]  # 1: a joint of this board; 0: of another
-    reached = valves[0]  # by the model, now
-    expected = valves[1]  # by the model, at the sample
+    driven = constants[3]  # 1 for the joints of this board
+    reached = valves[0]  # of the model, now
+    expected = valves[1]  # of the model, at the sample
     trim = valves[2]  # correction
     joints = len(arm)
     clipped = False
@@ -343,7 +367,7 @@ def set_tensions(
             commanded = sensed[(2 + row) * joints + j] - trim[row, j]
             expected[row, j] += shares[0] * (commanded - expected[row, j])
             learned = trim[row, j] + shares[1] * (expected[row, j] - sensed[row * joints + j])
-            if abs(learned) < np.inf:  # a NaN that was sensed teaches nothing
+            if abs(learned) < np.inf:  # ignore a sensed NaN
                 trim[row, j] = min(max(learned, -most_trim), most_trim)
             early = wanted + lead * (wanted - reached[row, j])
             early = np.minimum(np.maximum(early, least[j]), most[j])

@@ -1,8 +1,8 @@
-"""The boards that run the loops of a hand: one loop of all fingers each, or all loops of one
-finger, by the same laws.
+"""Boards for the loops of a hand. A board runs one loop of all fingers, or all loops of one finger,
+with the same laws.
 
-With one loop each, the fingertip loop turns what the grasp loop wants into targets of all joints,
-the joint loop these into torques, and the tendon loop these into tensions.
+The fingertip loop converts commands of the grasp loop to joint targets, the joint loop converts
+these to torques, and the tendon loop converts torques to tensions.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ from rack.levels.systems.hand.messages import (
 from rack.levels.tables import read_params
 
 NO_HAND_YET = "no status of the hand yet: waiting for its board"
-HAND_LOST = "no status of the hand: what was commanded last is kept"
+HAND_LOST = "no status of the hand: the last command stays in force"
 
 
 class HandLoop(Executor):
-    """A loop between the level above and the hand: follows the newest command, at the state that
-    the hand has sensed.
+    """Base of the loops between the level above and the hand.
 
-    Without a fresh command it keeps what was commanded last, at rest: what the hand holds, it goes
-    on holding. So it does on an operator's hold. A command that is not finite is not taken. A
-    subclass has the ports "above", "command", "status", "hand", "operator" and, unless the hand is
-    below it, "below".
+    A loop follows the newest command, based on the sensed state of the hand. Without a fresh
+    command, and during an operator's hold, the last command stays in force with zero velocities, so
+    that the hand keeps its grip. Commands that are not finite are rejected. A subclass has the
+    ports "above", "command", "status", "hand", "operator" and, unless the hand is directly below,
+    "below".
     """
 
     commands = HOLDABLE
@@ -68,7 +68,7 @@ class HandLoop(Executor):
     command: RelayedCommand
     status: LoopStatus | FingerStatus
     followed: RelayedCommand
-    """The command that is followed."""
+    """The command in force."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -78,43 +78,43 @@ class HandLoop(Executor):
         self.orders = Orders(self.commands)
         command = self.inputs["above"].message
         self.followed = command.zeros(context.sizes)
-        # Names of its fields that must be finite.
+        # Names of the fields that must be finite.
         self._numbers = [field.name for field in command.message_type.fields if field.kind == "f8"]
-        self.commanded = False  # there was one
-        # (joints,) or (fingers,), as in the status: those of this board.
+        self.commanded = False  # whether a command was accepted
+        # Mask of the joints or fingers of this board, as in the status.
         self.driven: Mask
         self._above = ", ".join(context.above)
         self._period = max(pace.every for pace in context.above.values())
         slowest = max(context.every, *(pace.every for pace in context.below.values()))
-        # Ticks, of a status of the hand.
+        # Ticks: largest age of a usable status of the hand.
         self._oldest = slowest + self.cell.patience.ticks(slowest, context.tick_s)
-        self._taken = 0  # tick at which `command` came
-        self._rejected = ""  # why the newest command is not followed
-        self._held = False  # by an operator, in the last cycle
-        self._met = False  # a status of the hand has come
+        self._taken = 0  # tick at which `followed` was accepted
+        self._rejected = ""  # reason for rejecting the newest command, empty if accepted
+        self._held = False  # whether an operator held the loop in the last cycle
+        self._met = False  # whether a status of the hand has arrived
 
     @classmethod
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield a robot that has no hand, and a lack of neighbours."""
+        """Yield a robot without a hand, and missing neighbours."""
         if context.robot.hand is None:
-            yield "executor", cls.__name__, "it drives a hand; there is no [robot.hand]"
+            yield "executor", cls.__name__, "it drives a hand, but there is no [robot.hand]"
         for place, boards in (("above", above), ("below", below)):
             if not boards:
-                yield place, [], "it needs a board there"
+                yield place, [], "it needs a board in this place"
 
     @abstractmethod
     def start_from(self, hand: HandStatus) -> None:
-        """Begin with the first `HandStatus`, or continue from the level's own last messages."""
+        """Start from the first `HandStatus`, or continue from the level's own last messages."""
 
     @abstractmethod
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Write the level's command for `self.followed`, and what its status says of fingers or
-        joints."""
+        """Fill the command for `self.followed`, and the fields of the status that are specific to
+        the loop."""
 
     def process(self, tick: int) -> None:
-        """Follow the newest command, and report."""
+        """Follow the newest command and fill the status."""
         hand = self.hand
         self.orders.take(self.operator)
         if not self._met:
@@ -137,23 +137,23 @@ class HandLoop(Executor):
         self.orders.report(self.status, self.followed.operator)
 
     def sample_age_s(self, hand: HandStatus, tick: int) -> float:
-        """Return how old the sample of a `HandStatus` is when what this cycle commands acts, s."""
+        """Return the age of the sample in a `HandStatus` when the command of this cycle acts, s."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )
 
     def command_age_s(self, tick: int) -> float:
-        """Return the time by which the command is to be taken on at its velocities, s: a cycle of
-        the level above."""
+        """Return the time by which the command is extrapolated, s: its age, at most a cycle of the
+        level above."""
         return min(tick - self._taken, self._period) * self.context.tick_s
 
     def _take_command(self, command: Reading[RelayedCommand], tick: int) -> None:
-        """Follow what is new, unless an operator holds the loop."""
+        """Accept a new command, unless an operator holds the loop."""
         released = self._held
         self._held = self.orders.holds
         if self._held:
             for name in self._numbers:
-                if name.endswith("velocity"):  # what is commanded is kept at rest
+                if name.endswith("velocity"):  # the command stays in force at rest
                     setattr(self.followed, name, 0.0)
             self.orders.done()
         elif command.is_new or (released and command.is_there):
@@ -171,7 +171,7 @@ class HandLoop(Executor):
                 self._taken = tick
 
     def _holding_reason(self, tick: int) -> str:
-        """Return why the hand does not follow the level above; empty: it does."""
+        """Return why the hand does not follow the level above, empty if it does."""
         hand = self.hand.message
         if self.hand.is_lost or tick - hand.tick > self._oldest:
             return HAND_LOST
@@ -193,7 +193,7 @@ class HandLoop(Executor):
         status.echo = self.followed.id
         note = kept or self._rejected
         if lost and not note:
-            note = f"no command from '{self._above}': its last one is kept"
+            note = f"no command from '{self._above}': the last one stays in force"
         status.driven = self.driven
         status.stopped = bool(kept)
         status.holding = lost or not self.commanded
@@ -208,9 +208,9 @@ class HandLoop(Executor):
 
 
 class FingertipLoop(HandLoop):
-    """Turns postures, points and forces of fingers into targets of joints. See `FingertipLaw`.
+    """Converts postures, points and forces of fingers to joint targets. See `FingertipLaw`.
 
-    A restarted board continues from the targets that it gave last.
+    A restarted board continues from its last targets.
     """
 
     above = Input(GraspTarget, "above.command")
@@ -231,21 +231,20 @@ class FingertipLoop(HandLoop):
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
     def start_from(self, hand: HandStatus) -> None:
-        """Begin where the joints are, or with the last targets."""
+        """Start at the current joint positions, or at the last targets."""
         last = self.last.message
         begin = last if self.last.is_there and last.active else hand
         self._law.start(begin.position)
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Write the targets of the joints."""
+        """Fill the joint targets."""
         set_finger_targets(self, self._law, hand, self.command, self.status, tick)
 
 
 class JointLoop(HandLoop):
-    """Brings the joints to their targets with torques; until there are targets it holds them where
-    it found them.
+    """Moves the joints to their targets. See `JointLaw`.
 
-    See `JointLaw`.
+    Until there are targets it holds the joints in their initial positions.
     """
 
     above = Input(FingerTarget, "above.command")
@@ -264,12 +263,12 @@ class JointLoop(HandLoop):
         self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
 
     def start_from(self, hand: HandStatus) -> None:
-        """Hold the joints where they are, until there are targets."""
+        """Hold the joints in their current positions until there are targets."""
         self.followed.position = hand.position
         self.followed.stiff[:] = 1.0
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Write the torques for the newest targets."""
+        """Fill the torques for the newest targets."""
         self._law.set_torques(
             hand,
             self.followed,
@@ -282,10 +281,10 @@ class JointLoop(HandLoop):
 
 
 class TendonLoop(HandLoop):
-    """Gives the hand a tension for each tendon, in every cycle. See `TendonLaw`.
+    """Commands a tension for each tendon in every cycle. See `TendonLaw`.
 
-    What it commands rests on the status of the hand on which the torques rest: the hand thus
-    notices a joint loop that is gone, too.
+    The command names the status of the hand on which the torques depend, so that the hand also
+    detects the loss of the joint loop.
     """
 
     above = Input(TendonTorque, "above.command")
@@ -304,11 +303,11 @@ class TendonLoop(HandLoop):
         self._law = TendonLaw(self.hand_model, self.driven, gains, context)
 
     def start_from(self, hand: HandStatus) -> None:
-        """Begin with the tensions that are there."""
+        """Start with the current tensions."""
         self._law.start(hand)
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Write the tensions for the newest torques."""
+        """Fill the tensions for the newest torques."""
         command = self.command
         command.driven = self.driven
         command.sampled = min(hand.tick, self.followed.sampled) if self.commanded else -1
@@ -321,15 +320,13 @@ class FingerParams(FingertipGains, JointGains, TendonGains):
     """`[board.<name>.params]` of a board that runs all loops of a finger."""
 
     finger: str
-    """name of the finger, of robot.hand.finger"""
+    """name of the finger in robot.hand.finger"""
 
 
 class FingerExecutor(HandLoop):
-    """Drives the tendons of one finger as the grasp loop wants; holds it where it found it until
-    there is a target.
+    """Drives the tendons of one finger by the commands of the grasp loop.
 
-    After a restart it holds the finger where it is, or goes on with the newest command of the grasp
-    loop.
+    Until there is a command, also after a restart, it holds the finger in its current position.
     """
 
     above = Input(GraspTarget, "above.command")
@@ -360,8 +357,7 @@ class FingerExecutor(HandLoop):
     def misfits(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Misfits:
-        """Yield a finger that the hand does not have, in addition to a lack of a hand or of
-        neighbours."""
+        """Yield a finger that the hand lacks, and what `HandLoop` yields."""
         yield from super().misfits(context, above, below)
         hand = context.robot.hand
         name = read_params(FingerParams, context.params).finger
@@ -369,14 +365,14 @@ class FingerExecutor(HandLoop):
             yield "params.finger", name, f"the hand has no such finger; fingers: {', '.join(names)}"
 
     def start_from(self, hand: HandStatus) -> None:
-        """Hold the joints where they are."""
+        """Hold the joints in their current positions."""
         self._tip.start(hand.position)
         self._tendons.start(hand)
         self._target.position = hand.position
         self._target.stiff[:] = 1.0
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Write the tensions of the finger's tendons."""
+        """Fill the tensions of the finger's tendons."""
         set_finger_targets(self, self._tip, hand, self._target, self.status, tick)
         self._servo.set_torques(
             hand, self._target, self.sample_age_s(hand, tick), 0.0, self._torque
@@ -394,8 +390,16 @@ def set_finger_targets(
     status: FingerStatus,
     tick: int,
 ) -> None:
-    """Fill a `FingerTarget` for the `GraspTarget` that a loop follows, and the
-    `FingerStatus`."""
+    """Fill a `FingerTarget` and a `FingerStatus`.
+
+    Args:
+        loop: The loop, with the `GraspTarget` in force.
+        law: Its fingertip law.
+        hand: Status of the hand.
+        target: Joint targets; filled.
+        status: Status of the fingers; filled.
+        tick: Tick of the cycle.
+    """
     status.tip = law.find_tips(hand.position)
     target.active = loop.followed.active
     if loop.followed.active:

@@ -1,11 +1,11 @@
 """The messages of a hand: tensions down to the valves, angles and tensions up, and the targets of
 the loops between.
 
-Symbolic sizes: `joints` of the hand, in the order of `robot.joints`, and `fingers`, in the order of
-`robot.hand`. Vectors have all joints and all fingers; a board of some of them fills and obeys its
-own, others are 0. Tensions have two rows, flexors and extensors: a flexor's tension turns its joint
-in the positive direction. Points and forces are in the frame of the palm, which is the site
-`robot.tool`.
+Symbolic sizes are `joints` of the hand, in the order of `robot.joints`, and `fingers`, in the order
+of `robot.hand`. Vectors have all joints or all fingers; a board that drives only some of them fills
+and uses their elements, and the others are 0. Tensions have two rows, flexors and extensors. The
+tension of a flexor turns its joint in the positive direction. Points and forces are in the frame of
+the palm, which is the site `robot.tool`.
 """
 
 from __future__ import annotations
@@ -20,41 +20,42 @@ from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 FLEXOR = 0
 EXTENSOR = 1
-"""Rows of tensions."""
+"""Row indices of tensions."""
 
 
 class FingerMode(IntEnum):
     """Modes in which a finger is controlled."""
 
-    JOINTS = 0  # its joints go to positions
-    POINT = 1  # its joints go to where its tip is at a point
-    FORCE = 2  # its tip exerts a force, and is a spring of given stiffness about a point
+    JOINTS = 0  # the joints move to positions
+    POINT = 1  # the tip moves to a point
+    FORCE = 2  # the tip exerts a force, and acts as a spring about a point
 
 
 class GraspKind(IntEnum):
     """Kinds of steps of a grasp."""
 
     NONE = 0
-    PRESHAPE = 1  # joints go to a posture
-    CLOSE = 2  # tips go to an object until they touch it
+    PRESHAPE = 1  # joints move to a posture
+    CLOSE = 2  # tips move to an object until they touch it
     SQUEEZE = 3  # forces rise
-    SHIFT = 4  # the object is moved within the hand
-    HOLD = 5  # the object is kept
-    RELEASE = 6  # tips let go and withdraw
+    SHIFT = 4  # the fingers move the object
+    HOLD = 5  # the object is held in place
+    RELEASE = 6  # forces fall, tips withdraw
 
 
-DRIVEN = field("u1", unit="1", doc="1: the joint is one of this board's", shape="joints")
-SENSED = field(unit="tick", doc="tick of the hand's status that it rests on; -1: none yet")
+DRIVEN = field("u1", unit="1", doc="1 for joints of this board", shape="joints")
+SENSED = field(unit="tick", doc="tick of the hand's status on which it depends, -1 without one")
 
 
 class TensionCommand(SampledCommand, version=1):
     """From the boards of tendon loops to the board of the hand."""
 
     sampled: int = field(
-        unit="tick", doc="tick of the hand's status that it rests on; -1: none yet, so no tension"
+        unit="tick",
+        doc="tick of the hand's status on which the tensions depend, -1 if there are none",
     )
     tension: np.ndarray = field(
-        unit="N", doc="of the tendons of the board's own joints", shape=(2, "joints")
+        unit="N", doc="tensions of the tendons of this board's joints", shape=(2, "joints")
     )
     driven: np.ndarray = DRIVEN
 
@@ -65,20 +66,24 @@ class HandStatus(AnsweringStatus, version=1):
     tick: int = field(unit="tick", doc="tick at which the hand was sensed")
     position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
     velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    torque: np.ndarray = field(unit="N m", doc="of the tendons on the joints", shape="joints")
-    tension: np.ndarray = field(unit="N", doc="of the tendons, as sensed", shape=(2, "joints"))
+    torque: np.ndarray = field(
+        unit="N m", doc="torques of the tendons on the joints", shape="joints"
+    )
+    tension: np.ndarray = field(unit="N", doc="sensed tensions of the tendons", shape=(2, "joints"))
     wanted: np.ndarray = field(
         unit="N", doc="tensions commanded of the valves", shape=(2, "joints")
     )
     force: np.ndarray = field(
-        unit="N", doc="of the surroundings on the fingertips, as sensed", shape=("fingers", 3)
+        unit="N", doc="sensed forces of the environment on the fingertips", shape=("fingers", 3)
     )
-    holding: bool = field(doc="1: no fresh tensions: the valves are closed")
+    holding: bool = field(
+        doc="1 if the valves are closed, for lack of fresh tensions or another reason"
+    )
     stopped: bool = field(
-        doc="1: tensions are not followed: a demand, an operator, or a lost board"
+        doc="1 if tensions are ignored because of a demand, an operator, or a lost board"
     )
-    demand: Demand = field(doc="stop that the rack's safety demands in this cycle")
-    clipped: int = field("u4", unit="1", doc="cycles in which a tension was cut to its limits")
+    demand: Demand = field(doc="safety demand in this cycle")
+    clipped: int = field("u4", unit="1", doc="cycles in which a tension was limited")
     touches: int = field("u4", unit="1", doc="unintended contacts, counted at every substep")
     violations: int = field(
         "u4", unit="1", doc="substeps in which a tendon drove a joint beyond a limit"
@@ -92,26 +97,28 @@ class TendonTorque(RelayedCommand, version=1):
     """From the joint loop to the tendon loop."""
 
     sampled: int = field(
-        unit="tick", doc="tick of the hand's status that it rests on; -1: none yet"
+        unit="tick", doc="tick of the hand's status on which it depends, -1 without one"
     )
-    torque: np.ndarray = field(unit="N m", doc="of the joints", shape="joints")
+    torque: np.ndarray = field(unit="N m", doc="torques of the joints", shape="joints")
 
 
 class FingerTarget(RelayedCommand, version=1):
     """From the fingertip loop to the joint loop."""
 
-    active: bool = field(doc="0: no target yet, hold")
+    active: bool = field(doc="0 until there is a target")
     position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
     velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
     stiff: np.ndarray = field(
         unit="1",
-        doc="part of the joint loop's stiffness that acts, 0 to 1; its damping acts",
+        doc="scale of the joint loop's stiffness, 0 to 1; its damping is not scaled",
         shape="joints",
     )
-    torque: np.ndarray = field(unit="N m", doc="in addition: of the forces of tips", shape="joints")
+    torque: np.ndarray = field(
+        unit="N m", doc="additional torques, from forces of the tips", shape="joints"
+    )
     spring: np.ndarray = field(
         unit="N m/rad",
-        doc="in addition: stiffness of tips, by joint and joint",
+        doc="additional joint stiffness, from springs at the tips",
         shape=("joints", "joints"),
     )
 
@@ -119,22 +126,24 @@ class FingerTarget(RelayedCommand, version=1):
 class GraspTarget(RelayedCommand, version=1):
     """From the grasp loop to the fingertip loop, or to the boards of fingers."""
 
-    active: bool = field(doc="0: no target yet, hold")
-    mode: np.ndarray = field(
-        "u1", unit=FingerMode, doc="how each finger is controlled", shape="fingers"
+    active: bool = field(doc="0 until there is a target")
+    mode: np.ndarray = field("u1", unit=FingerMode, doc="mode of each finger", shape="fingers")
+    position: np.ndarray = field(unit="rad", doc="joint positions in mode JOINTS", shape="joints")
+    velocity: np.ndarray = field(
+        unit="rad/s", doc="joint velocities in mode JOINTS", shape="joints"
     )
-    position: np.ndarray = field(unit="rad", doc="joint positions, for JOINTS", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities, for JOINTS", shape="joints")
     tip: np.ndarray = field(
-        unit="m", doc="points of the tips, for POINT and FORCE", shape=("fingers", 3)
+        unit="m", doc="points of the tips in modes POINT and FORCE", shape=("fingers", 3)
     )
-    tip_velocity: np.ndarray = field(unit="m/s", doc="their velocities", shape=("fingers", 3))
+    tip_velocity: np.ndarray = field(
+        unit="m/s", doc="velocities of these points", shape=("fingers", 3)
+    )
     stiffness: np.ndarray = field(
-        unit="N/m", doc="of each tip about its point, for FORCE", shape="fingers"
+        unit="N/m", doc="stiffness of each tip about its point in mode FORCE", shape="fingers"
     )
     force: np.ndarray = field(
         unit="N",
-        doc="of each tip on the surroundings, at its point, for FORCE",
+        doc="force of each tip on the environment in mode FORCE",
         shape=("fingers", 3),
     )
 
@@ -145,11 +154,11 @@ class LoopStatus(AnsweringStatus, version=1):
     driven: np.ndarray = DRIVEN
     sensed: int = SENSED
     clipped: int = field(
-        "u4", unit="1", doc="cycles in which a torque was cut to what tendons can give"
+        "u4", unit="1", doc="cycles in which a torque was limited to what the tendons can exert"
     )
-    holding: bool = field(doc="1: no fresh command from above: what was commanded last is kept")
+    holding: bool = field(doc="1 if the last command stays in force for lack of a fresh one")
     stopped: bool = field(
-        doc="1: commands are not followed: the hand is stopped, or an operator holds the loop"
+        doc="1 if commands are ignored because the hand is stopped or an operator holds the loop"
     )
 
 
@@ -157,66 +166,65 @@ class FingerStatus(AnsweringStatus, version=1):
     """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp
     loop."""
 
-    driven: np.ndarray = field(
-        "u1", unit="1", doc="1: the finger is one of this board's", shape="fingers"
-    )
+    driven: np.ndarray = field("u1", unit="1", doc="1 for fingers of this board", shape="fingers")
     sensed: int = SENSED
     position: np.ndarray = field(
         unit="rad", doc="joint positions, from the hand's status", shape="joints"
     )
-    target: np.ndarray = field(unit="rad", doc="joint positions wanted", shape="joints")
-    tip: np.ndarray = field(unit="m", doc="points of the tips", shape=("fingers", 3))
-    force: np.ndarray = field(unit="N", doc="of the surroundings on the tips", shape=("fingers", 3))
-    holding: bool = field(doc="1: no fresh target: the fingers stay")
+    target: np.ndarray = field(unit="rad", doc="joint targets", shape="joints")
+    tip: np.ndarray = field(unit="m", doc="positions of the tips", shape=("fingers", 3))
+    force: np.ndarray = field(
+        unit="N", doc="forces of the environment on the tips", shape=("fingers", 3)
+    )
+    holding: bool = field(doc="1 if the fingers stay for lack of a fresh target")
     stopped: bool = field(
-        doc="1: targets are not followed: the hand is stopped, or an operator holds a loop"
+        doc="1 if targets are ignored because the hand is stopped or an operator holds a loop"
     )
 
 
 class GraspStatus(AnsweringStatus, version=1):
     """From the grasp loop. Points and forces are in the frame of the palm."""
 
-    step: int = field("u2", unit="1", doc="steps of the program that are done")
-    steps: int = field("u2", unit="1", doc="steps of the program")
-    kind: GraspKind = field(doc="of the step under way")
-    passed: float = field(unit="s", doc="time for which that step is under way")
+    step: int = field("u2", unit="1", doc="number of completed steps")
+    steps: int = field("u2", unit="1", doc="number of steps of the program")
+    kind: GraspKind = field(doc="kind of the current step")
+    passed: float = field(unit="s", doc="execution time of the current step")
     object: int = field(
-        "i2", unit="1", doc="row of the object grasped, in the world model; -1: none"
+        "i2", unit="1", doc="row of the gripped object in the world model, -1 without one"
     )
     touching: np.ndarray = field(
-        "u1", unit="1", doc="1: the finger touches the object", shape="fingers"
+        "u1", unit="1", doc="1 for fingers that touch the object", shape="fingers"
     )
-    grip: float = field(
-        unit="N", doc="internal force of the finger that opposes the others; they share it"
-    )
-    load: np.ndarray = field(unit="N", doc="that the grasp makes up for: weight and pull", shape=3)
-    anchor: np.ndarray = field(unit="m", doc="where the object is to be", shape=3)
-    moved: float = field(unit="m", doc="distance of the object from there")
+    grip: float = field(unit="N", doc="internal force of the opposing finger, shared by the others")
+    load: np.ndarray = field(unit="N", doc="force of the grasp against weight and pull", shape=3)
+    anchor: np.ndarray = field(unit="m", doc="target position of the object", shape=3)
+    moved: float = field(unit="m", doc="distance of the object from its target position")
     farthest: float = field(unit="m", doc="largest such distance since the object was gripped")
-    plan: int = field("u4", unit="1", doc="id of the grasp plan in use; 0: none")
+    plan: int = field("u4", unit="1", doc="id of the grasp plan in use, 0 without one")
 
 
 class GraspPlan(RelayedCommand, version=1):
-    """From a planner, on a board or on the host side, to the grasp loop: where the fingers take
-    hold of
-    an object, and from which posture they close. The newest with an `id` above 0 counts."""
+    """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on
+    an object, and the posture from which they close. The newest plan with an `id` above 0 is used."""
 
     object: int = field("i2", unit="1", doc="row of the object in the world model")
-    sensed: int = field(unit="tick", doc="tick of the world model that it rests on")
+    sensed: int = field(unit="tick", doc="tick of the world model on which it depends")
     posture: np.ndarray = field(
         unit="rad", doc="joint positions from which the fingers close", shape="joints"
     )
     contact: np.ndarray = field(
         unit="m",
-        doc="of each tip, on the object's surface, in the object's frame",
+        doc="contact of each tip on the object's surface, in the object's frame",
         shape=("fingers", 3),
     )
     normal: np.ndarray = field(
         unit="1",
-        doc="direction of each tip's force there, in the object's frame",
+        doc="unit vector of each tip's force, in the object's frame",
         shape=("fingers", 3),
     )
-    grip: float = field(unit="N", doc="force of each finger; the opposing one bears their sum")
+    grip: float = field(
+        unit="N", doc="force of each finger except the opposing one, which bears their sum"
+    )
 
 
 STREAMED_DOWN = (

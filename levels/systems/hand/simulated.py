@@ -1,4 +1,4 @@
-"""The hand in MuJoCo: tendons that pull, behind valves that follow a tension or are closed."""
+"""The simulated hand: tendons behind valves that follow a tension or are closed."""
 
 from __future__ import annotations
 
@@ -15,30 +15,38 @@ from rack.levels.tables import SceneConfig
 
 
 class HandSample(NamedTuple):
-    """One sample of a hand's sensors. Positions and velocities are as coarse and noisy as their
-    encoders."""
+    """One sample of a hand's sensors. Positions and velocities have the resolution and noise of
+    their encoders."""
 
     position: Array  # (joints,), rad
     velocity: Array  # (joints,), rad/s
-    torque: Array  # (joints,), N m: of the tendons
+    torque: Array  # (joints,), N m: torque of the tendons
     tension: Array  # (2, joints), N: flexors, extensors
-    force: Array  # (fingers, 3), N: of the surroundings on the tips, in the palm's frame
+    force: Array  # (fingers, 3), N: environment on tips, in the palm's frame
 
 
 class SimulatedHand(Simulation):
-    """A hand of tendons. It has no brakes: without commands its valves close, and the grip is kept.
+    """A hand driven by tendons. It has no brakes: without commands its valves close and keep the
+    grip.
 
-    The air in a closed valve is a spring: the tension of its tendon rises by `Hand.closed` with
-    every metre by which the joint pulls at it. So fingers that moved come to rest, and what they
-    held stays held, by the tension with which the valves closed. At the start they are closed with
+    The air in a closed valve acts as a spring. The tension of its tendon rises by `Hand.closed` for
+    each metre by which the joint pulls the tendon. Moving fingers therefore come to rest, and the
+    grip is kept by the tension at which the valves closed. Initially the valves are closed, with
     tensions that carry the weight of the open hand.
     """
 
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
-        """Start at home. One tick is `clock_ns`, one cycle of commands `every` ticks; `seed` is for
-        random noise."""
+        """Start at home.
+
+        Args:
+            cell: Cell with a hand.
+            scene: Scene with the objects.
+            clock_ns: Length of a tick, ns.
+            every: Ticks between two commands.
+            seed: Seed of the sensor noise.
+        """
         super().__init__(cell)
         assert cell.hand is not None, "it is a hand"
         self.hand = hand = cell.hand
@@ -52,11 +60,11 @@ class SimulatedHand(Simulation):
         self._spring = np.stack((-pull, pull))  # (2, joints), N/rad: of closed valves
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         acts = cell.model.actuator_actadr[hand.actuators]
-        # (2, joints): tensions behind valves that take time; None: they take none.
+        # (2, joints): addresses of the states of valves with a lag. None without a lag.
         self._acts = acts if (acts >= 0).all() else None
 
     def _set_initial_tensions(self, tension: Array) -> None:
-        """Let the valves have had tensions, (2, joints), N, for ever."""
+        """Set controls, valve states and delay lines to steady tensions, (2, joints), N."""
         model = self.cell.model
         d = self._data
         for actuator, pull in zip(
@@ -72,13 +80,13 @@ class SimulatedHand(Simulation):
 
     @property
     def wanted(self) -> Array:
-        """Tensions commanded of the valves, (2, joints), N; of closed ones, those that the air in
-        them tends to."""
+        """Tensions commanded of open valves, or equilibrium tensions of closed ones, (2, joints),
+        N."""
         return np.asarray(np.clip(self._data.ctrl[self.hand.actuators], 0.0, self.hand.most))
 
     def sense(self) -> HandSample:
-        """Return the newest sample; torques, tensions and forces are those of a step ago, as
-        MuJoCo's are."""
+        """Return the newest sample. Torques, tensions and forces are one simulation step old, as
+        always in MuJoCo."""
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)
@@ -88,14 +96,13 @@ class SimulatedHand(Simulation):
         return HandSample(position, velocity, self._steps.seen[-1, 2], tension, in_palm)
 
     def apply_tensions(self, tension: Array) -> None:
-        """Open the valves, and let them follow tensions, (2, joints), N, which are within the
-        limits."""
+        """Open the valves and let them follow tensions, (2, joints), N, within the limits."""
         self.waited = 0
         self.braked = False
         self._data.ctrl[self.hand.actuators] = tension
 
     def tear_tendons(self, torn: Mask) -> None:
-        """Let the tendons marked, (2, joints), give no tension, and all others theirs."""
+        """Tear the tendons of a mask, (2, joints), and mend all others."""
         self._model.actuator_gainprm[self.hand.actuators, 0] = np.where(torn, 0.0, 1.0)
 
     def close_valves(self) -> None:
@@ -103,8 +110,8 @@ class SimulatedHand(Simulation):
         self.braked = True
 
     def step(self, ticks: int) -> None:
-        """Simulate `ticks` ticks. After a fault the hand stands still in its last sound state; time
-        continues."""
+        """Simulate `ticks` ticks. After a simulation fault the hand stays in its last valid state
+        while time continues."""
         self.contact = None
         for _ in range(ticks):
             self.braked = self.braked or self.waited >= self.patience
@@ -116,11 +123,10 @@ class SimulatedHand(Simulation):
             self._data.time = self._now_s
 
     def _simulate(self) -> None:
-        """Simulate one tick. Tensions behind closed valves follow the joints at once, and their
-        controls with them.
+        """Simulate one tick. Tensions behind closed valves, and their controls, follow the joints.
 
-        The controls may go below 0, where MuJoCo cuts them: a slack tendon is tight again where it
-        became slack.
+        Controls may become negative, although MuJoCo limits them to 0: a slack tendon is then tight
+        again at the position at which it became slack.
         """
         if not self.braked:
             super()._simulate()
@@ -135,7 +141,7 @@ class SimulatedHand(Simulation):
 
 
 def _find_carrying_tensions(cell: Cell, data: mujoco.MjData) -> Array:
-    """Return the tensions, (2, joints), N, that carry the hand's weight where it starts."""
+    """Return the tensions, (2, joints), N, that carry the hand's weight in its initial position."""
     hand = cell.hand
     assert hand is not None, "it is a hand"
     turn = (data.qfrc_bias - data.qfrc_passive)[cell.dof] / (2.0 * hand.arms)

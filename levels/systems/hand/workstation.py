@@ -1,15 +1,15 @@
 """The workstation of a hand, a host program that plans the grasp.
 
-It reads messages and sends plans through the bus adapter. No message carries the boards' cycle
-counts, so a prompt reads these from the crate's memory, word by word at their bus addresses. Boards
-may be writing them at that time, in lockstep too.
+It reads messages and sends plans through the bus adapter. The cycle counts of the boards are not in
+any message, so the prompt reads them from the crate's memory at their bus addresses. The boards may
+write them at the same time, even in lockstep.
 
-A grasp: the tips of the hand take hold of the object, one finger opposed to all others.
-The fingers press along one line, from one side, the opposing finger from the other. Lines in all
-directions across the fingers' knuckles are tried. Rays give contacts on the object's surface,
-inverse kinematics the joints. A line is possible if all tips reach their contacts, and if the hand
-touches nothing before; of those the one counts whose joints are farthest from the ends of their
-ranges.
+In a grasp, one finger opposes all others: the fingers press along one line from one side, and the
+opposing finger presses from the other side. The planner tries lines in all directions across the
+knuckles. It finds contacts on the object's surface by ray casting, and joint positions by inverse
+kinematics. A line is possible if all tips reach their contacts, and if the hand touches nothing
+before. Of the possible lines it takes the one with the largest distance of the joints from the ends
+of their ranges.
 """
 
 from __future__ import annotations
@@ -35,43 +35,51 @@ from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
 from rack.levels.tables import NotNegative, Positive, Table, read_params
 
 LINES = 72
-"""Directions tried."""
+"""Number of directions that are tried."""
 STEPS = 60
-"""Most steps of inverse kinematics to a point."""
+"""Largest number of steps of inverse kinematics."""
 STEP_M = 0.02
-"""Longest way of a tip in such a step."""
+"""Largest displacement of a tip in such a step."""
 REACHED_M = 0.001
 OUTSIDE_M = 0.2
 """Distance from the object at which rays begin."""
 
 
 class GraspRules(Table):
-    """What a planned grasp is to be."""
+    """Requirements on a planned grasp."""
 
     pad: Positive = 0.009
-    """distance of a tip's site from the surface that the tip touches, m"""
+    """distance between the site of a tip and the surface that it touches, m"""
     clear: Positive = 0.02
     """distance from the object at which tips begin to close, m"""
     pull: NotNegative = 2.0
-    """force on the object, in addition to its weight, that friction must bear, N"""
+    """pull on the object that friction must bear in addition to its weight, N"""
     reserve: Positive = Field(1.5, ge=1.0)
-    """by how much more it could bear"""
+    """safety factor of friction"""
 
 
 @dataclass(frozen=True)
 class PlannedGrasp:
-    """A grasp. Points and directions are in the object's frame, a row for each finger."""
+    """A grasp. Points and directions are in the object's frame, with a row for each finger."""
 
     contact: Array  # (fingers, 3), m, on the surface
-    normal: Array  # (fingers, 3), directions of the tips' forces
+    normal: Array  # (fingers, 3), unit vectors of the tips' forces
     posture: Array  # (joints,), rad, from which the fingers close
-    grip: float  # N, force of each finger but the opposing one
-    margin: float  # least distance of a joint from the ends of its range, in parts of the range
+    grip: float  # N, force of each finger except the opposing one
+    margin: float  # smallest distance of a joint from an end of its range, as a fraction
 
 
 class GraspPlanner:
-    """Plans for one hand; `opposing` is the finger that opposes all others. Raises `LevelError`
-    without one."""
+    """Plans grasps for one hand.
+
+    Args:
+        cell: Cell with a hand.
+        opposing: Name of the finger that opposes all others.
+        rules: Requirements on a grasp.
+
+    Raises:
+        LevelError: The hand has no finger of that name.
+    """
 
     def __init__(self, cell: Cell, opposing: str, rules: GraspRules) -> None:
         assert cell.hand is not None, "a cell with a hand"
@@ -91,8 +99,13 @@ class GraspPlanner:
         self._bases = self._data.xanchor[cell.model.dof_jntid[cell.dof[first]]].copy()
 
     def plan(self, row: int, position: Array, quaternion: Array) -> PlannedGrasp | None:
-        """Return a grasp of the object in a row of the scene at a pose in the world; None if no
-        line is possible."""
+        """Return a grasp of an object, None if no line is possible.
+
+        Args:
+            row: Index of the object in the scene.
+            position: Position of the object in the world, (3,), m.
+            quaternion: Orientation of the object in the world, (4,), w first.
+        """
         address = self._cell.object_qpos[row]
         self._data.qpos[address : address + 7] = *position, *quaternion
         self._data.qpos[self._cell.qpos] = self._cell.home
@@ -104,7 +117,7 @@ class GraspPlanner:
         return max(grasps, key=lambda grasp: grasp.margin, default=None)
 
     def _plan_along_line(self, row: int, angle: float) -> PlannedGrasp | None:
-        """Return the grasp along one line across the palm, if it is possible."""
+        """Return the grasp along a line at `angle`, rad, across the palm, None if impossible."""
         across, _, out = self._kinematics.rotation.T
         line = math.cos(angle) * across + math.sin(angle) * out
         contact, normal = np.zeros((2, len(self._bases), 3))
@@ -135,8 +148,13 @@ class GraspPlanner:
         )
 
     def _find_contact(self, row: int, base: Array, way: Array) -> Array | None:
-        """Return where a ray at the height of a finger's base meets the object, (3,), m; None: it
-        does not."""
+        """Return the point at which a ray from a finger's side meets the object, (3,), m, or None.
+
+        Args:
+            row: Index of the object in the scene.
+            base: Base of the finger, (3,), m.
+            way: Direction of the ray, (3,).
+        """
         model = self._cell.model
         data = self._data
         body = self._cell.bodies[row]
@@ -158,12 +176,16 @@ class GraspPlanner:
         return None if nearest > OUTSIDE_M else start + nearest * way
 
     def _object_geoms(self, row: int) -> Ints:
-        """Return the geoms of the object."""
+        """Return the indices of the object's geoms."""
         return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
 
     def _find_joints(self, tips: Array, start: Array) -> Array | None:
-        """Return joint positions, (joints,), rad, at which the tips are at points of the world,
-        (fingers, 3), m; sought from `start` on. None: there are none."""
+        """Return joint positions, (joints,), rad, with the tips at given points, or None.
+
+        Args:
+            tips: Points in the world, (fingers, 3), m.
+            start: Joint positions at which the iteration starts, (joints,), rad.
+        """
         kinematics = self._kinematics
         position = start.copy()
         wanted = [kinematics.to_palm_frame(point) for point in tips]
@@ -181,7 +203,7 @@ class GraspPlanner:
         return None
 
     def _has_contact(self, position: Array) -> bool:
-        """Return whether the hand touches anything at joint positions, also itself."""
+        """Return whether the hand touches anything, including itself, at joint positions."""
         model = self._cell.model
         data = self._data
         data.qpos[self._cell.qpos] = position
@@ -190,7 +212,7 @@ class GraspPlanner:
         return bool((hand & (data.contact.dist < 0.0)).any())
 
     def _find_grip_force(self, row: int) -> float:
-        """Return the force of each finger, N, with which friction on both sides bears weight and
+        """Return the force of each finger, N, at which friction on both sides bears weight and
         pull."""
         model = self._cell.model
         body = self._cell.bodies[row]
@@ -201,7 +223,7 @@ class GraspPlanner:
 
 
 MOVED_M = 0.003
-"""Distance by which an object may move before a new plan is made."""
+"""Displacement of the object after which a new plan is made."""
 WORD = 8
 
 
@@ -211,15 +233,15 @@ class WorkstationParams(Table):
     object: str
     """object to grasp, of scene.objects"""
     opposing: str
-    """finger that opposes all others"""
+    """name of the finger that opposes all others"""
     rules: GraspRules = GraspRules()
-    """what the grasp is to be"""
+    """requirements on the grasp"""
     every_s: Positive = 0.2
-    """longest wait between two looks at the object, s"""
+    """longest time between two checks of the object's position, s"""
 
 
 class Workstation(HostProgram):
-    """Plans a grasp of one object, and plans again if the object moves before it is held."""
+    """Plans a grasp of one object, and plans it again if the object moves before it is gripped."""
 
     world = Input(WorldState, "below.world")
     grasp = Input(GraspStatus, "below.grasp")
@@ -236,16 +258,16 @@ class Workstation(HostProgram):
         cell = cell_of(context)
         self._planner = GraspPlanner(cell, p.opposing, p.rules)
         self._planned: PlannedGrasp | None = None
-        self._at = np.full(3, np.inf)  # (3,), m: where the object was when a grasp was planned last
+        self._at = np.full(3, np.inf)  # (3,), m: position of the object in the newest plan
 
     def run(self, bus: Bus) -> None:
-        """Plan until the run is over."""
+        """Plan grasps until the run is over."""
         while not bus.is_over:
             bus.wait(self._params.every_s)
             self.plan_grasp(bus)
 
     def plan_grasp(self, bus: Bus) -> PlannedGrasp | None:
-        """Plan and send a grasp if one is wanted; return the newest, None without one."""
+        """Plan and send a grasp if one is needed; return the newest grasp, None without one."""
         world = bus.read("world")
         status = bus.read("grasp")
         if not (world.is_there and status.is_there) or status.message.kind > GraspKind.PRESHAPE:
@@ -270,14 +292,14 @@ class Workstation(HostProgram):
         return grasp
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return the functions that a prompt offers."""
+        """Return the functions that a prompt offers, by name."""
         return {
             "plan": lambda: self.plan_grasp(bus),
             "boards": lambda: self.read_counts(bus),
         }
 
     def read_counts(self, bus: Bus) -> dict[str, dict[str, int]]:
-        """Return the counts of every task, from the words of its control block."""
+        """Return the cycle counts of every task, read from its control block."""
         counts = {"cycles": Block.CYCLES, "missed": Block.MISSED, "skipped": Block.SKIPPED}
         blocks = {task: bus.address(task) for task in bus.tasks}
         return {
