@@ -205,7 +205,7 @@ class GraspStatus(AnsweringStatus, version=1):
 
 class GraspPlan(RelayedCommand, version=1):
     """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on
-    an object, and the posture from which they close. The newest plan with an `id` above 0 is used."""
+    an object, and the posture from which they close. The newest with an `id` above 0 is used."""
 
     object: int = field("i2", unit="1", doc="row of the object in the world model")
     sensed: int = field(unit="tick", doc="tick of the world model on which it depends")
