@@ -1,5 +1,5 @@
-"""Streams motions from the command environment: a flower drawn in the air, then a block put on
-another.
+"""Streams motions from the command environment: it draws a flower in the air, then puts one block
+on another.
 
 The rack runs it as its host board `command`. By hand, at any time:
     rack run chimera --set host.command.external=true
@@ -13,16 +13,14 @@ POINTS = 60
 RADIUS = 0.16
 CENTRE = (0.52, 0.0, 0.86)
 
-# Sixty short motions, sent as fast as the queue takes them, and blended: the tool does not stop in
-# between.
+# Sixty short motions, sent as fast as the queue accepts them, and blended without stops.
 for point in range(POINTS + 1):
     angle = 2 * pi * point / POINTS
     reach = RADIUS * (0.6 + 0.4 * cos(PETALS * angle))
     x, y, z = CENTRE
     line((x + reach * cos(angle), y + reach * sin(angle), z), segment=0.25, acceleration=0.1)
 
-# One block is put on the other. A goal in a body's frame is where the body is when the motion
-# begins.
+# Put one block on the other. A goal in the frame of a body is evaluated when the motion begins.
 release()
 line((0.0, 0.0, 0.15), body="block1")
 line((0.0, 0.0, 0.0), body="block1")

@@ -1,8 +1,8 @@
-"""The programming side: verbs that start motions on the real-time side, and a new verb made of two
-of them.
+"""The programming side: verbs that start motions on the real-time side, and a new verb combined
+from two of them.
 
-`guarded_line` is a line and a guard, without a change to either; the guard travels with the line's
-request.
+`guarded_line` combines a line and a guard without changing either. The guard travels with the
+request of the line.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,20 @@ PRESSED = 6.0
 LEAST = 0.01
 """Opening of the gripper below which it holds no block, m."""
 PLACE = (0.70, 0.30)
-"""Where the blocks go, m."""
+"""Goal of the blocks, m."""
 SLOW = 0.03
 """Speed of a guarded move, m/s."""
 
 
 def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> bool:
-    """Move the tool along a line that ends where the arm meets something; return whether it did."""
+    """Move the tool along a line until the arm touches something; return whether it did."""
     line = motions.line(goal, guard=PRESSED, segment=seconds)
     motions.wait(line)
     return motions.end_of(line) is RequestEnd.GUARDED
 
 
 class Assembly(HostProgram):
-    """Puts a block on the table, and the other one on it; how high that is, only touch tells."""
+    """Puts a block on the table, and the other on top of it. Heights are found by touch."""
 
     motion = Input(MotionStatus, "below.motion")
     sensors = Input(ArmStatus, "below.sensors")

@@ -1,36 +1,34 @@
-"""Wipes along a surface at a force, over an edge that the script does not know, as far as a wall,
+"""Wipes across a surface with constant force, over a step that the script does not know, to a wall
 and back.
 
-The rack runs it as its host board `coordinator`. If that was not done it ends with an
-error, and the run with status 1.
-By hand, at any time:
-    rack run penn --set host.coordinator.external=true
-    rack prompt penn coordinator configs/penn/wipe.py
+The rack runs this script as its host board `coordinator`. If the wipe fails, the script ends with
+an error, and the run with status 1. By hand, at any time: rack run penn --set
+host.coordinator.external=true rack prompt penn coordinator configs/penn/wipe.py
 """
 
 from rack.levels.systems.trajectory.messages import RequestEnd
 
 X = 0.50
 DOWN = (0.0, 0.0, 1.0, 0.0)
-ABOVE = 0.62  # m: a free height
-SURFACE = 0.50  # m: where it should be
+ABOVE = 0.62  # m: height of free motion
+SURFACE = 0.50  # m: expected height
 START = -0.25  # m, along y, as are END and BEYOND
 END = 0.12
-BEYOND = 0.30  # the wall is somewhere before it
+BEYOND = 0.30  # behind the wall
 PRESS = 15.0  # N
-STEP = 0.002  # m: the force is looked at once on so much of the way
+STEP = 0.002  # m: the force is judged once per step of the way
 
 
 def expect(request, end, what):
-    """Wait for a request; raise unless it ended so."""
+    """Wait for a request, and raise an error unless it ended with `end`."""
     wait(request)
     if end_of(request) is not end:
         raise RuntimeError(f"{what}: {end_of(request).name.lower()}, not {end.name.lower()}")
 
 
 def wipe(y, seconds, end, what):
-    """Move along the surface to y, pressing; raise if the force was off on more than a fifth of the
-    way."""
+    """Press while moving along the surface to y; raise an error if the force was wrong on more than
+    a fifth of the way."""
     pressed = {}
 
     def look():
@@ -43,7 +41,7 @@ def wipe(y, seconds, end, what):
     expect(request, end, what)
     kept = sum(pressed.values()) / len(pressed)
     if kept < 0.8:
-        raise RuntimeError(f"{what}: the force was off on {1 - kept:.0%} of the way")
+        raise RuntimeError(f"{what}: the force was wrong on {1 - kept:.0%} of the way")
 
 
 expect(free(), RequestEnd.DONE, "beginning")

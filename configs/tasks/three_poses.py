@@ -1,4 +1,4 @@
-"""The poses of three-poses.toml for a command environment: its script."""
+"""Script with the poses of three-poses.toml, for a command environment."""
 
 POSES = (
     (0.8691, 1.367, -2.9103, 0.0, -1.5983, 0.8691),
@@ -7,5 +7,5 @@ POSES = (
 )
 
 for pose in POSES:
-    # It would blend the motions: each ends before the next begins.
+    # Wait, because motions are blended otherwise.
     wait(move(pose))

@@ -1,4 +1,4 @@
-"""A message by shared memory alone, and the same message by a mailbox."""
+"""The same message through plain shared memory and through a mailbox."""
 
 from mmap import mmap
 from time import sleep
@@ -10,13 +10,13 @@ from rack.levels.level import Executor, Input, Output
 
 
 class Numbers(Message, version=1):
-    """Sixteen equal numbers: a reader sees at once whether a message is torn."""
+    """Sixteen equal numbers, so that a reader can detect a torn message."""
 
-    numbers: np.ndarray = field("i8", unit="1", doc="all the same", shape=16)
+    numbers: np.ndarray = field("i8", unit="1", doc="equal numbers", shape=16)
 
 
 class TornCounts(Status, version=1):
-    """How many torn messages a reader has seen."""
+    """Number of torn messages that a reader found."""
 
     reads: int = field(unit="1", doc="messages read")
     memory: int = field(unit="1", doc="torn messages in memory")
@@ -24,17 +24,17 @@ class TornCounts(Status, version=1):
 
 
 READS = 1000
-WORD_S = 0.0002  # a word on a slow bus
+WORD_S = 0.0002  # time to write a word over a slow bus
 MEMORY = np.frombuffer(mmap(-1, 16 * 8), "i8")  # shared by all boards: they are forked after this
 
 
 def is_torn(numbers):
-    """Return whether the numbers are of more than one message."""
+    """Return whether the numbers belong to more than one message."""
     return bool((numbers != numbers[0]).any())
 
 
 class Writer(Executor):
-    """Writes the number of its cycle 16 times."""
+    """Writes the current tick 16 times."""
 
     message = Output(Numbers)
 

@@ -1,4 +1,4 @@
-"""Print the peak of the first 10 s, all levels in one process: python measure.py RATE_HZ..."""
+"""Print the peak of the first 10 s, with all levels in one process: python measure.py RATE_HZ..."""
 
 import sys
 

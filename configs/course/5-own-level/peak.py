@@ -1,4 +1,4 @@
-"""A level of one's own: the greatest speed of any joint so far."""
+"""Your own level: it finds the greatest speed of any joint."""
 
 from rack.backplane.message import State, Status, field
 from rack.levels.level import Executor, Input, Output
@@ -12,7 +12,7 @@ class PeakStatus(Status, version=1):
 
 
 class Peak(Executor):
-    """Reads the servo level's status, and keeps the greatest speed in it."""
+    """Keeps the greatest speed in the status of the servo level."""
 
     servo = Input(ServoStatus, "servo.status")
     status = Output(PeakStatus)

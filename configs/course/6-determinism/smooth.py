@@ -1,4 +1,4 @@
-"""Two levels; with one of them a rack does not repeat."""
+"""Two levels, one of which breaks determinism."""
 
 from time import monotonic
 
@@ -14,9 +14,9 @@ class SmoothStatus(Status, version=1):
 
 
 class RisesStatus(Status, version=1):
-    """How often the speed has risen."""
+    """Number of times at which the speed began to rise."""
 
-    rises: int = field(unit="1", doc="how often the speed has risen")
+    rises: int = field(unit="1", doc="number of times at which the speed began to rise")
 
 
 TIME_CONSTANT_S = 0.1

@@ -1,4 +1,4 @@
-"""The cable from a drive to the bus, and what may be wrong with it."""
+"""The cable from a drive to the bus, with simulated disturbances."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from wire import DISTURB, SPAN, Frame, receive, send
 
 
 class Disturbance(IntEnum):
-    """What may be wrong with a drive or its cable; in brackets its size."""
+    """Disturbances of a drive or its cable. The unit of their size is in brackets."""
 
     NONE = 0
     UNPLUGGED = 1
-    BUS_OFF = 2  # the drive's controller takes no part in the bus
-    LATE = 3  # [s] frames come, and are answered, so late
-    LOST = 4  # [part of the frames]
+    BUS_OFF = 2  # the drive's controller is not on the bus
+    LATE = 3  # [s] frames arrive late
+    LOST = 4  # [fraction of the frames]
     DOUBLED = 5
     TOO_HOT = 6
     RESET = 7
@@ -39,24 +39,26 @@ class Cable:
 
     @property
     def disturbance(self) -> Disturbance:
-        """What is wrong now."""
+        """The current disturbance."""
         return self._kind if monotonic() < self._until_s else Disturbance.NONE
 
     def send(self, kind: int, data: bytes) -> None:
-        """Send a frame of the drive's."""
-        for _ in range(self._times()):
+        """Send a frame of the drive."""
+        for _ in range(self._count_copies()):
             send(self._bus, kind, self._node, data)
 
     def receive(self, take: Callable[[Frame], None]) -> None:
-        """Give what has come to `take`, in order, each frame with its time by CLOCK_MONOTONIC."""
+        """Pass frames that have arrived to `take`, in order, stamped by CLOCK_MONOTONIC."""
         late_s = self._size if self.disturbance is Disturbance.LATE else 0.0
-        # Of arrival, by the kernel: that this process looks later makes no difference to the drive.
+        # The kernel stamps frames at arrival, so it does not matter when this process reads them.
         epoch_s = time() - monotonic() - late_s
         for frame in receive(self._bus):
             if (frame.kind, frame.node) == (DISTURB, self._node):
                 self._disturb(*SPAN.unpack_from(frame.data))
             else:
-                self._coming += [frame._replace(time_s=frame.time_s - epoch_s)] * self._times()
+                self._coming += [
+                    frame._replace(time_s=frame.time_s - epoch_s)
+                ] * self._count_copies()
         while self._coming and self._coming[0].time_s <= monotonic():
             take(self._coming.popleft())
 
@@ -65,8 +67,8 @@ class Cable:
         self._size = size
         self._until_s = monotonic() + seconds
 
-    def _times(self) -> int:
-        """Return how often a frame comes out of the cable."""
+    def _count_copies(self) -> int:
+        """Return how often a frame is delivered."""
         kind = self.disturbance
         if kind in (Disturbance.UNPLUGGED, Disturbance.BUS_OFF):
             return 0

@@ -1,4 +1,4 @@
-"""An arm whose drives hang on CAN: the rack's side of the bus."""
+"""An arm with drives on a CAN bus: the rack's side of the bus."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
 INCOMPLETE = 20
-"""Most ticks of which reports are kept until those of all drives are there."""
+"""Largest number of ticks with incomplete reports that are kept."""
 ANSWER_S = 5.0
-"""Time in which drives must answer when they are to be enabled: they may still be booting."""
+"""Time within which drives must answer an enable request; they may still be booting."""
 ON = (Power.SWITCHED_ON, Power.OPERATION_ENABLED)
 UP: dict[int, Control] = {
     Power.SWITCH_ON_DISABLED: Control.SHUT_DOWN,
     **dict.fromkeys((Power.READY_TO_SWITCH_ON, *ON), Control.SWITCH_ON),
 }
-"""What switches a drive on, its brake engaged, by its state."""
+"""Control word that brings a drive closer to SWITCHED_ON, by its state. The brake stays engaged."""
 
 
 class CanArm(Arm):
-    """Sends a SYNC and a command in every cycle, and takes the reports that have come; waits for
-    nothing.
+    """Sends a SYNC and a command in every cycle, and reads the reports that have arrived. It never
+    blocks.
 
-    The newest sample is that of the newest SYNC which all drives have answered. The arm is enabled
-    while all drives are switched on. One that then leaves this state, reports a fault, or is not
-    heard of, is a fault of the arm, and the power is taken from all others.
+    A sample is complete when all drives have answered the same SYNC. The arm is enabled while all
+    drives are switched on. If a drive leaves this state, reports a fault or is silent, the arm has
+    a fault, and all other drives are switched off.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class CanArm(Arm):
         self._sample = Sensed(cell.home.copy(), np.zeros(self._joints), 0.0, 0.0, -1)
         self._coming: dict[int, dict[int, Report]] = {}  # by tick and joint
         self._newest: dict[int, Report] = {}  # by joint
-        self._heard = [0.0] * self._joints  # tick
+        self._heard = [0.0] * self._joints  # tick of the newest frame of each drive
         self._beat = 0.0  # tick of the next heartbeat
         self._reset_until = 0.0  # tick
-        self._wanted = False  # enabled
+        self._wanted = False  # whether the drives are to be enabled
         self._bus = wire.open_bus()
 
     def sense(self) -> Sensed:
@@ -57,7 +57,7 @@ class CanArm(Arm):
         return self._sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Command torques; brake on one that no drive may be given."""
+        """Command torques; brake if one is beyond its limit or NaN."""
         finding = self.refused(torque)
         if finding is not None:
             self.brake()
@@ -65,77 +65,78 @@ class CanArm(Arm):
         self.torque = torque.copy()
         self.waited = 0
         self.braked = False
-        self._command([Control.ENABLE_OPERATION] * self._joints)
+        self._send_command([Control.ENABLE_OPERATION] * self._joints)
         return None
 
     def brake(self) -> None:
         """Engage the brakes."""
         self.torque = np.zeros(self._joints)
         self.braked = True
-        self._command([self._control(joint) for joint in range(self._joints)])
+        self._send_command([self._next_control(joint) for joint in range(self._joints)])
 
     def step(self, ticks: int) -> None:
-        """Let time pass: take what has come, and ask for the next sample."""
+        """Advance the time: read the frames that have arrived, and request the next sample."""
         self.tick += ticks
         self.waited += ticks
         self.braked = self.braked or self.waited >= self.patience
         for frame in wire.receive(self._bus):
             if 0 < frame.node <= self._joints:
-                self._take(frame.node - 1, frame)
-        self._judge()
+                self._take_frame(frame.node - 1, frame)
+        self._update_state()
         wire.send(self._bus, wire.SYNC, 0, wire.TICK.pack(self.tick))
         if self.tick >= self._beat:
             self._beat = self.tick + wire.HEARTBEAT_S * self._rate_hz
             wire.send(self._bus, wire.HEARTBEAT, wire.RACK, wire.OPERATIONAL)
 
     def enable(self) -> None:
-        """Ask the drives for torque."""
-        self._want()
+        """Request the drives to become ready for torque."""
+        self._request_power()
         self.state = DriveState.ENABLING
 
     def disable(self) -> None:
-        """Take the power from the drives."""
+        """Switch the drives off."""
         self._wanted = False
         self.state = DriveState.DISABLED
         self.brake()
 
     def reset(self) -> None:
-        """Let drives leave their fault."""
+        """Let the drives leave their fault states."""
         if self.state is DriveState.FAULT:
             self.fault = ""
             self.state = DriveState.DISABLED
             self._reset_until = self.tick + wire.SILENT_S * self._rate_hz
 
     def restore(self, state: ArmState) -> None:
-        """Continue: the drives are as they were, but for what their watchdogs have done."""
+        """Continue after a restart of the board; the drives kept their states, or their watchdogs
+        braked."""
         super().restore(state)
         if self.state is not DriveState.DISABLED:
-            self._want()
+            self._request_power()
 
-    def _want(self) -> None:
+    def _request_power(self) -> None:
         self._wanted = True
-        self._newest.clear()  # of drives that are not heard of any more, too
+        self._newest.clear()  # silent drives have old reports
         self._heard = [self.tick + ANSWER_S * self._rate_hz] * self._joints
 
-    def _command(self, control: list[Control]) -> None:
+    def _send_command(self, control: list[Control]) -> None:
         wire.send(self._bus, wire.COMMAND, 0, wire.command(self.tick, control, self.torque))
 
-    def _control(self, joint: int) -> Control:
-        """Return what leads a drive, its brake engaged, to where it is wanted."""
+    def _next_control(self, joint: int) -> Control:
+        """Return the control word that leads a braked drive to its wanted state."""
         if self._wanted and joint not in self._newest:
-            # It may be on, as after a restart of the board: that takes nothing from it but torque.
+            # After a restart of the board it may be on. SWITCH_ON then only removes its torque.
             return Control.SWITCH_ON
         power = self._newest[joint].power if joint in self._newest else Power.FAULT
         if power == Power.FAULT and self.tick < self._reset_until:
             return Control.RESET_FAULT
         return UP.get(power, Control.DISABLE_VOLTAGE) if self._wanted else Control.DISABLE_VOLTAGE
 
-    def _take(self, joint: int, frame: wire.Frame) -> None:
+    def _take_frame(self, joint: int, frame: wire.Frame) -> None:
         self._heard[joint] = self.tick
         if frame.kind != wire.STATUS:
             return
         report = Report(*wire.REPORT.unpack_from(frame.data))
-        # Older ones were late; one from the future is of another run.
+        # Ignore late reports, and reports of another run, which are from the future.
         if not self._sample.tick < report.tick <= self.tick:
             return
         self._newest[joint] = report
@@ -148,18 +149,18 @@ class CanArm(Arm):
         elif len(self._coming) > INCOMPLETE:
             del self._coming[min(self._coming)]
 
-    def _judge(self) -> None:
-        """Set `state`, and `fault`, by what the drives report."""
+    def _update_state(self) -> None:
+        """Set `state` and `fault` from the reports of the drives."""
         on = sum(report.power in ON for report in self._newest.values())
-        if fault := self._broken():
+        if fault := self._find_fault():
             self.fault = self.fault or fault
             self.state = DriveState.FAULT
             self._wanted = False
         elif self._wanted and on == self._joints:
             self.state = DriveState.ENABLED
 
-    def _broken(self) -> str:
-        """Return what is wrong with a drive."""
+    def _find_fault(self) -> str:
+        """Return the fault of the first faulty drive as text, empty without one."""
         silent = self.tick - wire.SILENT_S * self._rate_hz
         for joint, heard in enumerate(self._heard):
             if self._wanted and heard < silent:

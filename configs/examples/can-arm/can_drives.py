@@ -1,7 +1,6 @@
-"""Stands in for an arm with its drives: starts each in a process of its own, and again when it has
-died.
+"""Stand-in for an arm with drives: starts one process per drive, and restarts those that died.
 
-With drives of your own take `[host.drives]` out of the config.
+For your drives, remove `[host.drives]` from the config.
 """
 
 from __future__ import annotations
@@ -23,12 +22,12 @@ FORK = multiprocessing.get_context("fork")
 
 
 class Drives(HostProgram):
-    """The arm, until the rack ends."""
+    """Runs the drives until the rack ends."""
 
     def run(self, bus: Bus) -> None:
-        """Start the drives; watch them."""
+        """Start the drives and restart those that died."""
         context = self.context
-        open_bus().shutdown()  # raises why it cannot, once
+        open_bus().shutdown()  # raises once, with the reason, if there is no bus
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         mechanics = Mechanics(cell, monotonic())
         times_s = context.tick_s, cell.patience.ticks(1, context.tick_s) * context.tick_s

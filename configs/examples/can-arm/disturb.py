@@ -1,4 +1,4 @@
-"""Disturb a drive of `can-arm`, or its cable, while the rack runs:
+"""Disturb a drive of `can-arm`, or its cable, while the rack runs.
 
 python disturb.py NODE unplugged|bus_off|late|lost|doubled|too_hot|reset [SECONDS [SIZE]]
 """

@@ -1,4 +1,4 @@
-"""A drive of one joint, after CiA 402: state machine, watchdog, heartbeat, encoder."""
+"""A drive of one joint, modelled on CiA 402: state machine, watchdog, heartbeat, encoder."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from wire import Control, Frame, Power
 from rack.backplane.process import die_with_parent, name_process, set_priority
 
 PRIORITY = 79
-"""Below that of the servo level, which must not wait for drives; above all others'."""
+"""Below the servo level, which must not wait for drives, and above all others."""
 LOOKS = 2
-"""At the bus, in a tick. Woken by every frame, seven drives would take a core and a half."""
+"""Reads of the bus per tick. If every frame woke seven drives, they would take 1.5 cores."""
 DRIFT_S = 1e-7
-"""By how much the rack's clock may come later in a tick, as a drive's own clock sees it."""
+"""Largest drift per tick between the clocks of rack and drive."""
 WINDOW_S = 5e-3
-"""Largest lateness of a SYNC that a drive's clock sees through."""
+"""Largest lateness of a SYNC that the clock of a drive compensates."""
 LADDER = {
     Power.SWITCH_ON_DISABLED: Control.DISABLE_VOLTAGE,
     Power.READY_TO_SWITCH_ON: Control.SHUT_DOWN,
     Power.SWITCHED_ON: Control.SWITCH_ON,
     Power.OPERATION_ENABLED: Control.ENABLE_OPERATION,
 }
-"""States, and the control words that lead to them: down by any number of steps, up by one."""
+"""Control word that leads to each state. A drive can go down any number of states, and up by
+one."""
 POWERS = list(LADDER)
 DEFECTS = {Disturbance.BUS_OFF: wire.BUS_OFF, Disturbance.TOO_HOT: wire.TOO_HOT}
 
 
 def next_power(power: Power, control: int) -> Power:
-    """Return the state to which a control word takes a drive."""
+    """Return the state of a drive after a control word."""
     if power is Power.FAULT:
         return Power.SWITCH_ON_DISABLED if control == Control.RESET_FAULT else power
     reachable = POWERS[: POWERS.index(power) + 2]
@@ -41,16 +42,17 @@ def next_power(power: Power, control: int) -> Power:
 
 
 class TickClock:
-    """The times of the rack's ticks, by its SYNCs: none comes early, but any may come late."""
+    """Estimates the times of the rack's ticks from SYNC frames, which may be late but never
+    early."""
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
         self._start_s = 0.0
 
     def at(self, tick: int, came_s: float) -> float:
-        """Return the time, s, of a tick whose SYNC came at `came_s`."""
+        """Return the time, s, of a tick whose SYNC arrived at `came_s`."""
         start_s = came_s - tick * self._tick_s
-        # A very late one, or one of another run, is believed; the next on time corrects it.
+        # A very late SYNC, or one of another run, is accepted; the next timely one corrects it.
         if not self._start_s < start_s < self._start_s + WINDOW_S:
             self._start_s = start_s
         self._start_s += DRIFT_S
@@ -58,7 +60,7 @@ class TickClock:
 
 
 class Drive:
-    """Obeys and answers the frames for its node."""
+    """Obeys and answers the frames for one node."""
 
     def __init__(
         self,
@@ -68,8 +70,15 @@ class Drive:
         times_s: tuple[float, float],
         now_s: float,
     ) -> None:
-        """Boot at `now_s`, s. `times_s`: the tick, and after which time without a torque the brake
-        engages."""
+        """Boot.
+
+        Args:
+            node: Node on the bus.
+            joint: The joint to drive.
+            send: Sends a frame, given its kind and data.
+            times_s: Length of a tick, and time without a torque after which the brake engages, s.
+            now_s: Current time, s.
+        """
         self.power = Power.SWITCH_ON_DISABLED
         self.fault = 0
         self._node = node
@@ -83,7 +92,7 @@ class Drive:
         send(wire.HEARTBEAT, wire.BOOTED)
 
     def take(self, frame: Frame) -> None:
-        """Take a frame."""
+        """Process a received frame."""
         kind, node, data, came_s = frame
         identifier = kind + node
         if identifier == wire.SYNC:
@@ -108,7 +117,7 @@ class Drive:
             self._joint.drive(orders["torque"] * wire.UNIT)
 
     def watch(self, now_s: float, trouble: Disturbance) -> None:
-        """Look after itself at `now_s`, s."""
+        """Detect faults and time-outs at `now_s`, s, and send the heartbeat."""
         fault = DEFECTS.get(trouble, 0)
         if now_s - self._heard_s > wire.SILENT_S:
             fault = fault or wire.NO_HEARTBEAT
@@ -117,7 +126,7 @@ class Drive:
         if now_s - self._driven_s > self._patience_s:
             if self.power is Power.OPERATION_ENABLED:
                 self._turn(Power.SWITCHED_ON)
-            # Not to now: the SYNC of an earlier time may still come.
+            # Not up to now, because the SYNC of an earlier time may still arrive.
             self._joint.advance(now_s - WINDOW_S)
         if now_s - self._beat_s > wire.HEARTBEAT_S:
             self._beat_s = now_s
@@ -131,7 +140,7 @@ class Drive:
 
 
 def run_drive(node: int, mechanics: Mechanics, times_s: tuple[float, float], parent: int) -> None:
-    """Run a drive in a process of its own, until it is reset or its parent ends."""
+    """Run a drive in this process until it is reset or the parent process ends."""
     die_with_parent(parent)
     name_process(f"drive {node}")
     set_priority(PRIORITY)

@@ -1,10 +1,10 @@
-"""The arm's mechanics, in memory that its drives share: each drive steps its own joint.
+"""The mechanics of the arm, in memory that its drives share; each drive steps one joint.
 
-Joints act on each other through the arm, whatever happens on the bus. So a drive finds there where
-the others are, in order to solve the arm's whole equation of motion for its own acceleration. They
-are stepped in processes of their own, up to a few ms apart; to its own time a drive leads them at
-the speed they have. By this alone the arm differs from one stepped as a whole: by 0.5 a t^2, some
-10 urad at the joints' accelerations, in what another joint feels of it.
+The joints interact through the arm, whatever happens on the bus. A drive therefore reads the state
+of all joints from shared memory, and solves the whole equation of motion for the acceleration of
+its joint. The processes of the drives differ by up to a few ms, so a drive extrapolates the other
+joints to its time at their velocities. The resulting error is 0.5 a t^2, about 10 urad at the
+accelerations of the joints.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from rack.levels.robot.dynamics import Dynamics
 STEP_S = 1e-3
 ROWS = 4
 LEAD_S = 5e-3
-"""Longest time over which another joint is led: one whose drive has died goes no further."""
+"""Longest extrapolation of another joint: a joint whose drive has died stops there."""
 
 
 class Mechanics:
-    """The state of all joints."""
+    """State of all joints."""
 
     def __init__(self, cell: Cell, now_s: float) -> None:
         """Start at home, braked, at `now_s`, s."""
         self.cell = cell
         joints = len(cell.home)
-        memory = mmap.mmap(-1, ROWS * joints * 8)  # shared with whoever is forked from here
+        memory = mmap.mmap(-1, ROWS * joints * 8)  # shared with forked processes
         table = np.frombuffer(memory).reshape(ROWS, joints)
-        # (joints,) each: s, of the state; rad; rad/s; 1: the brake is engaged
+        # (joints,) each: time of the state, s; rad; rad/s; 1 if the brake is engaged
         self.time, self.position, self.velocity, self.braked = table
         self.time[:] = now_s
         self.position[:] = cell.home
@@ -41,7 +41,7 @@ class Mechanics:
 
 
 class Joint:
-    """A joint, as its drive steps it."""
+    """One joint, stepped by its drive."""
 
     def __init__(self, mechanics: Mechanics, number: int) -> None:
         self._all = mechanics
@@ -56,27 +56,27 @@ class Joint:
         return len(self._braking)
 
     def sample(self) -> tuple[int, int]:
-        """Return position and velocity, in `wire.UNIT`, as far as its registers go."""
+        """Return position and velocity in `wire.UNIT`, limited to the range of the registers."""
         state = self._all.position[self._number], self._all.velocity[self._number]
         position, velocity = (round(np.clip(each / UNIT, -MOST, MOST)) for each in state)
         return position, velocity
 
     def drive(self, torque: Array) -> None:
-        """Release the brake and give a torque: that of this joint in `torque`, (joints,), N m.
+        """Release the brake and apply a torque.
 
-        What those of the others give meanwhile must fit it in time: through axes that are nearly
-        parallel, one that is some ms older throws a joint about.
+        Args:
+            torque: Torques of all joints from the same command, (joints,), N m. With nearly
+                parallel axes, torques of different cycles would disturb a joint strongly.
         """
         self._torque = torque
         self._all.braked[self._number] = 0.0
 
     def brake(self) -> None:
-        """Engage the brake; the motor gives nothing."""
+        """Engage the brake and switch off the torque."""
         self._all.braked[self._number] = 1.0
 
     def advance(self, until_s: float) -> None:
-        """Let time pass until `until_s`, s; an earlier time than that of the joint changes
-        nothing."""
+        """Step the joint to the time `until_s`, s. Earlier times than the joint's are ignored."""
         shared = self._all
         own = self._number
         time_s = shared.time[own]
@@ -95,7 +95,7 @@ class Joint:
         shared.time[own] = until_s
 
     def _acceleration(self, position: Array, velocity: Array, step_s: float) -> Array:
-        """Return the accelerations, rad/s2: joints that are braked come to rest, whatever acts."""
+        """Return the accelerations, rad/s2; braked joints come to rest whatever the load."""
         inertia, bias = self._dynamics.terms(position, velocity)
         braked = self._all.braked > 0.0
         stopping = np.clip(-velocity / step_s, -self._braking, self._braking) * braked

@@ -1,15 +1,15 @@
-"""What the rack and the drives say to each other: frames after CiA 301 and CiA 402.
+"""Frames between the rack and the drives, modelled on CiA 301 and CiA 402.
 
 | identifier | from, when | data |
 |---|---|---|
 | 0x080 + 0 | rack, every tick | SYNC: tick |
 | 0x180 + node | drive, on SYNC | a `Report` |
 | 0x200 + 0 | rack, every tick | tick; an order for each drive in turn |
-| 0x600 + node | anybody | disturbance: see `disturb.py` |
+| 0x600 + node | anyone | disturbance: see `disturb.py` |
 | 0x700 + node | drives and rack, every 100 ms | heartbeat: state of the node |
 
-One command for all, of which each drive maps its part, halves the load: 9 frames of CAN FD a tick
-with seven joints.
+One command for all drives, from which each takes its order, halves the load: 9 CAN FD frames per
+tick with seven joints.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ except ModuleNotFoundError as error:
     raise LevelError("this arm needs python-can: pip install 'nasrem-rack[can]'") from error
 
 RACK = 127
-"""Node of the rack, the highest; those of the drives count from 1."""
+"""Node of the rack, the highest. The nodes of the drives start at 1."""
 SYNC, STATUS, COMMAND, DISTURB, HEARTBEAT = 0x080, 0x180, 0x200, 0x600, 0x700
 BOOTED, OPERATIONAL = b"\x00", b"\x05"
 """States of a node."""
@@ -39,25 +39,25 @@ HEARTBEAT_S = 0.1
 SILENT_S = 0.5
 """Time without a heartbeat after which a node is lost."""
 LOCAL: dict[str, Any] = {"interface": "udp_multicast", "channel": "239.74.163.2", "hop_limit": 0}
-"""The bus by default: UDP that does not leave this machine."""
+"""Default bus: UDP multicast that does not leave this machine."""
 UNIT = 1e-6
-"""Of positions, rad, velocities, rad/s, and torques, N m, which are integers."""
+"""Resolution of the integers for positions, rad, velocities, rad/s, and torques, N m."""
 MOST = 2**31 - 1
 TICK = struct.Struct("<I")
 ORDER = np.dtype([("control", "<u2"), ("torque", "<i4")])
 Orders = NDArray[np.void]
-"""Of ORDER, (drives,)."""
+"""Array of ORDER, (drives,)."""
 MOST_DRIVES = 10
 REPORT = struct.Struct("<IHHii")
 SPAN = struct.Struct("<Bff")
 SIZES = {SYNC: 4, STATUS: REPORT.size, COMMAND: 64, DISTURB: SPAN.size, HEARTBEAT: 1}
-"""Of the data, bytes; what is shorter, or of another kind, is dropped."""
+"""Sizes of the data, bytes. Shorter frames and other kinds are dropped."""
 MOST_FRAMES = 64
-"""Taken at once: a bus that babbles must keep nobody from the rest of its work."""
+"""Largest number of frames read at once, so that a flooded bus cannot block its readers."""
 
 
 class Power(IntEnum):
-    """States of a drive, as status words. The brake is engaged in all but the last."""
+    """States of a drive, as status words. The brake is released only in OPERATION_ENABLED."""
 
     FAULT = 0x08
     SWITCH_ON_DISABLED = 0x40
@@ -78,11 +78,11 @@ class Control(IntEnum):
 
 FAULTS = {0x4310: "too hot", 0x8130: "no heartbeat from the rack", 0x8140: "was off the bus"}
 TOO_HOT, NO_HEARTBEAT, BUS_OFF = FAULTS
-"""Error codes; 0: none."""
+"""Error codes. 0 means no error."""
 
 
 class Report(NamedTuple):
-    """What a drive reports."""
+    """Report of a drive."""
 
     tick: int  # of the SYNC
     power: int
@@ -112,14 +112,14 @@ def open_bus() -> can.BusABC:
 
 
 def send(bus: can.BusABC, kind: int, node: int, data: bytes) -> None:
-    """Send a frame without waiting. One that the bus does not take is lost, as any may be."""
+    """Send a frame without blocking. A frame that the bus rejects is lost."""
     is_fd = len(data) > 8
     with suppress(can.CanError):
         bus.send(can.Message(0.0, kind + node, False, data=data, is_fd=is_fd), 0)
 
 
 def receive(bus: can.BusABC) -> Iterator[Frame]:
-    """Yield the frames that have come, but not more than `MOST_FRAMES`; waits for none."""
+    """Yield up to `MOST_FRAMES` frames that have arrived, without blocking."""
     for _ in range(MOST_FRAMES):
         try:
             message = bus.recv(0)
@@ -135,7 +135,13 @@ def receive(bus: can.BusABC) -> Iterator[Frame]:
 
 
 def command(tick: int, control: Sequence[int], torque: NDArray[np.float64]) -> bytes:
-    """Return the data of a command: a control word and a torque, N m, for each drive in turn."""
+    """Return the data of a command.
+
+    Args:
+        tick: Tick of the command.
+        control: Control word of each drive.
+        torque: Torque of each drive, (drives,), N m.
+    """
     orders = np.zeros(MOST_DRIVES, ORDER)
     orders["control"][: len(control)] = control
     orders["torque"][: len(control)] = np.clip(torque / UNIT, -MOST, MOST)

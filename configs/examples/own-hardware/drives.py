@@ -1,9 +1,9 @@
-"""Stand-in for the driver of your motion controller: six to seven drives with encoders, brakes, a
-time-out, and the states that CiA 402 gives to drives.
+"""Stand-in for the driver of your motion controller: drives with encoders, brakes, a time-out, and
+the states of CiA 402.
 
-Replace this file with calls of your fieldbus library. What the real drives do by themselves, this
-one computes: it integrates the arm's equation of motion, and engages the brakes when no torque has
-come for two cycles.
+Replace this file with calls of your fieldbus library. It simulates what real drives do: it
+integrates the equation of motion of the arm, and engages the brakes if no torque arrived for two
+cycles.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ STEPS = 5
 """Steps of the integration per tick."""
 ENABLING_TICKS = 100
 HOMING_TICKS = 400
-"""Ticks that the drives take to be enabled, and to find their reference before that."""
+"""Ticks for enabling the drives, and for finding their reference before that."""
 
 
 class Drives:
-    """Drives of an arm, exchanged with once per cycle."""
+    """The drives of an arm."""
 
     def __init__(self, cell: Cell, tick_s: float, timeout_ticks: int) -> None:
         self._dynamics = Dynamics(cell)
@@ -37,18 +37,18 @@ class Drives:
         self.braked = True
         self._silent_ticks = 0
         self.state = DriveState.DISABLED
-        self.fault = ""  # why they are in FAULT
-        # (joints,), rad: position that they count as 0, until they have found their reference.
+        self.fault = ""  # reason for FAULT
+        # (joints,), rad: offset of the encoders until the drives have found their reference.
         self.zero: Array = self.position * cell.homing
-        self._waited_ticks = 0  # since they were asked for torque
+        self._waited_ticks = 0  # ticks since `enable`
 
     def enable(self) -> None:
-        """Find the reference, if it is not known, and become ready for torques."""
+        """Find the reference if it is not known, and become ready for torques."""
         self.state = DriveState.ENABLING
         self._waited_ticks = -HOMING_TICKS if self.zero.any() else 0
 
     def leave(self, state: DriveState, fault: str = "") -> None:
-        """Brake, and give no torque any more: DISABLED, or FAULT."""
+        """Brake, and go to DISABLED or FAULT."""
         self.brake()
         self.state = state
         self.fault = fault
@@ -65,7 +65,7 @@ class Drives:
         self.velocity[:] = self.torque[:] = 0.0
 
     def pass_ticks(self, ticks: int) -> None:
-        """Let time pass: on real hardware it passes by itself."""
+        """Simulate the given number of ticks."""
         for _ in range(ticks):
             if self.state is DriveState.ENABLING:
                 self._make_ready()

@@ -1,4 +1,4 @@
-"""Arm hardware of your own: the servo level drives it instead of MuJoCo."""
+"""Your own arm hardware, driven by the servo level in place of MuJoCo."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class HardwareArm(Arm):
-    """Passes torques down to the drives and samples up."""
+    """Passes torques to the drives and returns their samples."""
 
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
@@ -30,24 +30,24 @@ class HardwareArm(Arm):
         return Sensed(drives.position - drives.zero, drives.velocity.copy(), 0.0, 0.0, self.tick)
 
     def enable(self) -> None:
-        """Ask the drives for torque."""
+        """Enable the drives."""
         self.drives.enable()
 
     def disable(self) -> None:
-        """Ask the drives to give none."""
+        """Disable the drives."""
         self.drives.leave(DriveState.DISABLED)
 
     def reset(self) -> None:
-        """Ask the drives to leave their fault."""
+        """Reset a fault of the drives."""
         self.drives.leave(DriveState.DISABLED)
 
     def weaken(self, most: Array | None) -> None:
-        """Let a drive find out that its motor gives nothing, as an injected fault has it."""
+        """Simulate an injected fault: the drive of a motor without torque reports a fault."""
         if most is not None and not most.all():
             self.drives.leave(DriveState.FAULT, f"drive {most.argmin() + 1}: motor phase open")
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Pass torques on; brake on one that no drive may be given."""
+        """Pass on torques; brake if one is beyond its limit or NaN."""
         finding = self.refused(torque)
         if finding is None:
             self.drives.write(torque)
@@ -65,7 +65,7 @@ class HardwareArm(Arm):
         self.braked = True
 
     def step(self, ticks: int) -> None:
-        """Let time pass."""
+        """Advance the time."""
         self.drives.pass_ticks(ticks)
         self.tick += ticks
         self.waited += ticks
@@ -75,12 +75,12 @@ class HardwareArm(Arm):
             self.brake()
 
     def save(self, state: ArmState) -> None:
-        """Add what a restarted board could ask real drives for."""
+        """Save the positions and velocities, which real drives would report after a restart."""
         super().save(state)
         state.state[: 2 * len(self.torque)] = [*self.drives.position, *self.drives.velocity]
 
     def restore(self, state: ArmState) -> None:
-        """Continue where the arm was left."""
+        """Continue after a restart of the board."""
         super().restore(state)
         saved = state.state[: 2 * len(self.torque)].reshape(2, -1)
         self.drives.position[:], self.drives.velocity[:] = saved

@@ -1,5 +1,5 @@
-"""A control modification of one's own: it limits what the servo law may add to the load, so that
-the arm gives way."""
+"""A control modification that limits the torque which the servo law adds to the load torque, so
+that the arm yields."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from rack.levels.tables import Positive, Table, read_params
 
 
 class GentleParams(Table):
-    """What `params` of the modification may hold."""
+    """Parameters of the modification."""
 
     part: Positive = Field(0.2, le=1.0)
-    """part of each joint's torque limit that may be added to its load"""
+    """fraction of each joint's torque limit that may be added to its load torque"""
 
 
 class Gentle(Modification):
-    """Carries the arm's weight and motion in full, and corrects errors with part of the torque
-    only."""
+    """Applies the full load torque, and corrects errors with a fraction of the torque limit."""
 
     hook = Hook.AFTER
     params = GentleParams

@@ -1,4 +1,4 @@
-"""A planner of one's own for the primitive level: trapezoids of speed in place of jerk-limited
+"""A planner for the primitive level with trapezoidal speed profiles in place of jerk-limited
 trajectories."""
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from rack.levels.primitive.segment import read_segment, window
 from rack.levels.robot.cell import build_cell
 
 SHARE = 0.7
-"""Part of each joint's acceleration that a trapezoid uses: its corners ask for more than the model
-can follow."""
+"""Fraction of each joint's acceleration that a trapezoid uses, because the arm cannot follow its
+corners exactly."""
 SAMPLE_RAD = 0.02
 
 
 class TrapezoidPlanner(Planner):
-    """Accelerates, cruises and brakes along the path: between stops, with one speed and one
-    acceleration."""
+    """Accelerates, cruises and brakes along the path, with one speed and one acceleration between
+    stops."""
 
     above = Input(MoveCommand, "above.command")
     status = Input(PrimitiveStatus, "own.status")
@@ -30,17 +30,17 @@ class TrapezoidPlanner(Planner):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.limits = build_cell(context.robot, context.scene, context.clock_ns).limits
-        self.made = (0, 0.0)  # segment, and path parameter at its begin, rad, of the newest plan
+        self.made = (0, 0.0)  # newest plan: segment, and path parameter at its start, rad
 
     def wanted(self, tick: int) -> bool:
-        """Return whether the executor wants a trajectory that has not been made."""
+        """Return whether the executor needs a trajectory that has not been planned."""
         status = self.status.message
         return (
             status.wants in window(self.above.message) and (status.wants, status.begin) != self.made
         )
 
     def plan(self, tick: int) -> None:
-        """Time the wanted segment, or give the reason why it cannot be timed."""
+        """Plan the trajectory of a segment, or report the reason for which it is impossible."""
         status = self.status.message
         self.made = status.wants, status.begin
         self.output.clear()
@@ -51,7 +51,7 @@ class TrapezoidPlanner(Planner):
             self.output.error = Error.LIMIT
             self.output.reason = str(error)
             return
-        sections = self.sections(path, status.begin)
+        sections = self.find_sections(path, status.begin)
         self.output.count = len(sections) - 1
         self.output.duration = sections[-1][0]
         self.output.sections[: self.output.count] = sections[:-1]
@@ -60,30 +60,38 @@ class TrapezoidPlanner(Planner):
             max(published * self.context.tick_s, status.ends) + self.output.duration
         )
 
-    def sections(
+    def find_sections(
         self, path: BlendedPath, begin: float
     ) -> list[tuple[float, float, float, float, float]]:
-        """Return start in s, then s, ds, dds and jerk of the path parameter per section; the last
-        is the end."""
-        found = []
+        """Return the sections of the trajectory, and its end.
+
+        Args:
+            path: Path of the segment.
+            begin: Path parameter at the start, rad.
+
+        Returns:
+            For each section the start time, s, then position, rad, velocity, acceleration and jerk
+            of the path parameter.
+        """
+        sections = []
         start_s = 0.0
         for first, last in pairwise(
             [begin, *(stop for stop in path.stops if begin < stop < path.length), path.length]
         ):
-            speed, acceleration = self.limits_of(path, first, last)
+            speed, acceleration = self.find_limits(path, first, last)
             speed = min(speed, np.sqrt(acceleration * (last - first)))
             ramp_s = speed / acceleration
             ramp = 0.5 * speed**2 / acceleration
             cruise_s = (last - first - 2.0 * ramp) / speed
-            found.append((start_s, first, 0.0, acceleration, 0.0))
-            found.append((start_s + ramp_s, first + ramp, speed, 0.0, 0.0))
-            found.append((start_s + ramp_s + cruise_s, last - ramp, speed, -acceleration, 0.0))
+            sections.append((start_s, first, 0.0, acceleration, 0.0))
+            sections.append((start_s + ramp_s, first + ramp, speed, 0.0, 0.0))
+            sections.append((start_s + ramp_s + cruise_s, last - ramp, speed, -acceleration, 0.0))
             start_s += 2.0 * ramp_s + cruise_s
-        return [*found, (start_s, path.length, 0.0, 0.0, 0.0)]
+        return [*sections, (start_s, path.length, 0.0, 0.0, 0.0)]
 
-    def limits_of(self, path: BlendedPath, first: float, last: float) -> tuple[float, float]:
-        """Return the speed, rad/s, and acceleration, rad/s2, that every joint keeps between two
-        path parameters."""
+    def find_limits(self, path: BlendedPath, first: float, last: float) -> tuple[float, float]:
+        """Return the largest speed, rad/s, and acceleration, rad/s2, of the path parameter that all
+        joints permit between two path parameters."""
         speeds = []
         accelerations = []
         for s in np.linspace(first, last, 2 + int((last - first) / SAMPLE_RAD)):

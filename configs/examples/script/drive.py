@@ -1,4 +1,4 @@
-"""Drive a rack from Python: watch it, hold its task for a second, kill a board, let it finish.
+"""Run a rack from Python: watch it, hold its task for a second, kill a board, let it finish.
 
 python drive.py [SECONDS]
 """
@@ -25,9 +25,8 @@ def main(seconds: float | None = None) -> int:
     with Rack.from_file("nasrem", SETTINGS) as rack:
         rack.command("task", "hold", tick=2600)
         rack.command("task", "resume", tick=3000)
-        servo = open_observer(
-            rack.segment, "servo.status"
-        )  # the newest message of any mailbox, at no board's cost
+        # Reads the newest message of a mailbox without delaying any board.
+        servo = open_observer(rack.segment, "servo.status")
         rack.start(seconds)
         seen = 0
         while rack.watch(timeout_s=0.5):
