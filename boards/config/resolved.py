@@ -405,9 +405,7 @@ class _Examined:
         if not is_executor and is_critical(self._config, layout, spec.board):
             critical_priority = board.priority
         # Planners are below all reservations.
-        busy_ms = 0.0
-        if is_executor and board.budget is not None:
-            busy_ms = board.budget.cycle_ms
+        busy_ms = board.busy_ms if is_executor else 0.0
         return TaskWiring(
             task=ports.task,
             target=ports.place.target,

@@ -7,7 +7,7 @@ unit follows a comma; `rack schema` shows it in a separate column.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -264,6 +264,11 @@ class BoardConfig(PlacedConfig):
     """while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then
     brakes; brake: the arm brakes at once"""
 
+    @property
+    def busy_ms(self) -> float:
+        """Processor time of a cycle of the executor by its budget, ms; 0: it has none."""
+        return 0.0 if self.budget is None else self.budget.cycle_ms
+
 
 LAN = "lan"
 """Name of the board that exchanges mailboxes with other racks."""
@@ -514,6 +519,11 @@ class RackConfig(Table):
     def table(self, of: TaskPlace | TaskSpec) -> BoardConfig | HostConfig:
         """Return the table of a task's board, or of a host board."""
         return self.host[of.board] if of.role == "host" else self.board[of.board]
+
+    def rewired(self, place: TaskPlace) -> Mapping[str, Sources]:
+        """Return the mailboxes that the config gives to ports of a task or host board, by port."""
+        found: Mapping[str, Sources] = getattr(self.table(place), place.reads_key)
+        return found
 
     def text(self) -> str:
         """Return the config as self-contained TOML that loads to the same config."""

@@ -239,7 +239,7 @@ def reservations(wiring: Wiring) -> Mistakes:
         yield Mistake("timing.clock_ms", 0.0, "missing; the clock reserves twice as much")
     for name, board in config.board.items():
         place = f"board.{name}"
-        if board.budget is None or not board.budget.cycle_ms:
+        if not board.busy_ms:
             yield Mistake(f"{place}.budget", None, "missing; the board reserves twice as much")
         if (board.wake or config.clock.wake) == "poll":
             yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up what it reserves")

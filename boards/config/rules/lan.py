@@ -163,7 +163,7 @@ def _export(wiring: Wiring, source: str) -> Iterator[str]:
     elif source in wiring.operated:
         yield "what an operator commands stays in its rack; permitted: mailboxes that levels write"
     elif not wiring.is_known(source):
-        yield f"no such mailbox; mailboxes: {wiring.names()}"
+        yield f"no such mailbox; mailboxes: {wiring.names}"
     elif source in wiring.writers and board in wiring.every:
         every = wiring.every[board] * wiring.writers[source][1].cycles
         rate_hz = 1e9 / (every * wiring.config.clock_ns)
