@@ -13,14 +13,14 @@ In a replay there is no network: see `rack.boards.lan.replayed`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State, Status, field, fill_counts, make_message
+from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
@@ -34,6 +34,7 @@ from rack.boards.lan.link import RETRY_MS, Carrier, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import Peers
 from rack.boards.lan.replayed import ReplayedNetwork
+from rack.boards.lan.status import status_of
 from rack.boards.wiring import Entries
 from rack.levels.errors import LevelError
 from rack.levels.level import Input, LevelContext, MadePorts, Output, TimedOutput
@@ -41,103 +42,6 @@ from rack.levels.peer import PeerPresence, peer_port
 from rack.levels.tables import read_params
 
 _LAUNCH_MASK = (1 << 62) - 1
-
-
-class LanExport(Message, version=1):
-    """Counts of one export, in the status of the network adapter."""
-
-    sent: int = field("u4", unit="1", doc="messages sent")
-    serial: int = field(unit="1", doc="serial of the newest message sent; 0: none")
-
-
-class LanImport(Message, version=1):
-    """Counts of one import, and its newest message, in the status of the network adapter."""
-
-    taken: int = field("u4", unit="1", doc="messages passed to the backplane")
-    missing: int = field(
-        "u4", unit="1", doc="messages sent that never came, or came after a later one"
-    )
-    disordered: int = field(
-        "u4", unit="1", doc="messages that came after a later one, and were not passed"
-    )
-    repeated: int = field("u4", unit="1", doc="messages that came twice")
-    late: int = field("u4", unit="1", doc="messages older than max_age_ms when they came")
-    refused: int = field(
-        "u4",
-        unit="1",
-        doc="messages refused: malformed, unsigned, oversized, or not what its type permits",
-    )
-    unknown_launch: int = field(
-        "u4", unit="1", doc="messages of a launch that is over, or not there"
-    )
-    superseded: int = field(
-        "u4", unit="1", doc="messages that a newer one overtook before the exchange"
-    )
-    launch: int = field(
-        unit="1",
-        doc="number of the launch that wrote the newest message taken; 0: none, or in lockstep",
-    )
-    number: int = field(unit="1", doc="number of that message among those sent from its mailbox")
-    serial: int = field(unit="1", doc="its serial in its mailbox; 0: none")
-    age: int = field(unit="tick", doc="age of its information in this rack's ticks; -1: none yet")
-    age_s: float = field(unit="s", doc="the same in simulated time; -1: none yet")
-
-
-class LanFlaws(Message, version=1):
-    """Counts of what came over the network and was dropped unread, by cause."""
-
-    malformed: int = field(
-        "u4",
-        unit="1",
-        doc="not of this protocol, or of another version of it; in lockstep always 0",
-    )
-    unsigned: int = field(
-        "u4",
-        unit="1",
-        doc="changed on the way, under another key, or not sealed by whom it names; likewise",
-    )
-    oversized: int = field("u4", unit="1", doc="longer than most_bytes; likewise")
-
-
-class LanClocks(Message, version=1):
-    """Counts of the round trips by which racks compare their clocks."""
-
-    taken: int = field("u4", unit="1", doc="round trips measured")
-    answered: int = field("u4", unit="1", doc="pings of other racks answered")
-    withheld: int = field(
-        "u4", unit="1", doc="pings not answered: they came too fast, or from too many racks"
-    )
-    refused: int = field(
-        "u4",
-        unit="1",
-        doc="pings and answers refused: malformed, unsigned, or to nothing that was asked",
-    )
-
-
-class LanDesk(Message, version=1):
-    """Counts of the emergency stops that other machines asked for."""
-
-    answered: int = field(
-        "u4",
-        unit="1",
-        doc="emergency stops from other machines that were set; in lockstep always 0",
-    )
-    refused: int = field("u4", unit="1", doc="emergency stops refused: not permitted; likewise")
-    dropped: int = field(
-        "u4", unit="1", doc="requests dropped: malformed, unsigned or oversized; likewise"
-    )
-
-
-def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
-    """Return the class of an adapter's status: a group for each export and import."""
-    groups = {
-        "clocks": field(LanClocks, doc="round trips to compare clocks; none in lockstep"),
-        **{f"export_{port}": field(LanExport, doc=f"export {port}") for port in exports},
-        **{f"import_{port}": field(LanImport, doc=f"import {port}") for port in imports},
-        "desk": field(LanDesk, doc="emergency stops from other machines"),
-        "flaws": field(LanFlaws, doc="all that came and was dropped unread, by cause"),
-    }
-    return make_message("lan_status", 1, Status, groups)
 
 
 class LanAdapter(Adapter):

@@ -9,7 +9,6 @@ and whoever gets no answer asks again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
@@ -18,10 +17,12 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.message import fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
+from rack.boards.host.entries import zero_counts
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
 from rack.boards.lan.link import LanLink, Question
+from rack.boards.lan.status import LanDesk
 from rack.levels.level import Finding
 
 ESTOP_KIND = xxh3(b"rack estop 1")
@@ -29,15 +30,6 @@ CHECK = 1
 """Flags of a request that is answered as a stop would be, and sets none."""
 REQUESTS_A_CYCLE = 16
 """Requests that wait for a cycle, and that a cycle looks at."""
-
-
-@dataclass
-class DeskCount:
-    """Requests so far: see `rack.boards.lan.adapter.DESK`."""
-
-    answered: int = 0
-    refused: int = 0
-    dropped: int = 0
 
 
 class Desk:
@@ -53,7 +45,7 @@ class Desk:
         self._findings = findings
         self._lines = UtilityLines(segment)
         self._requests: Callable[[], Iterator[Question]] = lambda: iter(())
-        self.count = DeskCount()
+        self.count = zero_counts(LanDesk)
 
     def open(self, link: LanLink, launch: int) -> None:
         """Take requests from now on."""
@@ -89,10 +81,10 @@ class Desk:
 
     def resume(self, record: Any) -> None:
         """Count on from the group of its predecessor's last status."""
-        self.count = DeskCount(*record.tolist())
+        self.count.record[...] = record
 
     def fill(self, record: object) -> None:
         """Write its counts into the group of a status; in lockstep none, since they do not depend
         on ticks alone."""
         if not self._grid.is_lockstep:
-            fill_counts(record, vars(self.count).values())
+            fill_counts(record, self.count.record.item())
