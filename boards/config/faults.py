@@ -1,23 +1,250 @@
-"""Fault tables made into entries of the fault table, once their rules are kept."""
+"""Faults: whether their kind, their target and their time fit each other and the rack, and their
+entries in the fault table."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from zlib import crc32
 
-from rack.backplane.address_map import CLOCK
+from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
 from rack.backplane.fault_table import Injection
-from rack.backplane.layout import Layout
+from rack.backplane.layout import Layout, Role
+from rack.backplane.mailbox.queue import is_position
+from rack.boards.config.mistakes import at_key
 from rack.boards.config.published import Levels
-from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import first_tick
-from rack.boards.errors import ConfigError
+from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.clock_board import PHASES
 from rack.boards.faults.config import FaultConfig, condition
-from rack.boards.faults.kind import KINDS, Kind
+from rack.boards.faults.kind import KINDS, Kind, Parameter
+from rack.levels.tables import RobotConfig
 
 SEEDS = 2**31
+Place = str
+"""The place of a fault in a config, as in "fault[0]"; empty for a fault injected live."""
+
+
+def fault_mistakes(
+    faults: Iterable[tuple[Place, FaultConfig]],
+    config: RackConfig,
+    levels: Levels,
+    layout: Layout | None = None,
+    unspecified: Collection[str] = (),
+) -> list[Mistake]:
+    """Check faults.
+
+    Args:
+        faults: The faults, with their places.
+        config: The config of the rack.
+        levels: Its levels.
+        layout: Its layout. Without it the rules that need one are skipped.
+        unspecified: Boards with known mistakes.
+
+    Returns:
+        Every mistake.
+    """
+    rules = [
+        FaultRules(place, fault, config, levels, layout, unspecified) for place, fault in faults
+    ]
+    found = [mistake for rule in rules for mistake in rule.mistakes()]
+    if len(rules) > FAULT_ENTRIES:
+        found.append(
+            Mistake("fault", len(rules), f"too many faults for one run; permitted: {FAULT_ENTRIES}")
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class FaultRules:
+    """The rules for one fault at `place`: see `fault_mistakes`."""
+
+    place: Place
+    fault: FaultConfig
+    config: RackConfig
+    levels: Levels
+    layout: Layout | None = None
+    unspecified: Collection[str] = ()
+
+    def mistakes(self) -> Mistakes:
+        """Yield every mistake in the fault."""
+        # Check that its begin and its end are each given in one way.
+        for keys in (("tick", "at", "when"), ("for", "cycles")):
+            given = [key for key in keys if self._value(key) is not None]
+            for key in given[1:]:
+                yield self._mistake(
+                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
+                )
+        fault = self.fault
+        places = (*self.config.tasks(), *self.config.hosts())
+        tasks: dict[str, Role] = {place.name: place.role for place in places}
+        kind = KINDS.names.get(fault.kind)
+        if kind is None:
+            yield self._mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
+        else:
+            yield from self._of_kind(kind)
+        if fault.board != CLOCK and fault.board not in tasks:
+            if fault.board.partition(".")[0] not in self.unspecified:
+                yield self._mistake("board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}")
+        elif kind is not None:
+            yield from self._target(kind, tasks)
+        if fault.when is not None and (layout := self._layout_of(fault.when)) is not None:
+            try:
+                condition(fault.when, layout)
+            except LookupError as error:
+                yield self._mistake("when", str(error.args[0]))
+
+    def _of_kind(self, kind: Kind) -> Mistakes:
+        if kind.realtime and self.config.clock.mode == "lockstep":
+            why = (
+                f"{kind.name} needs real time: in lockstep time waits for every task; run without"
+                " --lockstep"
+            )
+            yield self._mistake("kind", why)
+        if kind.once:
+            yield from self._without(
+                ("for", "cycles"), f"{kind.name} strikes once and has no duration; remove it"
+            )
+        if kind.where == "start":
+            yield from self._without(
+                ("tick", "at", "when"), f"{kind.name} strikes as the board starts; remove it"
+            )
+        if self.fault.phase and not kind.within_tick:
+            takers = _listed(other.name for other in KINDS if other.within_tick)
+            yield self._mistake(
+                "phase", f"{kind.name} cannot strike within a tick; kinds that can: {takers}"
+            )
+        if self.fault.mailbox is not None and not kind.takes_mailbox:
+            takers = _listed(other.name for other in KINDS if other.takes_mailbox)
+            yield self._mistake(
+                "mailbox", f"{kind.name} does not affect mailboxes; kinds that do: {takers}"
+            )
+        yield from self._parameters(kind)
+
+    def _parameters(self, kind: Kind) -> Mistakes:
+        known = {parameter.name: parameter for parameter in kind.parameters}
+        for name, value in self.fault.parameters.items():
+            if name not in known:
+                why = f"{kind.name} has no such parameter; parameters: {_listed(known)}"
+                yield Mistake(at_key(self.place, name), _plain(value), why)
+            elif why := _range(known[name], value, self.config.robot):
+                yield Mistake(at_key(self.place, name), _plain(value), why)
+        for parameter in kind.parameters:
+            if parameter.default is None and parameter.name not in self.fault.parameters:
+                yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
+
+    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
+        """Check that the task can be struck by such a fault."""
+        board = self.fault.board
+        if board in self.config.host and self.config.host[board].external:
+            yield self._mistake(
+                "board",
+                "external: the rack has no process to strike; permitted: boards that it starts",
+            )
+        elif board == CLOCK:
+            if "clock" not in kind.tasks:
+                kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
+                yield self._mistake(
+                    "board", f"{kind.name} cannot strike the clock; kinds that can: {kinds}"
+                )
+        elif kind.tasks == ("clock",):
+            yield self._mistake(
+                "board", f'{kind.name} strikes only the clock; permitted: "{CLOCK}"'
+            )
+        elif tasks[board] not in kind.tasks:
+            role = kind.tasks[0]
+            fitting = _listed(name for name, other in tasks.items() if other == role)
+            yield self._mistake("board", f"{kind.name} strikes only {role}s; {role}s: {fitting}")
+        elif kind.where == "arm":
+            able = [
+                name
+                for name in self.config.board
+                # A level whose class is missing may be struck by any kind.
+                if name not in self.levels or kind.name in self.levels[name].struck_by
+            ]
+            if board not in able:
+                yield self._mistake(
+                    "board",
+                    f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}",
+                )
+        elif kind.takes_mailbox and (layout := self._layout_of(board)) is not None:
+            yield from self._mailboxes(kind, layout)
+
+    def _layout_of(self, place: str) -> Layout | None:
+        """Return the layout; None without one, or if it lacks the board of a task or a mailbox."""
+        is_known = place.partition(".")[0].strip() not in self.unspecified
+        return self.layout if is_known else None
+
+    def _mailboxes(self, kind: Kind, layout: Layout) -> Mistakes:
+        every = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
+        # The position of a queue's reader is not written through a port.
+        written = {
+            name: m for name, m in every.items() if kind.where == "bus" or not is_position(m)
+        }
+        wanted = self.fault.mailbox
+        struck = [m for m in written.values() if wanted in (None, m.name)]
+        if wanted is not None and wanted not in written:
+            yield self._mistake(
+                "mailbox", f"'{self.fault.board}' does not write it; it writes: {_listed(written)}"
+            )
+        elif kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
+            why = (
+                f"'{struck[0].name}' is a queue, which {kind.name} does not strike:"
+                f" {kind.not_queued}"
+            )
+            yield self._mistake("mailbox", why)
+        elif (
+            kind.where == "bus"
+            and wanted is None
+            and not any(m.readers for m in written.values())
+            # Readers may be among the boards that the layout lacks.
+            and not self.unspecified
+        ):
+            yield self._mistake(
+                "mailbox", f"missing; no mailbox of '{self.fault.board}' has a reader"
+            )
+        elif kind.where == "lock":
+            locked = [name for name, mailbox in written.items() if mailbox.protocol == "lock"]
+            is_locked = bool(locked) if wanted is None else wanted in locked
+            if not is_locked:
+                why = (
+                    f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' that use"
+                    f" it: {_listed(locked)}"
+                )
+                yield self._mistake("mailbox", why)
+
+    def _without(self, keys: Iterable[str], why: str) -> Mistakes:
+        """Check that none of these keys is given."""
+        for key in keys:
+            if self._value(key) is not None:
+                yield self._mistake(key, why)
+
+    def _value(self, key: str) -> object:
+        return self.fault.lasts if key == "for" else getattr(self.fault, key)
+
+    def _mistake(self, key: str, why: str) -> Mistake:
+        return Mistake(at_key(self.place, key), self._value(key), why)
+
+
+def _range(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
+    """Return why a value is not permitted for the parameter; empty if it is."""
+    most = parameter.most
+    if parameter.name == "joint" and robot is not None:
+        most = len(robot.joints) - 1
+    if not parameter.least <= value <= most or (parameter.is_whole and value != int(value)):
+        whole = "whole numbers " if parameter.is_whole else ""
+        return f"out of range; permitted: {whole}{parameter.least:g} to {most:g}; {parameter}"
+    return ""
+
+
+def _plain(value: float) -> float:
+    return int(value) if value.is_integer() else value
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"
 
 
 def places(config: RackConfig) -> list[tuple[str, FaultConfig]]:

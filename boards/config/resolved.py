@@ -25,15 +25,13 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
 from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes, with_derived
-from rack.boards.config.commands import requests
-from rack.boards.config.faults import injections, places
+from rack.boards.config.commands import command_mistakes, requests
+from rack.boards.config.faults import fault_mistakes, injections, places
 from rack.boards.config.files import CONFIGS, PartialConfigError, anchor, assembled
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.published import PublishedRack, publish
 from rack.boards.config.rules import broken_rules, network_rules
-from rack.boards.config.rules.commands import command_mistakes
-from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAN, LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation

@@ -525,6 +525,17 @@ class RackConfig(Table):
         found: Mapping[str, Sources] = getattr(self.table(place), place.reads_key)
         return found
 
+    @property
+    def outside(self) -> str:
+        """Whose state is not the rack's, so that it has no snapshots; empty: nobody's.
+
+        Such a rack repeats itself only with what came from outside of it then.
+        """
+        hosts = ", ".join(map(repr, self.host))
+        found = [f"{hosts}: a host program's state"] if hosts else []
+        found += [f"'{LAN}': what comes from the network"] if self.adapter.lan is not None else []
+        return "; ".join(found)
+
     def text(self) -> str:
         """Return the config as self-contained TOML that loads to the same config."""
         # Not in JSON mode, which lacks infinity and NaN: parameters of levels may use them.

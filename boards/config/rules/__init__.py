@@ -2,8 +2,8 @@
 wiring to mistakes.
 
 All mistakes are reported at once. A rule skips what depends on a broken table, whose own mistakes
-are already reported. Faults and commands, which may come live too, have rules of their own in
-`faults` and `commands`.
+are already reported. Faults and commands, which may come live too, have rules of their own:
+`rack.boards.config.faults` and `rack.boards.config.commands`.
 """
 
 from __future__ import annotations
