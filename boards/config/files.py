@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -28,14 +29,28 @@ EXTENDS = "configs that this file extends, by name or path, in order; its own ke
 """Meaning of `extends`, the one key that only files have."""
 
 
+@dataclass(frozen=True)
+class Assembled:
+    """The tables of a config as they were read.
+
+    Attributes:
+        tables: The tables.
+        mistakes: Mistakes in files, fault script and settings.
+        broken: Tables that settings with mistakes were to change.
+        is_whole: False if files are missing, with tables that nobody knows.
+    """
+
+    tables: Tables
+    mistakes: Sequence[Mistake] = ()
+    broken: frozenset[str] = frozenset()
+    is_whole: bool = True
+
+
 def assembled(
     name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
-) -> Tables:
+) -> Assembled:
     """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults
-    of a script.
-
-    Paths in an override are relative to the current folder. Raises `ConfigError`.
-    """
+    of a script. Paths in an override are relative to the current folder."""
     mistakes: list[Mistake] = []
     tables: Tables = {}
     folder = CONFIGS
@@ -51,26 +66,8 @@ def assembled(
     overridden = override(tables, overrides, wrong)
     # Settings may refer to what only the files hold.
     found = anchor(overridden if is_whole else tables, Path.cwd())
-    if mistakes or wrong:
-        broken = frozenset(table_of(setting.value) for setting in wrong)
-        raise PartialConfigError([*mistakes, *wrong], found, broken, is_whole)
-    return found
-
-
-class PartialConfigError(ConfigError):
-    """Mistakes in files, fault script and settings, with the tables that were read all the same.
-
-    `broken` names the tables that settings with mistakes were to change. `is_whole` is false if
-    files are missing, with tables that nobody knows.
-    """
-
-    def __init__(
-        self, mistakes: list[Mistake], tables: Tables, broken: frozenset[str], is_whole: bool
-    ) -> None:
-        super().__init__(mistakes)
-        self.tables = tables
-        self.broken = broken
-        self.is_whole = is_whole
+    broken = frozenset(table_of(setting.value) for setting in wrong)
+    return Assembled(found, [*mistakes, *wrong], broken, is_whole)
 
 
 @contextmanager

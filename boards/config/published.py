@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import Field, TypeAdapter, create_model
 from pydantic.fields import FieldInfo
@@ -31,7 +31,6 @@ from rack.levels.tables import Table, keys_of, live_keys, read_params
 TYPES: Mapping[str, type] = {kind.__name__: kind for kind in (bool, int, float, str)}
 """Types of parameters whose values can be checked without the level's class."""
 Constraint = Literal["gt", "ge", "lt", "le", "allow_inf_nan"]
-CONSTRAINTS: tuple[Constraint, ...] = ("gt", "ge", "lt", "le", "allow_inf_nan")
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,7 @@ def _level(
 def _param(declared: FieldInfo, launched: object) -> PublishedParam:
     constraints: dict[Constraint, float | bool] = {}
     for bound in declared.metadata:
-        for key in CONSTRAINTS:
+        for key in get_args(Constraint):
             value = getattr(bound, key, None)
             # An infinite bound is none, and JSON has no infinity.
             if value is not None and isfinite(value):

@@ -27,7 +27,7 @@ from rack.boards.classes import extend_path
 from rack.boards.config.cell import cell_sizes, with_derived
 from rack.boards.config.commands import command_mistakes, requests
 from rack.boards.config.faults import fault_mistakes, injections, places
-from rack.boards.config.files import CONFIGS, PartialConfigError, anchor, assembled
+from rack.boards.config.files import CONFIGS, Assembled, anchor, assembled
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.published import PublishedRack, publish
@@ -86,17 +86,13 @@ def load(
     are relative to the current folder. Raises `ConfigError` with every mistake if a file, a setting
     or a single table is wrong; `resolve` checks the rest.
     """
-    try:
-        tables = assembled(name_or_path, overrides, faults)
-    except PartialConfigError as error:
-        return validated(error.tables, error)
-    return validated(tables)
+    return validated(assembled(name_or_path, overrides, faults))
 
 
 def loads(text: str) -> RackConfig:
     """Return the config in TOML text, as `RackConfig.text` writes it, and add its levels to the
     import path. Raises `ConfigError` as `load` does."""
-    return validated(anchor(parse(text), CONFIGS))
+    return validated(Assembled(anchor(parse(text), CONFIGS)))
 
 
 def read_stored(text: str) -> RackConfig:
@@ -264,23 +260,21 @@ class Resolved:
             why = f"at most {allowed} open files are permitted (ulimit -n); the rack needs {needed}"
             raise LaunchError(f"rack '{self.config.name}': {why}")
 
-    def _unlocked(self, segment: Segment) -> list[str]:
+    def _unlocked(self, segment: Segment) -> Iterator[str]:
+        """Yield which tasks have not locked their memory, and the limit."""
         if self.config.clock.mode == "lockstep":
-            return []
-        memory = {
-            t.name: mapped_and_locked(segment.block(t.name)[Block.PID]) for t in self.layout.tasks
-        }
-        unlocked = {name: mapped for name, (mapped, locked) in memory.items() if not locked}
-        if not unlocked:
-            return []
-        limit = (
-            f"the limit is {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps"
-            f" {max(unlocked.values())}"
-        )
-        return [
-            f"memory not locked for {', '.join(unlocked)}: {limit}; page faults may delay cycles."
-            f" {PERMIT_LOCK}"
-        ]
+            return
+        unlocked = {}
+        for task in self.layout.tasks:
+            mapped, locked = mapped_and_locked(segment.block(task.name)[Block.PID])
+            if not locked:
+                unlocked[task.name] = mapped
+        if unlocked:
+            yield (
+                f"memory not locked for {', '.join(unlocked)}: the limit is"
+                f" {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())};"
+                f" page faults may delay cycles. {PERMIT_LOCK}"
+            )
 
     def _reserved(self, segment: Segment) -> Iterator[str]:
         """Yield who has a reservation, on which cores, and who was refused one."""
@@ -462,24 +456,16 @@ class _Examined:
         )
 
 
-def validated(tables: Tables, partial: PartialConfigError | None = None) -> RackConfig:
+def validated(found: Assembled) -> RackConfig:
     """Return the config in tables, and add its levels to the import path.
 
-    Args:
-        tables: Tables of a config, assembled.
-        partial: Earlier mistakes, which are raised together with those that are found here.
-
     Raises:
-        ConfigError: The config has mistakes. All stages run on the tables that are valid.
+        ConfigError: The config has mistakes, those of its tables included. All stages run on the
+            tables that are valid.
     """
-    mistakes: list[Mistake] = []
-    broken: frozenset[str] = frozenset()
-    is_whole = True
-    if partial is not None:
-        mistakes += partial.mistakes
-        broken = partial.broken
-        is_whole = partial.is_whole
-    unset = broken
+    tables = found.tables
+    mistakes = list(found.mistakes)
+    broken = found.broken
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
@@ -489,9 +475,9 @@ def validated(tables: Tables, partial: PartialConfigError | None = None) -> Rack
             for mistake in mistakes_of(error, RackConfig, tables)
             # A setting or a file with mistakes may hold what is missing.
             if not mistake.why.startswith("missing")
-            or (is_whole and table_of(mistake.place) not in unset)
+            or (found.is_whole and table_of(mistake.place) not in found.broken)
         ]
-    if not is_whole:
+    if not found.is_whole:
         raise ConfigError(mistakes)
     if broken:
         config = _intact(tables, broken)

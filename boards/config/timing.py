@@ -11,7 +11,6 @@ from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
 from rack.backplane.process import Reservation
 from rack.boards.config.schema import (
-    BoardConfig,
     BudgetConfig,
     CommandConfig,
     RackConfig,
@@ -27,7 +26,8 @@ NS_PER_MS = 1e6
 RESERVED = 2
 """Times its budget that a board may use up in a cycle: budgets are 99th percentiles, and the kernel
 lets whoever uses more wait for the next cycle."""
-PARTS = tuple(field.name for field in fields(Budget))
+KEYS = {part.name: part.name.replace("_ns", "_ms") for part in fields(Budget)}
+"""The key of a config's budget for each field of a `Budget`."""
 PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 """Keys of a budget that only a board with a planner has."""
 
@@ -160,33 +160,25 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
 
 def budgets(config: RackConfig) -> dict[str, Budget]:
     """Return the config's budgets, by board; boards without one are omitted."""
-    tables = {name: board.budget for name, board in config.board.items()}
     return {
         name: Budget(
-            **{
-                key: round(getattr(table, f"{key.removesuffix('_ns')}_ms") * NS_PER_MS)
-                for key in PARTS
-            }
+            **{part: round(getattr(board.budget, key) * NS_PER_MS) for part, key in KEYS.items()}
         )
-        for name, table in tables.items()
-        if table is not None
+        for name, board in config.board.items()
+        if board.budget is not None
     }
 
 
 def with_budgets(config: RackConfig, found: Mapping[str, Budget]) -> RackConfig:
     """Return the config with exactly these budgets, by board; each `plan_within_ms` is kept."""
-    boards = {name: _budgeted(board, found.get(name)) for name, board in config.board.items()}
+    boards = {}
+    for name, board in config.board.items():
+        budget = None
+        if name in found:
+            times = {KEYS[part]: ns / NS_PER_MS for part, ns in asdict(found[name]).items()}
+            if board.planner is None:
+                times = {key: ms for key, ms in times.items() if key not in PLANNER_BUDGET}
+            within_ms = None if board.budget is None else board.budget.plan_within_ms
+            budget = BudgetConfig(**times, plan_within_ms=within_ms)
+        boards[name] = board.model_copy(update={"budget": budget})
     return config.model_copy(update={"board": boards})
-
-
-def _budgeted(board: BoardConfig, budget: Budget | None) -> BoardConfig:
-    wanted = None if board.budget is None else board.budget.plan_within_ms
-    if budget is None:
-        return board.model_copy(update={"budget": None})
-    times = {
-        f"{part.removesuffix('_ns')}_ms": time_ns / NS_PER_MS
-        for part, time_ns in asdict(budget).items()
-    }
-    if board.planner is None:
-        times = {key: time for key, time in times.items() if key not in PLANNER_BUDGET}
-    return board.model_copy(update={"budget": BudgetConfig(**times, plan_within_ms=wanted)})

@@ -12,10 +12,8 @@ import tomli_w
 from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_LONG, load_toml
 from rack.boards.errors import ConfigError, Mistake, shown
 
-PART = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[^."'=\s]+)"""
-SETTING = re.compile(rf"\s*({PART}(?:\s*\.\s*{PART})*)\s*=(.*)", re.DOTALL)
-""""key.sub=value"; a key that contains a dot is quoted, as in TOML:
-protocol.mailbox."level.plan"=lock."""
+SETTING = re.compile(r"""((?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[^"'=\n])+)=([^\0]*)""")
+""""key.sub=value", with a key of TOML: protocol.mailbox."level.plan"=lock."""
 FREE_FORM = ("params", "task")
 """Tables of the levels, where an empty list is an ordinary value."""
 
@@ -84,9 +82,7 @@ def merge(base: Tables, top: Tables) -> Tables:
     return merged
 
 
-def override(
-    tables: Tables, settings: Sequence[str], mistakes: list[Mistake] | None = None
-) -> Tables:
+def override(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -> Tables:
     """Return the tables with each setting `key.sub=value` applied, in order.
 
     Values are TOML; any other text is taken as a string. A number in a key is an index into a list,
@@ -96,43 +92,34 @@ def override(
         tables: Tables of a config, which are not changed.
         settings: The settings.
         mistakes: Gets every mistake; the settings without one are applied.
-
-    Raises:
-        ConfigError: There are mistakes, and no list for them.
     """
-    raises = mistakes is None
-    mistakes = [] if mistakes is None else mistakes
     for setting in settings:
         try:
-            keys, value = _parts(setting)
-            tables = _put(tables, keys, value)
+            keys, text = _parts(setting)
+            tables = _put(tables, keys, _value(text))
         except LookupError as error:
             mistakes.append(Mistake("--set", setting, str(error.args[0])))
         except ConfigError as error:
             mistakes += [Mistake("--set", setting, mistake.why) for mistake in error.mistakes]
-    if mistakes and raises:
-        raise ConfigError(mistakes)
     return tables
 
 
-def _parts(setting: str) -> tuple[list[str], Any]:
-    """Return the keys and the value of a setting. Raises `LookupError` and `ConfigError`."""
+def _parts(setting: str) -> tuple[list[str], str]:
+    """Return the keys and the value of a setting. Raises `LookupError`."""
     found = SETTING.fullmatch(setting)
-    if found is None or "\0" in setting:
-        raise LookupError("must be key=value, as in clock.speed=2")
-    parts = re.findall(PART, found[1])
-    if len(parts) > MAX_DEPTH:
-        raise LookupError(TOO_DEEP)
-    return [_key(part) for part in parts], _value(found[2])
-
-
-def _key(part: str) -> str:
-    if part[0] not in "\"'":
-        return part
+    keys: list[str] = []
     try:
-        return str(tomllib.loads(f"key = {part}")["key"])
-    except tomllib.TOMLDecodeError as error:
-        raise LookupError(f"{part} is not a valid key: {error}") from None
+        node: Any = load_toml(f"{found[1]} = 0") if found else 0
+    except tomllib.TOMLDecodeError:
+        node = 0
+    except ValueError as error:
+        raise LookupError(str(error)) from None
+    while isinstance(node, dict):
+        ((key, node),) = node.items()
+        keys.append(key)
+    if found is None or not keys:
+        raise LookupError("must be key=value, as in clock.speed=2")
+    return keys, found[2]
 
 
 def _value(text: str) -> Any:

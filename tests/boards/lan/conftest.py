@@ -41,7 +41,9 @@ def segment(rack_name: str, request: pytest.FixtureRequest) -> Iterator[Segment]
     simulated times."""
     config = loads(
         to_toml(
-            override(parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"])
+            override(
+                parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"], []
+            )
         )
     )
     made = Segment.create(wire(config), config.text())

@@ -103,7 +103,7 @@ MISTAKES = {
 def test_a_mistake_is_one_line(name: str) -> None:
     settings, line = MISTAKES[name]
     with pytest.raises(ConfigError) as error:
-        resolve(loads(to_toml(override(parse(HOSTED), settings))))
+        resolve(loads(to_toml(override(parse(HOSTED), settings, []))))
     (mistake,) = error.value.mistakes
     assert line in str(mistake)
 

@@ -161,7 +161,7 @@ MISTAKES = {
 
 def resolved(*settings: str) -> None:
     """Check the config with these settings, in lockstep if they do not say otherwise."""
-    resolve(loads(to_toml(override(parse(TEXT), ["clock.mode=lockstep", *settings]))))
+    resolve(loads(to_toml(override(parse(TEXT), ["clock.mode=lockstep", *settings], []))))
 
 
 @pytest.mark.parametrize("name", MISTAKES)
