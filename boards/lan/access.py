@@ -118,29 +118,28 @@ def _operator(own: str) -> list[Rule]:
 
 
 def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
-    rules = []
-    policies = []
-    subjects: list[dict[str, Any]] = []
-    for subject, allowed in by_subject.items():
-        names = []
-        for at, (flow, messages, keys) in enumerate(allowed):
-            names.append(f"{subject}-{at}")
-            rules.append(
-                {
-                    "id": names[-1],
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": list(messages),
-                    "key_exprs": list(keys),
-                }
-            )
-        policies.append({"rules": names, "subjects": [subject]})
-        known = {} if subject == ANYONE else {"cert_common_names": [subject]}
-        subjects.append({"id": subject, **known})
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
+        "rules": [
+            {
+                "id": f"{subject}-{at}",
+                "permission": "allow",
+                "flows": [flow],
+                "messages": list(messages),
+                "key_exprs": list(keys),
+            }
+            for subject, allowed in by_subject.items()
+            for at, (flow, messages, keys) in enumerate(allowed)
+        ],
+        "subjects": [
+            {"id": subject}
+            if subject == ANYONE
+            else {"id": subject, "cert_common_names": [subject]}
+            for subject in by_subject
+        ],
+        "policies": [
+            {"rules": [f"{subject}-{at}" for at in range(len(allowed))], "subjects": [subject]}
+            for subject, allowed in by_subject.items()
+        ],
     }

@@ -162,20 +162,17 @@ class LanAdapter(Adapter):
         self._desk.open(link, self._launch)
         if barrier is not None:
             barrier.open(link, self._launch)
-            self._recall(barrier)
+            # The adapter before this one may have died with its last step before that left the
+            # machine.
+            if barrier.done >= 0:
+                for export in self._exports.values():
+                    export.recall(barrier.done, self.context.every)
+                barrier.prepare(barrier.done)
         self._peers.watch(
             link.watch_alive() if barrier is None else barrier.changes, barrier is not None
         )
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
-
-    def _recall(self, barrier: Barrier) -> None:
-        """Repeat the last step of an adapter before this one: it may have died with that before it
-        left the machine."""
-        if barrier.done >= 0:
-            for export in self._exports.values():
-                export.recall(barrier.done, self.context.every)
-            barrier.prepare(barrier.done)
 
     def process(self, tick: int) -> None:
         """Exchange what is due."""
@@ -203,22 +200,18 @@ class LanAdapter(Adapter):
         self._report(tick)
 
     def _look(self, tick: int) -> None:
-        """Note who has come, and who has gone."""
+        """Note who has come, and who has gone; demand that the arm stop while a rack that had been
+        there is lost, if it is to stop then."""
         arrivals = self._peers.arrivals
         self.findings += self._peers.look(tick)
-        self._demand_stop(tick)
-        if self._peers.arrivals != arrivals:
-            for export in self._exports.values():
-                export.is_asked = True
-
-    def _demand_stop(self, tick: int) -> None:
-        """Demand that the arm stop while a rack that had been there is lost, if it is to stop
-        then."""
         must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost)
         if must_stop != bool(self._words[System.PEER_STOP] & 1):
             # In lockstep other boards, and the clock, may be ahead in their ticks of this cycle.
             since = tick + self.context.every if self._grid.is_lockstep else tick
             self._words[System.PEER_STOP] = switch(since, must_stop)
+        if self._peers.arrivals != arrivals:
+            for export in self._exports.values():
+                export.is_asked = True
 
     def _report(self, tick: int) -> None:
         own = self.ports[STATUS]

@@ -56,28 +56,23 @@ class Desk:
 
     def answer(self, tick: int) -> None:
         """Answer the requests that have come."""
-        for request in self._requests():
-            head = self._sealer.opened(request.key, request.envelope, request.payload)
-            asker = request.key.split("/")[1]
-            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or request.payload:
+        for asked, reply in self._requests():
+            head = self._sealer.opened(*asked)
+            asker = asked.key.split("/")[1]
+            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or asked.payload:
                 self.count.dropped += 1
-            elif asker not in self._askers:
+                continue
+            if asker not in self._askers:
                 self.count.refused += 1
-            else:
-                self.count.answered += 1
-                if head.flags != CHECK:
-                    self._stop(asker)
-                self._reply(request, asker, head, tick)
-
-    def _stop(self, asker: str) -> None:
-        if not self._lines.emergency_stop:
-            self._findings.append(Finding(Alarm.REMOTE_STOP, self._askers[asker]))
-        self._lines.latch_emergency_stop()
-
-    def _reply(self, request: Question, asker: str, head: Envelope, tick: int) -> None:
-        # With session and number of the request: it cannot pass for the answer to another one.
-        answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
-        request.reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
+                continue
+            self.count.answered += 1
+            if head.flags != CHECK:
+                if not self._lines.emergency_stop:
+                    self._findings.append(Finding(Alarm.REMOTE_STOP, self._askers[asker]))
+                self._lines.latch_emergency_stop()
+            # With session and number of the request: it cannot pass for the answer to another one.
+            answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
+            reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
 
     def resume(self, record: Any) -> None:
         """Count on from the group of its predecessor's last status."""
