@@ -14,6 +14,7 @@ from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeated
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.schema import (
+    LAN,
     LONGEST_EVERY,
     SHORTEST_MS,
     BoardConfig,
@@ -40,6 +41,9 @@ def boards(wiring: Wiring) -> Mistakes:
         for key, neighbours in (("above", board.above), ("below", board.below)):
             yield from _neighbours(f"{place}.{key}", neighbours, others, "other board")
         yield from _planner(place, board)
+        if board.executor == LAN_ADAPTER and (name != LAN or wiring.config.adapter.lan is None):
+            why = "permitted: [adapter.lan], which makes its board"
+            yield Mistake(f"{place}.executor", board.executor, why)
 
 
 def hosts(wiring: Wiring) -> Mistakes:
@@ -297,15 +301,11 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
         key = "rate_hz" if board.every is None else "every"
         below = [cycle for cycle in fitting if cycle < every]
         above = [cycle for cycle in fitting if cycle > every]
-        nearest = (*below[-1:], *above[:1])
-        if key == "rate_hz":
-            written = [
-                f"{cycle * tick_ms:g} ms, {rate_text(1e3 / (cycle * tick_ms))} Hz"
-                for cycle in nearest
-            ]
-        else:
-            written = [f"{cycle * tick_ms:g} ms, every {cycle}" for cycle in nearest]
-        rates = " or ".join(written)
+        rates = " or ".join(
+            f"{(ms := cycle * tick_ms):g} ms, "
+            + (f"{rate_text(1e3 / ms)} Hz" if key == "rate_hz" else f"every {cycle}")
+            for cycle in (*below[-1:], *above[:1])
+        )
         why = (
             f"a cycle of {every * tick_ms:g} ms does not fit the schedule, a multiple of the minor"
             f" frame, {table.minor_ms:g} ms, that divides the major one, {table.major_ms:g} ms;"
