@@ -104,10 +104,10 @@ def command_mistakes(
         Every mistake.
     """
     given = list(commands)
-    checked = [(place, command) for place, command in given if command.level not in broken]
     found = [
         mistake
-        for place, command in checked
+        for place, command in given
+        if command.level not in broken
         for mistake in _mistakes(place, command, config, levels)
     ]
     if len(given) > OPERATOR_ENTRIES:

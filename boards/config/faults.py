@@ -65,8 +65,8 @@ class FaultRules:
     fault: FaultConfig
     config: RackConfig
     levels: Levels
-    layout: Layout | None = None
-    unspecified: Collection[str] = ()
+    layout: Layout | None
+    unspecified: Collection[str]
 
     def mistakes(self) -> Mistakes:
         """Yield every mistake in the fault."""
@@ -126,11 +126,12 @@ class FaultRules:
     def _parameters(self, kind: Kind) -> Mistakes:
         known = {parameter.name: parameter for parameter in kind.parameters}
         for name, value in self.fault.parameters.items():
-            if name not in known:
-                why = f"{kind.name} has no such parameter; parameters: {_listed(known)}"
-                yield Mistake(at_key(self.place, name), _plain(value), why)
-            elif why := _range(known[name], value, self.config.robot):
-                yield Mistake(at_key(self.place, name), _plain(value), why)
+            why = f"{kind.name} has no such parameter; parameters: {_listed(known)}"
+            if name in known:
+                why = _range(known[name], value, self.config.robot)
+            if why:
+                plain = int(value) if value.is_integer() else value
+                yield Mistake(at_key(self.place, name), plain, why)
         for parameter in kind.parameters:
             if parameter.default is None and parameter.name not in self.fault.parameters:
                 yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
@@ -178,10 +179,11 @@ class FaultRules:
         return self.layout if is_known else None
 
     def _mailboxes(self, kind: Kind, layout: Layout) -> Mistakes:
-        every = {m.name: m for m in layout.mailboxes if m.writer == self.fault.board}
         # The position of a queue's reader is not written through a port.
         written = {
-            name: m for name, m in every.items() if kind.where == "bus" or not is_position(m)
+            m.name: m
+            for m in layout.mailboxes
+            if m.writer == self.fault.board and (kind.where == "bus" or not is_position(m))
         }
         wanted = self.fault.mailbox
         struck = [m for m in written.values() if wanted in (None, m.name)]
@@ -207,8 +209,7 @@ class FaultRules:
             )
         elif kind.where == "lock":
             locked = [name for name, mailbox in written.items() if mailbox.protocol == "lock"]
-            is_locked = bool(locked) if wanted is None else wanted in locked
-            if not is_locked:
+            if not locked or wanted not in (None, *locked):
                 why = (
                     f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' that use"
                     f" it: {_listed(locked)}"
@@ -237,10 +238,6 @@ def _range(parameter: Parameter, value: float, robot: RobotConfig | None) -> str
         whole = "whole numbers " if parameter.is_whole else ""
         return f"out of range; permitted: {whole}{parameter.least:g} to {most:g}; {parameter}"
     return ""
-
-
-def _plain(value: float) -> float:
-    return int(value) if value.is_integer() else value
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -290,15 +287,15 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
 
 def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
     """Return the index of the mailbox; -1: all that the task writes, or none."""
-    if fault.mailbox is None and kind.where != "bus":
-        return -1
-    boxes = enumerate(layout.mailboxes)
-    if fault.mailbox is None:
-        # One message is forged, in one mailbox: by default the first that has a reader.
-        found = (at for at, box in boxes if box.writer == fault.board and box.readers)
-    else:
-        found = (at for at, box in boxes if box.name == fault.mailbox)
-    return next(found, -1)
+    if fault.mailbox is not None:
+        return layout.index(fault.mailbox)
+    # One message is forged, in one mailbox: by default the first that has a reader.
+    forged = (
+        at
+        for at, box in enumerate(layout.mailboxes)
+        if kind.where == "bus" and box.writer == fault.board and box.readers
+    )
+    return next(forged, -1)
 
 
 def _ticks(fault: FaultConfig, layout: Layout) -> int:

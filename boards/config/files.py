@@ -258,20 +258,16 @@ def _bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
     place = f"{path.name}: extends"
     if not isinstance(extends, list) or not all(isinstance(item, str) for item in extends):
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
-    found = {
-        item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item)
-        for item in extends
-    }
-    mistakes += [
-        Mistake(
-            place,
-            item,
-            f"no such file next to {path.name} or among the bundled configs: {', '.join(names())}",
-        )
-        for item, base in found.items()
-        if base is None
-    ]
-    return [base for base in found.values() if base is not None]
+    bases = []
+    for item in extends:
+        base = _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item)
+        if base is None:
+            known = ", ".join(names())
+            why = f"no such file next to {path.name} or among the bundled configs: {known}"
+            mistakes.append(Mistake(place, item, why))
+        else:
+            bases.append(base)
+    return bases
 
 
 def _named(name: str, folder: Path = CONFIGS) -> Path | None:

@@ -71,12 +71,11 @@ def inboxes(layout: Layout) -> dict[str, InboxTiming]:
         if boxes := layout.interrupting(slot):
             name = layout.handler(slot)
             names = tuple(box.name for box in boxes)
-            how = [how_sent(box) for box in boxes]
-            times = zip(boxes, how, strict=True)
-            sources = [
-                InterruptSource(box.every * layout.clock_ns, sent.service_ns) for box, sent in times
-            ]
-            found[name] = InboxTiming(name, names, tuple(sources), how[0].depth)
+            sources = tuple(
+                InterruptSource(box.every * layout.clock_ns, how_sent(box).service_ns)
+                for box in boxes
+            )
+            found[name] = InboxTiming(name, names, sources, how_sent(boxes[0]).depth)
     return found
 
 
@@ -124,13 +123,12 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
 def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
     """Return the ticks at which an executor reads the messages of others, by writer, if not in
     every cycle."""
-    own = [
-        (box.writer, exchange.grid)
-        for box in layout.mailboxes
-        for exchange in box.exchanges
-        if exchange.task == board
-    ]
-    return {writer: max(grid for other, grid in own if other == writer) for writer, _ in own}
+    found: dict[str, TickGrid] = {}
+    for box in layout.mailboxes:
+        for exchange in box.exchanges:
+            if exchange.task == board:
+                found[box.writer] = max(found.get(box.writer, exchange.grid), exchange.grid)
+    return found
 
 
 def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:

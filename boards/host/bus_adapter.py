@@ -35,7 +35,6 @@ from typing import Any
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.mailbox.mailbox import Reader
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State, Status, field, make_message
 from rack.backplane.segment import Segment
@@ -116,7 +115,10 @@ class BusAdapter(Adapter):
         instead."""
         layout = segment.layout
         hosts = {host.name for host in layout.hosts}
-        self._resume_counts(open_observer(segment, f"{self.context.board}.{STATUS}"))
+        status = open_observer(segment, f"{self.context.board}.{STATUS}")
+        if (last := status.peek()).is_there:
+            for port, count in self._counts.items():
+                count.resume(getattr(last.message, port), status.newest)
         for port, table in self._tables.items():
             # What the process before this one has written, if the bridge is restarted.
             own = open_observer(segment, f"{self.context.board}.{port}")
@@ -142,13 +144,6 @@ class BusAdapter(Adapter):
             ]
         if entries is not None:
             self._statuses = Replayed(entries[STATUS], STATUS, is_sent=False)
-
-    def _resume_counts(self, status: Reader) -> None:
-        before = status.peek()
-        if not before.is_there:
-            return
-        for port, count in self._counts.items():
-            count.resume(getattr(before.message, port), status.newest)
 
     def process(self, tick: int) -> None:
         """Exchange the entries that are due; then, in lockstep, let programs run."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
 from rack.backplane.message import State
-from rack.boards.config.schema import LAN, TaskPlace
+from rack.boards.config.schema import LAN
 from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import Mistake, Mistakes
 from rack.boards.exchange import EXCHANGE, exchange_message
@@ -18,25 +18,22 @@ def ports(wiring: Wiring) -> Mistakes:
     """Check that each class is there, and that its inputs are connected as it declares."""
     config = wiring.config
     for place in (*config.tasks(), *config.hosts()):
+        table = place.table
         if place in wiring.missing:
-            yield Mistake(f"{place.table}.{place.class_key}", place.target, wiring.missing[place])
-        else:
-            yield from _connected(wiring, place, wiring.ports[place])
-
-
-def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Mistakes:
-    role = place.role
-    table = place.table
-    inputs = ", ".join(ports.kind.inputs) or "none"
-    for output, told in ports.outputs.items():
-        if told.rests_on is not None and told.rests_on.name not in ports.inputs:
-            why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
-            yield Mistake(f"{table}.{role}", place.target, why)
-    for port, given in wiring.config.rewired(place).items():
-        if port not in ports.kind.inputs:
-            key = f"{place.reads_key}.{port}"
-            yield Mistake(f"{table}.{key}", given, f"the {role} has no such port; ports: {inputs}")
-    yield from ports.mistakes
+            yield Mistake(f"{table}.{place.class_key}", place.target, wiring.missing[place])
+            continue
+        ports = wiring.ports[place]
+        role = place.role
+        inputs = ", ".join(ports.kind.inputs) or "none"
+        for output, told in ports.outputs.items():
+            if told.rests_on is not None and told.rests_on.name not in ports.inputs:
+                why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
+                yield Mistake(f"{table}.{role}", place.target, why)
+        for port, given in config.rewired(place).items():
+            if port not in ports.kind.inputs:
+                why = f"the {role} has no such port; ports: {inputs}"
+                yield Mistake(f"{table}.{place.reads_key}.{port}", given, why)
+        yield from ports.mistakes
 
 
 def writers(wiring: Wiring) -> Mistakes:
@@ -281,15 +278,12 @@ def asynchronous(wiring: Wiring) -> Mistakes:
 def interrupts(wiring: Wiring) -> Mistakes:
     """Check that messages of which the config demands it can interrupt."""
     for mailbox, given in wiring.config.protocol.mailbox.items():
-        why = ""
         if given != "interrupt":
             continue
+        place = f"protocol.mailbox.{mailbox}"
         if mailbox in wiring.of_host:
             why = "it is on the host side, where nothing is interrupted; permitted: no entry"
+            yield Mistake(place, given, why)
         elif wiring.is_of_network(mailbox):
-            why = (
-                "the network adapter writes it as messages come in; permitted: time-slice,"
-                " double-buffer"
-            )
-        if why:
-            yield Mistake(f"protocol.mailbox.{mailbox}", given, why)
+            why = "the network adapter writes it as messages come in"
+            yield Mistake(place, given, f"{why}; permitted: time-slice, double-buffer")
