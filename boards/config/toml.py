@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import tomli_w
@@ -29,32 +30,29 @@ def parse(text: str, place: str = "config") -> Tables:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
     except ValueError as error:
         raise ConfigError([Mistake(place, None, str(error))]) from None
-    if mistakes := list(_out_of_bounds(tables, place)):
+    found = (_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items())
+    if mistakes := list(chain.from_iterable(found)):
         raise ConfigError(mistakes)
     return tables
 
 
-def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
+def _out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
     """Yield mistakes that are valid TOML: deep nesting, long integers, NUL in text, dates."""
-    waiting: list[tuple[str, int, Any]] = [
-        (f"{place}: {key}", 1, value) for key, value in tables.items()
-    ]
-    while waiting:
-        where, depth, value = waiting.pop()
-        if isinstance(value, dict | list) and depth >= MAX_DEPTH:
-            yield Mistake(where, None, TOO_DEEP)
-        elif isinstance(value, dict):
-            waiting += [(f"{where}.{key}", depth + 1, item) for key, item in value.items()]
-        elif isinstance(value, list):
-            waiting += [(f"{where}[{at}]", depth + 1, item) for at, item in enumerate(value)]
-        elif isinstance(value, int) and value.bit_length() >= INTEGER_BITS:
-            yield Mistake(where, value, TOO_LONG)
-        elif isinstance(value, str) and "\0" in value:
-            yield Mistake(where, value, "text must not contain NUL")
-        elif not isinstance(value, str | int | float):
-            yield Mistake(
-                where, str(value), "dates and times are not permitted; use a number or quoted text"
-            )
+    if isinstance(value, dict | list) and depth >= MAX_DEPTH:
+        yield Mistake(where, None, TOO_DEEP)
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _out_of_bounds(f"{where}.{key}", item, depth + 1)
+    elif isinstance(value, list):
+        for at, item in enumerate(value):
+            yield from _out_of_bounds(f"{where}[{at}]", item, depth + 1)
+    elif isinstance(value, int) and value.bit_length() >= INTEGER_BITS:
+        yield Mistake(where, value, TOO_LONG)
+    elif isinstance(value, str) and "\0" in value:
+        yield Mistake(where, value, "text must not contain NUL")
+    elif not isinstance(value, str | int | float):
+        why = "dates and times are not permitted; use a number or quoted text"
+        yield Mistake(where, str(value), why)
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:

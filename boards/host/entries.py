@@ -224,6 +224,14 @@ class Outward:
                 semaphore.release()
 
 
+def last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None, int]:
+    """Return the newest message of a mailbox, with the tick at which it was written; None and
+    `NEVER` if there is none."""
+    own = open_observer(segment, mailbox)
+    reading = own.peek()
+    return (reading.message, own.newest) if reading.is_there else (None, NEVER)
+
+
 class Replayed:
     """A mailbox of an adapter in a replay: what the recorded run wrote to it, at the same ticks.
 

@@ -19,11 +19,11 @@ from typing import Any
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.layout import Layout
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
+from rack.boards.host.entries import last_written
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.desk import Desk
@@ -112,10 +112,9 @@ class LanAdapter(Adapter):
         # come.
         seen_by = words[System.TICK] + self._grid.ticks_in((table.lease_ms + RETRY_MS[1]) * 1e6)
         for peer in self._peers:
-            if (
-                before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()
-            ).is_there:
-                peer.resume(before.message, seen_by)
+            before, _ = last_written(segment, f"{board}.{peer_port(peer.rack)}")
+            if before is not None:
+                peer.resume(before, seen_by)
         self._imports = {
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack], self._grid)
             for port, entry in table.imports.items()
@@ -132,14 +131,14 @@ class LanAdapter(Adapter):
         names = self.names(self.context.params)
         subjects = {name: names.index(name) for name in table.estop_from}
         self._desk = Desk(segment, self._grid, subjects, self.findings)
-        observer = open_observer(segment, f"{board}.{STATUS}")
-        if (before := observer.peek()).is_there:
+        status, tick = last_written(segment, f"{board}.{STATUS}")
+        if status is not None:
             for port, export in self._exports.items():
-                export.resume(getattr(before.message, f"export_{port}"))
+                export.resume(getattr(status, f"export_{port}"))
             for port, entry in self._imports.items():
-                entry.resume(getattr(before.message, f"import_{port}"), observer.newest)
-            self._desk.resume(before.message.desk)
-            self._flaws = before.message.flaws.tolist()
+                entry.resume(getattr(status, f"import_{port}"), tick)
+            self._desk.resume(status.desk)
+            self._flaws = status.flaws.tolist()
         if self._grid.is_lockstep and table.racks:
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
