@@ -23,12 +23,10 @@ from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.levels.tables import RobotConfig
 
 SEEDS = 2**31
-Place = str
-"""The place of a fault in a config, as in "fault[0]"; empty for a fault injected live."""
 
 
 def fault_mistakes(
-    faults: Iterable[tuple[Place, FaultConfig]],
+    faults: Iterable[tuple[str, FaultConfig]],
     config: RackConfig,
     levels: Levels,
     layout: Layout | None = None,
@@ -37,7 +35,7 @@ def fault_mistakes(
     """Check faults.
 
     Args:
-        faults: The faults, with their places.
+        faults: The faults, with their places in a config. A live fault has an empty place.
         config: The config of the rack.
         levels: Its levels.
         layout: Its layout. Without it the rules that need one are skipped.
@@ -61,7 +59,7 @@ def fault_mistakes(
 class FaultRules:
     """The rules for one fault at `place`: see `fault_mistakes`."""
 
-    place: Place
+    place: str
     fault: FaultConfig
     config: RackConfig
     levels: Levels

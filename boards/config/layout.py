@@ -181,7 +181,12 @@ class LayoutMaker:
         }
         words = -(-box.size // WORD_BYTES)
         service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
-        sent_ns = self._sent_ns(writer)
+        # A plan is sent at the end of its slice, other messages when the budget is used up, or
+        # after a tick.
+        sent_ns = writer.slice * clock_ns
+        if writer.role != "planner":
+            busy_ms = self._config.board[writer.board].busy_ms
+            sent_ns = min(round(busy_ms * NS_PER_MS) or clock_ns, sent_ns)
         slots = tuple(sorted({task.slot for task in readers} - spared - {writer.slot}))
         delay = -(-(sent_ns + service_ns * bool(slots)) // clock_ns)
         interrupt = InterruptSpec(
@@ -192,15 +197,6 @@ class LayoutMaker:
         slowest = max((reader.slice for reader in readers), default=0)
         depth = depth_for(max(slowest + delay + waits, self._kept), box.every)
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
-
-    def _sent_ns(self, writer: TaskSpec) -> int:
-        """Return the time from a release until its messages are sent: its budget, or a tick; a
-        plan's: its slice."""
-        longest_ns = writer.slice * self._config.clock_ns
-        if writer.role == "planner":
-            return longest_ns
-        busy_ms = self._config.board[writer.board].busy_ms
-        return min(round(busy_ms * NS_PER_MS) or self._config.clock_ns, longest_ns)
 
     def _task(self, place: TaskPlace) -> TaskSpec:
         board = self._config.board[place.board]

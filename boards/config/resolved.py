@@ -223,9 +223,7 @@ class Resolved:
     def crate_priority(self) -> int:
         """SCHED_FIFO priority of the crate: below all real-time boards, above all ordinary
         processes."""
-        priorities = [
-            task.priority for task in self.layout.tasks if task.priority and task.role == "executor"
-        ]
+        priorities = [t.priority for t in self.layout.tasks if t.priority and t.role == "executor"]
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:

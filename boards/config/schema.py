@@ -44,8 +44,6 @@ ANY_CORE = -1
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
 OnLoss = Literal["hold", "stop", "brake"]
-Motion = Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do", "set"]
-Power = Literal["enable", "disable", "reset", "release"]
 
 
 def _listed(value: Any) -> Any:
@@ -283,10 +281,7 @@ class LanConfig(PlacedConfig, LanTable):
 
     def board(self) -> BoardConfig:
         """Return the board."""
-        own = {
-            key: getattr(self, key)
-            for key in LanConfig.model_fields.keys() - LanTable.model_fields.keys()
-        }
+        own = {key: value for key, value in self if key not in LanTable.model_fields}
         params = self.model_dump(
             exclude_none=True, by_alias=True, include=set(LanTable.model_fields)
         )
@@ -330,7 +325,20 @@ class CommandConfig(Table):
 
     level: str
     """board whose level is commanded, as in servo or task"""
-    what: Literal[Motion, Power]
+    what: Literal[
+        "hold",
+        "resume",
+        "setpoint",
+        "goto",
+        "modify",
+        "table",
+        "do",
+        "set",
+        "enable",
+        "disable",
+        "reset",
+        "release",
+    ]
     """hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify:
     put a control modification in or take it out; table: decide by another state table; do: do one
     of the level's own commands; set: set a live parameter of the level; enable, disable: give

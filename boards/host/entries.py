@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from pydantic import Field as Key
@@ -141,15 +141,6 @@ class EntryCount:
         fill_counts(record, self.counts.record.item())
 
 
-class Crossing(Protocol):
-    """One entry, at work."""
-
-    def exchange(
-        self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
-    ) -> object:
-        """Exchange, in a cycle in which that is due."""
-
-
 class Inward:
     """Into real time: from the ring of a host board to the bridge's own mailbox, which levels read
     by ticks."""
@@ -260,3 +251,7 @@ class Replayed:
             if self._is_sent:
                 out.send(basis)
         return self._at > before
+
+
+Crossing = Inward | Outward | Replayed
+"""One entry, at work: `exchange` is called in the cycles in which that is due."""

@@ -30,7 +30,7 @@ from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import RETRY_MS, Carrier, LanLink
+from rack.boards.lan.link import RETRY_MS, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import Peers
 from rack.boards.lan.replayed import ReplayedNetwork
@@ -150,13 +150,12 @@ class LanAdapter(Adapter):
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
         barrier = self._barrier
-        carrier: Carrier = barrier or link
         # A step has one seal for all that is in it.
         sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
         for entry in self._imports.values():
-            entry.open(carrier, sealer)
+            entry.open(barrier or link, sealer)
         for export in self._exports.values():
-            export.open(carrier, sealer)
+            export.open(barrier or link, sealer)
         self._clocks.open(link, link.sealer)
         self._desk.open(link, self._launch)
         if barrier is not None:

@@ -16,7 +16,8 @@ from rack.boards.lan.config import ExportConfig, ImportConfig
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.link import Arrived, Carrier
+from rack.boards.lan.link import Arrived, LanLink
+from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import NONE, PeerRack
 from rack.boards.lan.status import LanExport, LanImport
 from rack.levels.ports import Sender
@@ -100,7 +101,7 @@ class Export:
         """Continue with the counts in the status of an adapter before this one."""
         self.count.record[...] = record
 
-    def open(self, carrier: Carrier, sealer: Sealer) -> None:
+    def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
         """Publish it."""
         self._put = carrier.publish(self._key)
         self._sealer = sealer
@@ -185,7 +186,7 @@ class Import:
         self._order.resume()
         self._basis = None if count.age == NEVER else tick - count.age
 
-    def open(self, carrier: Carrier, sealer: Sealer) -> None:
+    def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
         """Subscribe to it."""
         self._arrived = carrier.subscribe(self._key)
         self._sealer = sealer

@@ -16,7 +16,7 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import zenoh
 
@@ -61,17 +61,6 @@ class Arrived(NamedTuple):
     def of(cls, sample: zenoh.Sample) -> Self:
         """Return what a sample of the network holds."""
         return cls(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
-
-
-class Carrier(Protocol):
-    """Carries exports and imports: the network itself, or in lockstep the steps of all racks."""
-
-    def publish(self, key: str) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends payload and envelope under a key expression."""
-
-    def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
-        """Return a function that yields what has come under a key expression since its last
-        call."""
 
 
 class Question(NamedTuple):

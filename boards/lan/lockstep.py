@@ -140,7 +140,7 @@ class Partner:
 class Barrier:
     """The end of an adapter's cycles, common to all racks in lockstep.
 
-    It is the `Carrier` of exports and imports, in place of the network.
+    Exports and imports use it in place of the `LanLink`, with the same methods.
     """
 
     def __init__(
