@@ -1,21 +1,16 @@
-"""From TOML to a rack: `load` reads and validates the tables, `resolve` checks and wires
-everything, once.
+"""From a config to a rack: `resolve` checks and wires everything, once.
 
-The two are separate so that at launch the crate imports the levels while this process resolves the
-config.
+`rack.boards.config.loader` reads the config before that, so that at launch the crate imports the
+levels while this process resolves the config.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
-from typing import Any, TypeVar, cast
-
-from pydantic import ValidationError
+from typing import Any, cast
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
@@ -23,19 +18,16 @@ from rack.backplane.operator_table import Request
 from rack.backplane.process import DEADLINE, cores_kept_awake, mapped_and_locked
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
-from rack.boards.classes import extend_path
-from rack.boards.config.cell import cell_sizes, with_derived
+from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
 from rack.boards.config.faults import fault_mistakes, injections, places
-from rack.boards.config.files import CONFIGS, Assembled, anchor, assembled
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
-from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.published import PublishedRack, publish
 from rack.boards.config.rules import broken_rules, network_rules
 from rack.boards.config.rules.levels import memory, neighbours, sizes
-from rack.boards.config.schema import LAN, LAST_SLOT, CommandConfig, RackConfig
+from rack.boards.config.schema import LAN, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
-from rack.boards.config.toml import Tables, parse, table_of
+from rack.boards.config.toml import table_of, without
 from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -49,7 +41,7 @@ from rack.boards.wiring import (
     mailboxes_of,
 )
 from rack.levels.level import LevelContext, Pace
-from rack.levels.tables import GoalConfig, RobotConfig, Table
+from rack.levels.tables import GoalConfig, RobotConfig
 
 LINGER_S = 0.5
 """Simulated time that a run continues after the task ends, to let the arm come to rest."""
@@ -72,40 +64,6 @@ that it writes."""
 
 LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
 """Tables without which there is no layout, and no level can judge its neighbours."""
-
-T = TypeVar("T", bound=Table)
-
-
-def load(
-    name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None
-) -> RackConfig:
-    """Return a config by name or path, with `key.sub=value` overrides, and add its levels to the
-    import path.
-
-    Faults of the script `faults`, by name or path, are appended to its own. Paths in an override
-    are relative to the current folder. Raises `ConfigError` with every mistake if a file, a setting
-    or a single table is wrong; `resolve` checks the rest.
-    """
-    return validated(assembled(name_or_path, overrides, faults))
-
-
-def loads(text: str) -> RackConfig:
-    """Return the config in TOML text, as `RackConfig.text` writes it, and add its levels to the
-    import path. Raises `ConfigError` as `load` does."""
-    return validated(Assembled(anchor(parse(text), CONFIGS)))
-
-
-def read_stored(text: str) -> RackConfig:
-    """Return the config that a rack or a run holds as text, which may be somebody else's.
-
-    Nothing that it names is imported, and its levels do not come into the import path. Raises
-    `ConfigError` with every mistake in a single table.
-    """
-    tables = anchor(parse(text), CONFIGS)
-    try:
-        return with_derived(RackConfig.model_validate(tables))
-    except ValidationError as error:
-        raise ConfigError(mistakes_of(error, RackConfig, tables)) from None
 
 
 def resolve(config: RackConfig) -> Resolved:
@@ -305,15 +263,15 @@ class Resolved:
         )
 
 
-def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> _Examined:
+def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
-    examined = _Examined(config, places(config), commands)
+    examined = Examination(config, places(config), commands)
     if mistakes := [*examined.mistakes, *further]:
         raise ConfigError(mistakes)
     return examined
 
 
-class _Examined:
+class Examination:
     """A config with the findings of its check.
 
     `broken` names tables that were removed for mistakes already known; nothing that depends on them
@@ -454,86 +412,9 @@ class _Examined:
         )
 
 
-def validated(found: Assembled) -> RackConfig:
-    """Return the config in tables, and add its levels to the import path.
-
-    Raises:
-        ConfigError: The config has mistakes, those of its tables included. All stages run on the
-            tables that are valid.
-    """
-    tables = found.tables
-    mistakes = list(found.mistakes)
-    broken = found.broken
-    try:
-        config = RackConfig.model_validate(tables)
-    except ValidationError as error:
-        broken |= _broken(error)
-        mistakes += [
-            mistake
-            for mistake in mistakes_of(error, RackConfig, tables)
-            # A setting or a file with mistakes may hold what is missing.
-            if not mistake.why.startswith("missing")
-            or (found.is_whole and table_of(mistake.place) not in found.broken)
-        ]
-    if not found.is_whole:
-        raise ConfigError(mistakes)
-    if broken:
-        config = _intact(tables, broken)
-    extend_path(config.python_path)
-    try:
-        config = with_derived(config)
-    except ConfigError as error:
-        broken |= {"robot"}
-        mistakes += error.mistakes
-        config = _intact(tables, broken)
-    if not mistakes:
-        return config
-    faults = _readable(tables, "fault", FaultConfig)
-    commands = _readable(tables, "command", CommandConfig)
-    raise ConfigError([*mistakes, *_Examined(config, faults, commands, broken).mistakes])
-
-
-def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
-    """Yield place and table for the valid tables of a list; the mistakes of the others are already
-    known."""
-    entries = tables.get(key)
-    if not isinstance(entries, list):
-        return
-    for at, entry in enumerate(entries):
-        with suppress(ValidationError):
-            yield f"{key}[{at}]", kind.model_validate(entry)
-
-
-def _broken(error: ValidationError) -> frozenset[str]:
-    """Return the tables with mistakes, as "robot", "board.servo" or "host.program"."""
-    places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
-    return frozenset(
-        ".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places
-    )
-
-
-def _without(tables: Tables, broken: frozenset[str]) -> Tables:
-    """Return tables without those with mistakes, as "robot" or "board.servo"."""
-    kept = {key: value for key, value in tables.items() if key not in broken}
-    for key in ("board", "host"):
-        own = kept.get(key, {})
-        kept[key] = {name: t for name, t in own.items() if f"{key}.{name}" not in broken}
-    return kept
-
-
 def _reduced(config: RackConfig, unsound: frozenset[str]) -> RackConfig:
     """Return a config without the boards and host boards that have mistakes."""
-    kept = _without({"board": config.board, "host": config.host}, unsound)
+    kept = without({"board": config.board, "host": config.host}, unsound)
     if "adapter" in unsound:
         kept["board"].pop(LAN, None)
     return config.model_copy(update=kept)
-
-
-def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
-    """Return a config made of the tables without mistakes."""
-    kept = _without({key: tables[key] for key in RackConfig.model_fields if key in tables}, broken)
-    # Stand-ins for required tables; nothing that depends on a broken table is checked.
-    spare = {"name": "unnamed", "clock": {"period_ms": 1}}
-    none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
-    config = RackConfig.model_validate({**spare, **kept, "board": kept["board"] or none})
-    return config if kept["board"] else config.model_copy(update={"board": {}})

@@ -151,3 +151,12 @@ def table_of(place: str) -> str:
     """Return the table of a place, as "board.servo" of "board.servo.rate_hz = 3"."""
     kind, *name = re.split(r"[.\[=]", place.replace("mailbox ", "board."))[:2]
     return f"{kind}.{name[0]}" if name and kind in ("board", "host") else kind
+
+
+def without(tables: Tables, broken: frozenset[str]) -> Tables:
+    """Return tables without those with mistakes, as "robot" or "board.servo"."""
+    kept = {key: value for key, value in tables.items() if key not in broken}
+    for key in ("board", "host"):
+        own = kept.get(key, {})
+        kept[key] = {name: t for name, t in own.items() if f"{key}.{name}" not in broken}
+    return kept

@@ -25,7 +25,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.config.commands import asked, request
-from rack.boards.config.resolved import classes, load, resolve
+from rack.boards.config.loader import load
+from rack.boards.config.resolved import classes, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.crate.clean import remove_dead, remove_own

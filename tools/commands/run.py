@@ -150,7 +150,7 @@ def run(
     assert config is not None
     read = assembled(config, overrides, faults)
     crate = _informed(context.obj, read.tables)
-    from rack.boards.config.resolved import validated
+    from rack.boards.config.loader import validated
     from rack.tools.live.display import display_for
     from rack.tools.live.folder import folder_of
     from rack.tools.live.launch import NO_TIME, Beginning, run_rack

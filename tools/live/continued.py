@@ -24,7 +24,8 @@ from rack.backplane.mailbox.history import chains
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.classes import extend_path
-from rack.boards.config.resolved import classes, load
+from rack.boards.config.loader import load
+from rack.boards.config.resolved import classes
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.rack import cell_of

@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config import load, loads, rack_timing, resolve, wire
 from rack.boards.config.files import Assembled
-from rack.boards.config.resolved import validated
+from rack.boards.config.loader import validated
 from rack.boards.config.timing import without_interrupts
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError

@@ -10,7 +10,8 @@ import pytest
 
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System
-from rack.boards.config.resolved import loads, wire
+from rack.boards.config.loader import loads
+from rack.boards.config.resolved import wire
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.lan.link import Arrived
 from tests.boards.lan.racks import rack_text

@@ -11,7 +11,8 @@ import pytest
 
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block
-from rack.boards.config.resolved import loads, wire
+from rack.boards.config.loader import loads
+from rack.boards.config.resolved import wire
 from rack.boards.lan.awaited import Why, word_of
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.keys import out_key, step_key

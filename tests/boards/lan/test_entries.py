@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
-from rack.boards.config.resolved import loads
+from rack.boards.config.loader import loads
 from rack.boards.lan.adapter import LanAdapter
 from rack.boards.lan.entries import Import
 from rack.boards.lan.envelope import Envelope, Sealer, kind_of

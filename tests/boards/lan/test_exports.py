@@ -5,7 +5,7 @@ from __future__ import annotations
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config.resolved import loads
+from rack.boards.config.loader import loads
 from rack.boards.lan.entries import Export
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid

@@ -15,7 +15,7 @@ import pytest
 
 from rack.boards.config import resolve
 from rack.boards.config.files import Assembled, assembled
-from rack.boards.config.resolved import validated
+from rack.boards.config.loader import validated
 from rack.boards.config.timing import rack_timing
 from rack.boards.errors import ConfigError
 from tests.snapshots import ROOT, Snapshots, digest

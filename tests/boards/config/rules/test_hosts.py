@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import resolve
-from rack.boards.config.resolved import loads
+from rack.boards.config.loader import loads
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.errors import ConfigError
 from tests.boards.host.test_board import HOSTED

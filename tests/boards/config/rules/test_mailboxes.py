@@ -6,7 +6,7 @@ import pytest
 
 from rack.boards.config import resolve
 from rack.boards.config.files import Assembled
-from rack.boards.config.resolved import validated
+from rack.boards.config.loader import validated
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError
 from tests.boards.host.test_board import HOSTED
