@@ -95,7 +95,7 @@ class FaultRules:
                 yield self._mistake("when", str(error.args[0]))
 
     def _of_kind(self, kind: Kind) -> Mistakes:
-        if kind.realtime and self.config.clock.mode == "lockstep":
+        if kind.realtime and self.config.is_lockstep:
             why = (
                 f"{kind.name} needs real time: in lockstep time waits for every task; run without"
                 " --lockstep"
@@ -268,12 +268,18 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
         # Two faults of one config must not draw the same random numbers.
         seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
     when = None if fault.when is None else condition(fault.when, layout)
+    # 0: until the end of the run, or it strikes once.
+    ticks = 0
+    if fault.cycles is not None:
+        ticks = fault.cycles * cycle_ticks(layout, fault.board)
+    elif fault.lasts is not None:
+        ticks = max(1, round(fault.lasts * 1e9 / layout.clock_ns))
     return Injection(
         kind=kind.number,
         task=task,
         mailbox=_mailbox(fault, kind, layout),
         tick=first_tick(fault, layout.clock_ns),
-        ticks=_ticks(fault, layout),
+        ticks=ticks,
         phase=int(fault.phase * PHASES),
         seed=seed,
         when=when,
@@ -294,10 +300,3 @@ def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
         if kind.where == "bus" and box.writer == fault.board and box.readers
     )
     return next(forged, -1)
-
-
-def _ticks(fault: FaultConfig, layout: Layout) -> int:
-    """Return the duration of a fault; 0: until the end of the run, or it strikes once."""
-    if fault.cycles is not None:
-        return fault.cycles * cycle_ticks(layout, fault.board)
-    return 0 if fault.lasts is None else max(1, round(fault.lasts * 1e9 / layout.clock_ns))

@@ -20,12 +20,12 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.segment import Segment
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.wiring import commandable, executors
+from rack.boards.config.wiring import executors, takes_commands
 from rack.boards.faults.kind import KINDS, Kind
 from rack.boards.faults.kinds import BUILT_IN
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor
-from rack.levels.operator import NAMED, Commands, Goal, Operation
+from rack.levels.operator import NAMED, Goal, Operation
 from rack.levels.tables import Table, keys_of, live_keys, read_params
 
 TYPES: Mapping[str, type] = {kind.__name__: kind for kind in (bool, int, float, str)}
@@ -134,17 +134,12 @@ CODE: Any = {
 
 def publish(config: RackConfig) -> PublishedRack:
     """Gather the facts about a rack's levels from their classes, which are imported."""
-    taken = commandable(config)
-    levels = {
-        name: _level(config, name, kind, taken.get(name, {}))
-        for name, kind in executors(config).items()
-    }
+    levels = {name: _level(config, name, kind) for name, kind in executors(config).items()}
     return PublishedRack(levels, tuple(kind for kind in KINDS if kind.name not in BUILT_IN))
 
 
-def _level(
-    config: RackConfig, board: str, kind: type[Executor], commands: Commands
-) -> PublishedLevel:
+def _level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
+    commands = kind.commands if takes_commands(kind) else {}
     given = config.board[board].params
     live: dict[str, PublishedParam] = {}
     if kind.params is not None and (keys := live_keys(kind.params)):

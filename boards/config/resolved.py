@@ -137,7 +137,7 @@ class Resolved:
             silent = max(silent, 8 * self.layout.task(writer).every)
         stop_tick = 0 if seconds is None else max(1, self._ticks(seconds))
         return ClockWiring(
-            lockstep=clock.mode == "lockstep",
+            lockstep=self.config.is_lockstep,
             period_ns=round(tick_ns / clock.speed),
             stop_tick=stop_tick,
             ends_run=ends_run,
@@ -146,7 +146,7 @@ class Resolved:
             history=self._ticks(AHEAD_S),
             core=self._clock_core,
             priority=clock.priority,
-            keeps_awake=clock.mode == "realtime" and clock.idle_cores == "awake",
+            keeps_awake=not self.config.is_lockstep and clock.idle_cores == "awake",
             reservation=reservation(self.config, self.config.timing.clock_ms, 1),
             restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
             on_loss={
@@ -160,7 +160,7 @@ class Resolved:
     def _clock_core(self) -> int:
         """Core of the clock: in lockstep that of the fastest board, since a switch is faster than
         waking up a core."""
-        if self.config.clock.mode == "lockstep":
+        if self.config.is_lockstep:
             # A polling board does not give its core away.
             boards = [t for t in self.layout.tasks if t.role == "executor" and t.wake != "poll"]
             if boards:
@@ -199,7 +199,7 @@ class Resolved:
                 found.append(
                     f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}'
                 )
-        if self.config.clock.mode == "lockstep":
+        if self.config.is_lockstep:
             why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
             found += [f"what {host.board} {why}" for host in self.hosts if host.is_external]
         return found
@@ -218,7 +218,7 @@ class Resolved:
 
     def _unlocked(self, segment: Segment) -> Iterator[str]:
         """Yield which tasks have not locked their memory, and the limit."""
-        if self.config.clock.mode == "lockstep":
+        if self.config.is_lockstep:
             return
         unlocked = {}
         for task in self.layout.tasks:
@@ -250,7 +250,7 @@ class Resolved:
                 yield f"{what}: {', '.join(sorted(names))}"
 
     def _refused(self, segment: Segment) -> str:
-        if self.config.clock.mode == "lockstep":
+        if self.config.is_lockstep:
             # It has no deadlines to miss.
             return ""
         refused = [
@@ -349,11 +349,7 @@ class Examination:
         # What is on the host side, a bus adapter exchanges by itself.
         of_host = self._wiring.of_host
         from_host = self._wiring.from_host
-        critical_priority = 0
-        if not is_executor and is_critical(self._config, layout, spec.board):
-            critical_priority = board.priority
-        # Planners are below all reservations.
-        busy_ms = board.busy_ms if is_executor else 0.0
+        is_locked = not is_executor and is_critical(self._config, layout, spec.board)
         return TaskWiring(
             task=ports.task,
             target=ports.place.target,
@@ -364,13 +360,16 @@ class Examination:
             },
             outputs={port: box for port, box in ports.writes.items() if box not in of_host},
             context=self._contexts[spec.board],
-            critical_priority=critical_priority,
+            critical_priority=board.priority if is_locked else 0,
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
             guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
             entries=None,
             exchange=exchanges(self._wiring, ports),
-            reservation=reservation(self._config, busy_ms, spec.every),
+            # Planners are below all reservations.
+            reservation=reservation(
+                self._config, board.busy_ms if is_executor else 0.0, spec.every
+            ),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
             ),

@@ -147,11 +147,6 @@ class BudgetConfig(Table):
     plan_within_ms: float | None = Field(None, gt=0, le=1e7)
     """longest acceptable time for a new plan, ms; an upper limit on within_cycles"""
 
-    @property
-    def cycle_ms(self) -> float:
-        """Of a cycle of the executor."""
-        return self.exchange_ms + self.read_ms + self.process_ms + self.write_ms
-
 
 class TransferConfig(Table):
     """`[board.<name>.transfer]`: minimum processor times of bus accesses, to emulate a slower
@@ -265,7 +260,8 @@ class BoardConfig(PlacedConfig):
     @property
     def busy_ms(self) -> float:
         """Processor time of a cycle of the executor by its budget, ms; 0: it has none."""
-        return 0.0 if self.budget is None else self.budget.cycle_ms
+        own = self.budget
+        return 0.0 if own is None else own.exchange_ms + own.read_ms + own.process_ms + own.write_ms
 
 
 LAN = "lan"
@@ -459,6 +455,11 @@ class RackConfig(Table):
     def changed(self) -> list[str]:
         """What has changed since the format of this config: a line, if it is not the newest."""
         return [CHANGED] if self.format < FORMAT else []
+
+    @property
+    def is_lockstep(self) -> bool:
+        """Whether each tick comes once every task is done, instead of by wall-clock time."""
+        return self.clock.mode == "lockstep"
 
     @property
     def clock_ns(self) -> int:

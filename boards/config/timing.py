@@ -44,7 +44,7 @@ def rack_timing(
     goal_ns = None if goal_ms is None else goal_ms * NS_PER_MS
     schedule = None if config.schedule is None else frames(config.schedule, config.clock_ns)
     return RackTiming(
-        is_lockstep=config.clock.mode == "lockstep",
+        is_lockstep=config.is_lockstep,
         speed=config.clock.speed,
         clock_ns=config.clock_ns,
         clock=TimedTask(
@@ -134,7 +134,7 @@ def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
 def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
     """Return what a board that computes so long in `every` ticks reserves of its processor, ms;
     None: it asks for a priority."""
-    if config.clock.scheduler == "fixed-priority" or config.clock.mode == "lockstep" or not busy_ms:
+    if config.clock.scheduler == "fixed-priority" or config.is_lockstep or not busy_ms:
         return None
     period_ns = every * config.tick_ns
     return Reservation(min(round(RESERVED * busy_ms * NS_PER_MS), period_ns), period_ns)

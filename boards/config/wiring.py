@@ -34,7 +34,7 @@ from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
 from rack.levels.level import Executor, MadePorts, Output, Planner, Program
-from rack.levels.operator import Commands, OperatorCommand
+from rack.levels.operator import OperatorCommand
 from rack.levels.ports import InputPort
 
 OWN_OPERATOR = "own.operator"
@@ -95,7 +95,7 @@ class TaskPorts:
         return () if source is None else mailboxes_of(self.reads.get(source.name, {}))
 
 
-def connect_ports(
+def _connected(
     config: RackConfig, place: TaskPlace, kind: LevelClass, types: Mapping[str, type[Message]]
 ) -> TaskPorts:
     """Return the ports of a task or host board.
@@ -195,7 +195,20 @@ class Wiring:
                 kinds[place] = _class(place)
             except LookupError as error:
                 self.missing[place] = str(error.args[0])
-        self.ports = _connected(config, kinds)
+        types: dict[str, type[Message]] = {}
+        while True:
+            self.ports = {
+                place: _connected(config, place, kind, types) for place, kind in kinds.items()
+            }
+            written = {
+                box: ports.outputs[port].message
+                for ports in self.ports.values()
+                for port, box in ports.writes.items()
+            }
+            # What one board makes another may pass on.
+            if len(written) == len(types):
+                return
+            types = written
 
     @property
     def broken_boards(self) -> list[str]:
@@ -233,7 +246,8 @@ class Wiring:
     @cached_property
     def operated(self) -> list[str]:
         """The operators' mailboxes."""
-        return [f"{board}.operator" for board in commandable(self.config)]
+        found = executors(self.config).items()
+        return [f"{board}.operator" for board, kind in found if takes_commands(kind)]
 
     @cached_property
     def types(self) -> dict[str, MessageType]:
@@ -334,23 +348,6 @@ class Wiring:
         return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
 
 
-def _connected(
-    config: RackConfig, kinds: Mapping[TaskPlace, LevelClass]
-) -> dict[TaskPlace, TaskPorts]:
-    types: dict[str, type[Message]] = {}
-    while True:
-        found = {place: connect_ports(config, place, kind, types) for place, kind in kinds.items()}
-        written = {
-            box: ports.outputs[port].message
-            for ports in found.values()
-            for port, box in ports.writes.items()
-        }
-        # What one board makes another may pass on.
-        if len(written) == len(types):
-            return found
-        types = written
-
-
 def executors(config: RackConfig) -> dict[str, type[Executor]]:
     """Return the class of each board's executor; those that are missing are reported elsewhere."""
     found: dict[str, type[Executor]] = {}
@@ -360,14 +357,9 @@ def executors(config: RackConfig) -> dict[str, type[Executor]]:
     return found
 
 
-def commandable(config: RackConfig) -> dict[str, Commands]:
-    """Return the commands that each level takes from an operator, by board; levels that take none
-    are omitted."""
-    return {
-        name: executor.commands
-        for name, executor in executors(config).items()
-        if any(port.source == OWN_OPERATOR for port in executor.inputs.values())
-    }
+def takes_commands(executor: type[Executor]) -> bool:
+    """Return True if a level reads the commands of an operator."""
+    return any(port.source == OWN_OPERATOR for port in executor.inputs.values())
 
 
 def is_taken(config: RackConfig) -> bool:

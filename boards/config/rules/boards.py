@@ -181,7 +181,7 @@ def clock(wiring: Wiring) -> Mistakes:
     clock = wiring.config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
         yield Mistake("clock.period_ms", clock.period_ms, "not a whole number of ns")
-    if clock.mode == "lockstep" and clock.speed != 1.0:
+    if config.is_lockstep and clock.speed != 1.0:
         yield Mistake(
             "clock.speed",
             clock.speed,

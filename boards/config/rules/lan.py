@@ -59,7 +59,7 @@ def _board(wiring: Wiring, table: LanConfig) -> Mistakes:
         for key, entries in (("export", table.exports), ("import", table.imports)):
             for port, entry in entries.items():
                 yield from _rate(f"{PLACE}.{key}.{port}", entry, cycle_ns)
-    if config.clock.mode == "realtime":
+    if not config.is_lockstep:
         yield from _priority(config, table)
         if config.protocol.strict:
             why = (
