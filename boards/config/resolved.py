@@ -126,46 +126,36 @@ class Resolved:
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task
         ends."""
-        clock = self.config.clock
-        tick_ns = self.config.clock_ns
+        config = self.config
+        clock = config.clock
         ends_run = self.ends_run
-        # The demand on the arm while a board is lost; none if the level below holds.
-        demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         silent = self._ticks(SILENT_S)
         if ends_run is not None:
             writer = self.layout.mailbox(ends_run).writer
             silent = max(silent, 8 * self.layout.task(writer).every)
-        stop_tick = 0 if seconds is None else max(1, self._ticks(seconds))
+        executors = [task for task in self.layout.tasks if task.role == "executor"]
+        core = obtained_core(clock.core)
+        # In lockstep the core of the fastest board, since a switch is faster than waking up a core.
+        # A polling board does not give its core away.
+        if config.is_lockstep and (giving := [task for task in executors if task.wake != "poll"]):
+            core = min(giving, key=lambda task: (task.every, task.slot)).core
+        # The demand on the arm while a board is lost; none if the level below holds.
+        demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         return ClockWiring(
-            lockstep=self.config.is_lockstep,
-            period_ns=round(tick_ns / clock.speed),
-            stop_tick=stop_tick,
+            lockstep=config.is_lockstep,
+            period_ns=config.tick_ns,
+            stop_tick=0 if seconds is None else max(1, self._ticks(seconds)),
             ends_run=ends_run,
             linger=self._ticks(LINGER_S),
             silent=silent,
             history=self._ticks(AHEAD_S),
-            core=self._clock_core,
+            core=core,
             priority=clock.priority,
-            keeps_awake=not self.config.is_lockstep and clock.idle_cores == "awake",
-            reservation=reservation(self.config, self.config.timing.clock_ms, 1),
-            restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
-            on_loss={
-                task.name: demands[self.config.board[task.board].on_loss]
-                for task in self.layout.tasks
-                if task.role == "executor"
-            },
+            keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
+            reservation=reservation(config, config.timing.clock_ms, 1),
+            restart_ticks=max(1, self._ticks(config.supervision.lockstep_restart_s)),
+            on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
-
-    @property
-    def _clock_core(self) -> int:
-        """Core of the clock: in lockstep that of the fastest board, since a switch is faster than
-        waking up a core."""
-        if self.config.is_lockstep:
-            # A polling board does not give its core away.
-            boards = [t for t in self.layout.tasks if t.role == "executor" and t.wake != "poll"]
-            if boards:
-                return min(boards, key=lambda task: (task.every, task.slot)).core
-        return obtained_core(self.config.clock.core)
 
     def _ticks(self, seconds: float) -> int:
         return round(seconds * 1e9 / self.config.clock_ns)
