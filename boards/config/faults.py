@@ -135,28 +135,27 @@ class FaultRules:
                 yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
 
     def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
-        """Check that the task can be struck by such a fault."""
+        if why := self._why_not_board(kind, tasks):
+            yield self._mistake("board", why)
+        elif why := self._why_not_mailbox(kind):
+            yield self._mistake("mailbox", why)
+
+    def _why_not_board(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
+        """Return why the task cannot be struck by such a fault; empty if it can."""
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
-            yield self._mistake(
-                "board",
-                "external: the rack has no process to strike; permitted: boards that it starts",
-            )
-        elif board == CLOCK:
-            if "clock" not in kind.tasks:
-                kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
-                yield self._mistake(
-                    "board", f"{kind.name} cannot strike the clock; kinds that can: {kinds}"
-                )
-        elif kind.tasks == ("clock",):
-            yield self._mistake(
-                "board", f'{kind.name} strikes only the clock; permitted: "{CLOCK}"'
-            )
-        elif tasks[board] not in kind.tasks:
+            return "external: the rack has no process to strike; permitted: boards that it starts"
+        if board == CLOCK:
+            kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
+            why = f"{kind.name} cannot strike the clock; kinds that can: {kinds}"
+            return "" if "clock" in kind.tasks else why
+        if kind.tasks == ("clock",):
+            return f'{kind.name} strikes only the clock; permitted: "{CLOCK}"'
+        if tasks[board] not in kind.tasks:
             role = kind.tasks[0]
             fitting = _listed(name for name, other in tasks.items() if other == role)
-            yield self._mistake("board", f"{kind.name} strikes only {role}s; {role}s: {fitting}")
-        elif kind.where == "arm":
+            return f"{kind.name} strikes only {role}s; {role}s: {fitting}"
+        if kind.where == "arm":
             able = [
                 name
                 for name in self.config.board
@@ -164,55 +163,42 @@ class FaultRules:
                 if name not in self.levels or kind.name in self.levels[name].struck_by
             ]
             if board not in able:
-                yield self._mistake(
-                    "board",
-                    f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}",
-                )
-        elif kind.takes_mailbox and (layout := self._layout_of(board)) is not None:
-            yield from self._mailboxes(kind, layout)
+                return f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}"
+        return ""
 
     def _layout_of(self, place: str) -> Layout | None:
         """Return the layout; None without one, or if it lacks the board of a task or a mailbox."""
         is_known = place.partition(".")[0].strip() not in self.unspecified
         return self.layout if is_known else None
 
-    def _mailboxes(self, kind: Kind, layout: Layout) -> Mistakes:
+    def _why_not_mailbox(self, kind: Kind) -> str:
+        """Return why such a fault cannot strike the mailboxes of the task; empty if it can."""
+        board = self.fault.board
+        wanted = self.fault.mailbox
+        layout = self._layout_of(board)
+        if layout is None or board == CLOCK or not kind.takes_mailbox:
+            return ""
         # The position of a queue's reader is not written through a port.
         written = {
             m.name: m
             for m in layout.mailboxes
-            if m.writer == self.fault.board and (kind.where == "bus" or not is_position(m))
+            if m.writer == board and (kind.where == "bus" or not is_position(m))
         }
-        wanted = self.fault.mailbox
         struck = [m for m in written.values() if wanted in (None, m.name)]
-        if wanted is not None and wanted not in written:
-            yield self._mistake(
-                "mailbox", f"'{self.fault.board}' does not write it; it writes: {_listed(written)}"
-            )
-        elif kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
-            why = (
-                f"'{struck[0].name}' is a queue, which {kind.name} does not strike:"
-                f" {kind.not_queued}"
-            )
-            yield self._mistake("mailbox", why)
-        elif (
-            kind.where == "bus"
-            and wanted is None
-            and not any(m.readers for m in written.values())
-            # Readers may be among the boards that the layout lacks.
-            and not self.unspecified
-        ):
-            yield self._mistake(
-                "mailbox", f"missing; no mailbox of '{self.fault.board}' has a reader"
-            )
-        elif kind.where == "lock":
-            locked = [name for name, mailbox in written.items() if mailbox.protocol == "lock"]
-            if not locked or wanted not in (None, *locked):
-                why = (
-                    f"{kind.name} needs protocol lock; mailboxes of '{self.fault.board}' that use"
-                    f" it: {_listed(locked)}"
-                )
-                yield self._mistake("mailbox", why)
+        if wanted is not None and not struck:
+            return f"'{board}' does not write it; it writes: {_listed(written)}"
+        if kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
+            why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
+            return f"{why}: {kind.not_queued}"
+        # Readers may be among the boards that the layout lacks.
+        if kind.where == "bus" and wanted is None and not self.unspecified:
+            has_reader = any(m.readers for m in struck)
+            return "" if has_reader else f"missing; no mailbox of '{board}' has a reader"
+        locked = [m.name for m in written.values() if m.protocol == "lock"]
+        if kind.where == "lock" and (not locked or wanted not in (None, *locked)):
+            why = f"{kind.name} needs protocol lock; mailboxes of '{board}' that use it"
+            return f"{why}: {_listed(locked)}"
+        return ""
 
     def _without(self, keys: Iterable[str], why: str) -> Mistakes:
         """Check that none of these keys is given."""

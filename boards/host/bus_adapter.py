@@ -145,11 +145,10 @@ class BusAdapter(Adapter):
 
     def process(self, tick: int) -> None:
         """Exchange the entries that are due; then, in lockstep, let programs run."""
-        if self._before:
-            for port, message in self._before.items():
-                out = self.ports[port]
-                (out.message if isinstance(out, Sender) else out).raw[:] = message
-            self._before.clear()
+        for port, message in self._before.items():
+            out = self.ports[port]
+            (out.message if isinstance(out, Sender) else out).raw[:] = message
+        self._before.clear()
         cycle = (tick - self.context.phase) // self.context.every
         for table, entry in self._entries:
             if table.is_due(cycle):

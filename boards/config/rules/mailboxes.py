@@ -16,20 +16,17 @@ PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 
 def ports(wiring: Wiring) -> Mistakes:
     """Check that each class is there, and that its inputs are connected as it declares."""
-    config = wiring.config
-    for place in (*config.tasks(), *config.hosts()):
+    for place, why in wiring.missing.items():
+        yield Mistake(f"{place.table}.{place.class_key}", place.target, why)
+    for place, ports in wiring.ports.items():
         table = place.table
-        if place in wiring.missing:
-            yield Mistake(f"{table}.{place.class_key}", place.target, wiring.missing[place])
-            continue
-        ports = wiring.ports[place]
         role = place.role
         inputs = ", ".join(ports.kind.inputs) or "none"
         for output, told in ports.outputs.items():
             if told.rests_on is not None and told.rests_on.name not in ports.inputs:
                 why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
                 yield Mistake(f"{table}.{role}", place.target, why)
-        for port, given in config.rewired(place).items():
+        for port, given in wiring.config.rewired(place).items():
             if port not in ports.kind.inputs:
                 why = f"the {role} has no such port; ports: {inputs}"
                 yield Mistake(f"{table}.{place.reads_key}.{port}", given, why)
