@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, Self, TypeVar
+from dataclasses import dataclass
+from typing import Any, Self
 
-import numpy as np
 from pydantic import Field as Key
 from pydantic import ValidationError, model_validator
 
@@ -32,18 +32,6 @@ def counter(doc: str) -> Any:
     return field("u4", unit="1", doc=doc)
 
 
-C = TypeVar("C", bound=Message)
-
-
-def zero_counts(group: type[C]) -> C:
-    """Return the counts of a group of a status, all 0.
-
-    Its integers are wider than those of the status, so that none overflows: see `fill_counts`.
-    """
-    fields = group.message_type.fields
-    return group(np.dtype([(f.name, "f8" if f.python is float else "i8") for f in fields]))
-
-
 class AdapterEntry(Message, version=1):
     """One entry, in the status of its bridge."""
 
@@ -56,6 +44,9 @@ class AdapterEntry(Message, version=1):
         unit="tick", doc="tick at which the newest message reached the other side; -1: none yet"
     )
     age: int = field(unit="tick", doc="time since that message was written; -1: none yet")
+
+
+_COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
 
 
 class EntryConfig(Table):
@@ -111,34 +102,36 @@ class AdapterParams(Table):
             return {}
 
 
+@dataclass
 class EntryCount:
-    """The counts of one entry.
+    """The counts of one entry: the fields of `AdapterEntry`. `written`: tick at which the newest
+    message was written."""
 
-    Attributes:
-        counts: What the status shows.
-        written: Tick at which the newest message was written.
-    """
-
-    def __init__(self) -> None:
-        self.counts = zero_counts(AdapterEntry)
-        self.counts.arrived = NEVER
-        self.written = NEVER
+    passed: int = 0
+    refused: int = 0
+    superseded: int = 0
+    full: int = 0
+    waiting: int = 0
+    arrived: int = NEVER
+    written: int = NEVER
 
     def resume(self, record: Any, tick: int) -> None:
         """Continue with the counts in the status of an earlier cycle."""
-        self.counts.record[...] = record
-        self.written = NEVER if self.counts.age == NEVER else tick - self.counts.age
+        age = int(record["age"])
+        for name in _COUNTED:
+            setattr(self, name, int(record[name]))
+        self.written = NEVER if age == NEVER else tick - age
 
     def passes(self, tick: int, written: int) -> None:
         """Count a message that reaches the other side at `tick`."""
-        self.counts.passed += 1
-        self.counts.arrived = tick
+        self.passed += 1
+        self.arrived = tick
         self.written = written
 
     def fill(self, record: Any, tick: int) -> None:
         """Write the counts into the status of a cycle."""
-        self.counts.age = NEVER if self.written == NEVER else tick - self.written
-        fill_counts(record, self.counts.record.item())
+        age = NEVER if self.written == NEVER else tick - self.written
+        fill_counts(record, (*(getattr(self, name) for name in _COUNTED), age))
 
 
 class Inward:
@@ -150,8 +143,8 @@ class Inward:
         self._port = port
         self._table = table
         self._count = count
-        self._ring.refused = count.counts.refused
-        self._ring.superseded = count.counts.superseded
+        self._ring.refused = count.refused
+        self._ring.superseded = count.superseded
         self._writer = segment.block(self._ring.spec.writer)
 
     def exchange(
@@ -172,11 +165,10 @@ class Inward:
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
             count.passes(tick, ring.written)
-        counts = count.counts
-        counts.refused = ring.refused
-        counts.superseded = ring.superseded
-        counts.full = ring.full
-        counts.waiting = ring.waiting
+        count.refused = ring.refused
+        count.superseded = ring.superseded
+        count.full = ring.full
+        count.waiting = ring.waiting
 
 
 class Outward:

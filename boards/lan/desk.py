@@ -17,12 +17,11 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.message import fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.host.entries import zero_counts
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
 from rack.boards.lan.link import LanLink, Question
-from rack.boards.lan.status import LanDesk
+from rack.boards.lan.status import LanDesk, zero_counts
 from rack.levels.level import Finding
 
 ESTOP_KIND = xxh3(b"rack estop 1")

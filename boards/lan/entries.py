@@ -11,7 +11,7 @@ from rack.backplane.mailbox.slots import Slots, message_dtype
 from rack.backplane.message import AnyMessage, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, switch
-from rack.boards.host.entries import NEVER, zero_counts
+from rack.boards.host.entries import NEVER
 from rack.boards.lan.config import ExportConfig, ImportConfig
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
@@ -19,7 +19,7 @@ from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import Arrived, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import NONE, PeerRack
-from rack.boards.lan.status import LanExport, LanImport
+from rack.boards.lan.status import LanExport, LanImport, zero_counts
 from rack.levels.ports import Sender
 
 LARGEST = 1 << 62

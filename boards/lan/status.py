@@ -4,9 +4,23 @@ else that came over the network."""
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TypeVar
+
+import numpy as np
 
 from rack.backplane.message import Message, Status, field, make_message
 from rack.boards.host.entries import counter
+
+C = TypeVar("C", bound=Message)
+
+
+def zero_counts(group: type[C]) -> C:
+    """Return the counts of a group of a status, all 0.
+
+    Its integers are wider than those of the status, so that none overflows: see `fill_counts`.
+    """
+    fields = group.message_type.fields
+    return group(np.dtype([(f.name, "f8" if f.python is float else "i8") for f in fields]))
 
 
 class LanExport(Message, version=1):

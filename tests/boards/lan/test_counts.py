@@ -5,10 +5,9 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rack.boards.host.entries import zero_counts
 from rack.boards.lan.entries import WINDOW, MessageOrder
 from rack.boards.lan.envelope import Envelope
-from rack.boards.lan.status import LanImport
+from rack.boards.lan.status import LanImport, zero_counts
 
 
 def head(number: int, launch: int = 7, serial: int = 0) -> Envelope:
