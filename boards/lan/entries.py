@@ -7,7 +7,7 @@ from typing import Any
 
 from rack.backplane.mailbox.host_ring import is_proper
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.mailbox.slots import Slots, message_dtype
+from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import AnyMessage, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, switch
@@ -166,7 +166,7 @@ class Import:
         self._max_age = spec.max_age
         self._delay = spec.delay
         self._peer = peer
-        self._box = Slots(segment, spec).box
+        self._box = segment.box(own)
         self._word = int(Box.KEPT if peer.goes_on else Box.VOID)
         self._is_away = bool(self._box[self._word] & 1)
         self._losses = peer.losses

@@ -32,7 +32,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 from zenoh.ext import Int64, ZDeserializeError, z_deserialize, z_serialize
 
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Run, System
+from rack.backplane.words import Block, System
 from rack.boards.lan.awaited import GIVE_UP_S, Why, word_of
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle, step_key
@@ -148,7 +148,6 @@ class Barrier:
     ) -> None:
         """Step with `racks`, except those that an adapter before this one has `lost`."""
         self._segment = segment
-        self._words = segment.words
         self._block = segment.block(board)
         self._partners = {rack: Partner(rack, place) for place, rack in enumerate(racks)}
         for rack in lost:
@@ -275,9 +274,7 @@ class Barrier:
 
     @property
     def _is_over(self) -> bool:
-        words = self._words
-        is_over = words[System.STOP_REQUEST] or words[System.STATE] == Run.STOPPED
-        return bool(is_over) or not self._segment.launcher_is_alive
+        return bool(self._segment.words[System.STOP_REQUEST]) or self._segment.run_is_over
 
     def _note(self, sample: zenoh.Sample) -> None:
         """Note what has come: a step of another rack, or the sign that it is there or gone."""
