@@ -22,14 +22,8 @@ from rack.backplane.exports import on_first_use
 if TYPE_CHECKING:
     from rack.boards.config.files import CONFIGS, FAULTS, names
     from rack.boards.config.layout import shared_out
-    from rack.boards.config.resolved import (
-        Resolved,
-        load,
-        loads,
-        read_stored,
-        resolve,
-        wire,
-    )
+    from rack.boards.config.loader import load, loads, read_stored
+    from rack.boards.config.resolved import Resolved, resolve, wire
     from rack.boards.config.schema import RackConfig
     from rack.boards.config.timing import budgets, rack_timing
 
@@ -51,14 +45,8 @@ __all__ = [
 _PLACES = {
     "rack.boards.config.files": ("CONFIGS", "FAULTS", "names"),
     "rack.boards.config.layout": ("shared_out",),
-    "rack.boards.config.resolved": (
-        "Resolved",
-        "load",
-        "loads",
-        "read_stored",
-        "resolve",
-        "wire",
-    ),
+    "rack.boards.config.loader": ("load", "loads", "read_stored"),
+    "rack.boards.config.resolved": ("Resolved", "resolve", "wire"),
     "rack.boards.config.schema": ("RackConfig",),
     "rack.boards.config.timing": ("budgets", "rack_timing"),
 }

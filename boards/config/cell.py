@@ -9,25 +9,9 @@ from typing import TYPE_CHECKING
 
 from rack.backplane.checked import pick
 from rack.boards.config.schema import RackConfig
-from rack.boards.errors import ConfigError, Mistake
-from rack.levels.errors import RobotError
 
 if TYPE_CHECKING:
     from rack.levels.robot.cell import Cell
-
-
-def with_derived(config: RackConfig) -> RackConfig:
-    """Return a config whose arm has joints, tool and home, its model's where it says nothing.
-    Raises `ConfigError`."""
-    robot = config.robot
-    if robot is None or (robot.joints and robot.tool and robot.home):
-        return config
-    from rack.levels.robot.lookup import derived
-
-    try:
-        return config.model_copy(update={"robot": derived(robot)})
-    except RobotError as error:
-        raise ConfigError([Mistake("robot", None, str(error))]) from None
 
 
 def cell_sizes(config: RackConfig) -> dict[str, int]:

@@ -1,24 +1,37 @@
-"""Operator commands: made into requests for the operator table, once their rules are kept."""
+"""Operator commands: what a level takes, with which goal, and their requests in the operator
+table."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
+from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.operator_table import Request
-from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.cell import built_cell
+from rack.boards.config.mistakes import at_key, mistakes_of
 from rack.boards.config.published import Levels, PublishedLevel
-from rack.boards.config.rules.commands import command_mistakes
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.config.timing import first_tick
-from rack.boards.errors import ConfigError
+from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.levels.algebra import norm
-from rack.levels.operator import Goal, OperatorCommand, goal_names
+from rack.levels.errors import LevelError, RobotError
+from rack.levels.operator import (
+    NAMED,
+    Commands,
+    Goal,
+    Operation,
+    OperatorCommand,
+    goal_names,
+    listed,
+)
+from rack.levels.tables import read_setting
 
 DOWN = (0.0, 0.0, -1.0)
 
@@ -71,3 +84,154 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
         message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
     message.name = command.name or ""
     return Request(layout.index(name), bytes(message.raw), first_tick(command, layout.clock_ns))
+
+
+def command_mistakes(
+    commands: Iterable[tuple[str, CommandConfig]],
+    config: RackConfig,
+    levels: Levels,
+    broken: Collection[str] = (),
+) -> list[Mistake]:
+    """Check commands.
+
+    Args:
+        commands: The commands, with their places in a config. A live command has an empty place.
+        config: The config of the rack.
+        levels: Its levels.
+        broken: Boards with known mistakes. Commands for them are not checked.
+
+    Returns:
+        Every mistake.
+    """
+    given = list(commands)
+    found = [
+        mistake
+        for place, command in given
+        if command.level not in broken
+        for mistake in _mistakes(place, command, config, levels)
+    ]
+    if len(given) > OPERATOR_ENTRIES:
+        found.append(
+            Mistake(
+                "command", len(given), f"too many pending commands; permitted: {OPERATOR_ENTRIES}"
+            )
+        )
+    return found
+
+
+def _mistakes(
+    place: str, command: CommandConfig, config: RackConfig, published: Levels
+) -> Mistakes:
+    at = partial(at_key, place)
+    if command.tick is not None and command.at is not None:
+        yield Mistake(at("at"), command.at, "tick is also given; permitted: one of tick, at")
+    levels = {name: level for name, level in published.items() if level.commands}
+    if command.level not in levels:
+        why = f"no level of this name takes commands; levels that do: {', '.join(levels) or 'none'}"
+        yield Mistake(at("level"), command.level, why)
+        return
+    level = levels[command.level]
+    known = level.commands
+    if command.said not in known:
+        why = f"'{command.level}' does not take {command.what}; it takes: {listed(known)}"
+        yield Mistake(at("what"), command.what, why)
+        return
+    yield from _goal(at, command, known)
+    if command.said is Operation.SET:
+        yield from _setting(place, command, level)
+    else:
+        yield from _name(at("name"), command, level)
+    if command.joints is not None and Goal.JOINTS in known[command.said]:
+        yield from _joints(at("joints"), command.joints, config)
+    for key in ("quaternion", "direction"):
+        if getattr(command, key) is not None and not any(getattr(command, key)):
+            yield Mistake(
+                at(key), list(getattr(command, key)), "all zero; its length must not be zero"
+            )
+
+
+def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:
+    """Check that there is one goal, of a form that the level accepts."""
+    wanted = known[command.said]
+    given = command.goals
+    what = f"{command.what} of '{command.level}'"
+    if not wanted:
+        for goal in given:
+            yield Mistake(at(_key(goal)), None, f"{command.what} takes no goal; remove it")
+    elif len(given) != 1:
+        why = "missing" if not given else f"several given: {goal_names(given)}"
+        yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(wanted)}")
+    elif given[0] not in wanted:
+        yield Mistake(
+            at(_key(given[0])), None, f"not a goal for {what}; permitted: {goal_names(wanted)}"
+        )
+    elif command.position is None and given[0] in (Goal.POSE, Goal.DIRECTION):
+        yield Mistake(at("position"), None, "missing; tool position, m")
+    elif command.quaternion is not None and command.direction is not None:
+        why = "quaternion is also given; permitted: one of quaternion, direction"
+        yield Mistake(at("direction"), list(command.direction), why)
+
+
+def _key(goal: Goal) -> str:
+    keys = {Goal.POSE: "quaternion", Goal.DIRECTION: "position", Goal.OFF: "on"}
+    return keys.get(goal, goal.name.lower())
+
+
+def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
+    """Check that an operation that gives a name, and no other, gives one that its level knows."""
+    if command.said not in NAMED:
+        if command.name is not None:
+            yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
+        return
+    known = level.wording.get(command.said)
+    # Mistakes that keep the names unknown are reported elsewhere.
+    if known is not None and command.name not in known:
+        yield Mistake(
+            place,
+            command.name,
+            f"{command.what} of '{command.level}' knows: {', '.join(known) or 'none'}",
+        )
+
+
+def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
+    """Check that a command sets a live parameter of its level to a valid value."""
+    name = at_key(place, "name")
+    try:
+        key, value = read_setting(command.name or "")
+    except LevelError as error:
+        yield Mistake(name, command.name, str(error))
+        return
+    params = name if place else f"board.{command.level}.params"
+    if not level.live or (key in level.keys and key not in level.live):
+        why = f"read at the launch alone; live: {', '.join(level.live) or 'none'}"
+        yield Mistake(f"{params}.{key}", value, why)
+        return
+    table = level.table
+    given = {key: value}
+    try:
+        table.model_validate(given)
+    except ValidationError as error:
+        yield from mistakes_of(error, table, given, params)
+
+
+def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistakes:
+    robot = config.robot
+    if robot is None:
+        yield Mistake(place, list(joints), "the rack has no arm")
+        return
+    if len(joints) != len(robot.joints):
+        why = (
+            f"{len(joints)} values; permitted: {len(robot.joints)}, one per joint:"
+            f" {', '.join(robot.joints)}"
+        )
+        yield Mistake(place, list(joints), why)
+        return
+    try:
+        ranges = built_cell(config).limits.position
+    except RobotError:
+        return  # reported elsewhere
+    for name, value, (low, high) in zip(robot.joints, joints, ranges, strict=True):
+        if not low <= value <= high:
+            yield Mistake(
+                place, value, f"out of range for joint '{name}'; permitted: {low:g} to {high:g} rad"
+            )

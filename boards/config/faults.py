@@ -1,23 +1,231 @@
-"""Fault tables made into entries of the fault table, once their rules are kept."""
+"""Faults: whether their kind, their target and their time fit each other and the rack, and their
+entries in the fault table."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from zlib import crc32
 
-from rack.backplane.address_map import CLOCK
+from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
 from rack.backplane.fault_table import Injection
-from rack.backplane.layout import Layout
+from rack.backplane.layout import Layout, Role
+from rack.backplane.mailbox.queue import is_position
+from rack.boards.config.mistakes import at_key
 from rack.boards.config.published import Levels
-from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import first_tick
-from rack.boards.errors import ConfigError
+from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.clock_board import PHASES
 from rack.boards.faults.config import FaultConfig, condition
-from rack.boards.faults.kind import KINDS, Kind
+from rack.boards.faults.kind import KINDS, Kind, Parameter
+from rack.levels.tables import RobotConfig
 
 SEEDS = 2**31
+
+
+def fault_mistakes(
+    faults: Iterable[tuple[str, FaultConfig]],
+    config: RackConfig,
+    levels: Levels,
+    layout: Layout | None = None,
+    unspecified: Collection[str] = (),
+) -> list[Mistake]:
+    """Check faults.
+
+    Args:
+        faults: The faults, with their places in a config. A live fault has an empty place.
+        config: The config of the rack.
+        levels: Its levels.
+        layout: Its layout. Without it the rules that need one are skipped.
+        unspecified: Boards with known mistakes.
+
+    Returns:
+        Every mistake.
+    """
+    rules = [
+        FaultRules(place, fault, config, levels, layout, unspecified) for place, fault in faults
+    ]
+    found = [mistake for rule in rules for mistake in rule.mistakes()]
+    if len(rules) > FAULT_ENTRIES:
+        found.append(
+            Mistake("fault", len(rules), f"too many faults for one run; permitted: {FAULT_ENTRIES}")
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class FaultRules:
+    """The rules for one fault at `place`: see `fault_mistakes`."""
+
+    place: str
+    fault: FaultConfig
+    config: RackConfig
+    levels: Levels
+    layout: Layout | None
+    unspecified: Collection[str]
+
+    def mistakes(self) -> Mistakes:
+        """Yield every mistake in the fault."""
+        # Check that its begin and its end are each given in one way.
+        for keys in (("tick", "at", "when"), ("for", "cycles")):
+            given = [key for key in keys if self._value(key) is not None]
+            for key in given[1:]:
+                yield self._mistake(
+                    key, f"{given[0]} is also given; permitted: one of {', '.join(keys)}"
+                )
+        fault = self.fault
+        places = (*self.config.tasks(), *self.config.hosts())
+        tasks: dict[str, Role] = {place.name: place.role for place in places}
+        kind = KINDS.names.get(fault.kind)
+        if kind is None:
+            yield self._mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
+        else:
+            yield from self._of_kind(kind)
+        if fault.board != CLOCK and fault.board not in tasks:
+            if fault.board.partition(".")[0] not in self.unspecified:
+                yield self._mistake("board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}")
+        elif kind is not None:
+            yield from self._target(kind, tasks)
+        if fault.when is not None and (layout := self._layout_of(fault.when)) is not None:
+            try:
+                condition(fault.when, layout)
+            except LookupError as error:
+                yield self._mistake("when", str(error.args[0]))
+
+    def _of_kind(self, kind: Kind) -> Mistakes:
+        if kind.realtime and self.config.is_lockstep:
+            why = (
+                f"{kind.name} needs real time: in lockstep time waits for every task; run without"
+                " --lockstep"
+            )
+            yield self._mistake("kind", why)
+        if kind.once:
+            yield from self._without(
+                ("for", "cycles"), f"{kind.name} strikes once and has no duration; remove it"
+            )
+        if kind.where == "start":
+            yield from self._without(
+                ("tick", "at", "when"), f"{kind.name} strikes as the board starts; remove it"
+            )
+        if self.fault.phase and not kind.within_tick:
+            takers = _listed(other.name for other in KINDS if other.within_tick)
+            yield self._mistake(
+                "phase", f"{kind.name} cannot strike within a tick; kinds that can: {takers}"
+            )
+        if self.fault.mailbox is not None and not kind.takes_mailbox:
+            takers = _listed(other.name for other in KINDS if other.takes_mailbox)
+            yield self._mistake(
+                "mailbox", f"{kind.name} does not affect mailboxes; kinds that do: {takers}"
+            )
+        yield from self._parameters(kind)
+
+    def _parameters(self, kind: Kind) -> Mistakes:
+        known = {parameter.name: parameter for parameter in kind.parameters}
+        for name, value in self.fault.parameters.items():
+            why = f"{kind.name} has no such parameter; parameters: {_listed(known)}"
+            if name in known:
+                why = _range(known[name], value, self.config.robot)
+            if why:
+                plain = int(value) if value.is_integer() else value
+                yield Mistake(at_key(self.place, name), plain, why)
+        for parameter in kind.parameters:
+            if parameter.default is None and parameter.name not in self.fault.parameters:
+                yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
+
+    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
+        if why := self._why_not_board(kind, tasks):
+            yield self._mistake("board", why)
+        elif why := self._why_not_mailbox(kind):
+            yield self._mistake("mailbox", why)
+
+    def _why_not_board(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
+        """Return why the task cannot be struck by such a fault; empty if it can."""
+        board = self.fault.board
+        if board in self.config.host and self.config.host[board].external:
+            return "external: the rack has no process to strike; permitted: boards that it starts"
+        if board == CLOCK:
+            kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
+            why = f"{kind.name} cannot strike the clock; kinds that can: {kinds}"
+            return "" if "clock" in kind.tasks else why
+        if kind.tasks == ("clock",):
+            return f'{kind.name} strikes only the clock; permitted: "{CLOCK}"'
+        if tasks[board] not in kind.tasks:
+            role = kind.tasks[0]
+            fitting = _listed(name for name, other in tasks.items() if other == role)
+            return f"{kind.name} strikes only {role}s; {role}s: {fitting}"
+        if kind.where == "arm":
+            able = [
+                name
+                for name in self.config.board
+                # A level whose class is missing may be struck by any kind.
+                if name not in self.levels or kind.name in self.levels[name].struck_by
+            ]
+            if board not in able:
+                return f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}"
+        return ""
+
+    def _layout_of(self, place: str) -> Layout | None:
+        """Return the layout; None without one, or if it lacks the board of a task or a mailbox."""
+        is_known = place.partition(".")[0].strip() not in self.unspecified
+        return self.layout if is_known else None
+
+    def _why_not_mailbox(self, kind: Kind) -> str:
+        """Return why such a fault cannot strike the mailboxes of the task; empty if it can."""
+        board = self.fault.board
+        wanted = self.fault.mailbox
+        layout = self._layout_of(board)
+        if layout is None or board == CLOCK or not kind.takes_mailbox:
+            return ""
+        # The position of a queue's reader is not written through a port.
+        written = {
+            m.name: m
+            for m in layout.mailboxes
+            if m.writer == board and (kind.where == "bus" or not is_position(m))
+        }
+        struck = [m for m in written.values() if wanted in (None, m.name)]
+        if wanted is not None and not struck:
+            return f"'{board}' does not write it; it writes: {_listed(written)}"
+        if kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
+            why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
+            return f"{why}: {kind.not_queued}"
+        # Readers may be among the boards that the layout lacks.
+        if kind.where == "bus" and wanted is None and not self.unspecified:
+            has_reader = any(m.readers for m in struck)
+            return "" if has_reader else f"missing; no mailbox of '{board}' has a reader"
+        locked = [m.name for m in written.values() if m.protocol == "lock"]
+        if kind.where == "lock" and (not locked or wanted not in (None, *locked)):
+            why = f"{kind.name} needs protocol lock; mailboxes of '{board}' that use it"
+            return f"{why}: {_listed(locked)}"
+        return ""
+
+    def _without(self, keys: Iterable[str], why: str) -> Mistakes:
+        """Check that none of these keys is given."""
+        for key in keys:
+            if self._value(key) is not None:
+                yield self._mistake(key, why)
+
+    def _value(self, key: str) -> object:
+        return self.fault.lasts if key == "for" else getattr(self.fault, key)
+
+    def _mistake(self, key: str, why: str) -> Mistake:
+        return Mistake(at_key(self.place, key), self._value(key), why)
+
+
+def _range(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
+    """Return why a value is not permitted for the parameter; empty if it is."""
+    most = parameter.most
+    if parameter.name == "joint" and robot is not None:
+        most = len(robot.joints) - 1
+    if not parameter.least <= value <= most or (parameter.is_whole and value != int(value)):
+        whole = "whole numbers " if parameter.is_whole else ""
+        return f"out of range; permitted: {whole}{parameter.least:g} to {most:g}; {parameter}"
+    return ""
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names) or "none"
 
 
 def places(config: RackConfig) -> list[tuple[str, FaultConfig]]:
@@ -46,12 +254,18 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
         # Two faults of one config must not draw the same random numbers.
         seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
     when = None if fault.when is None else condition(fault.when, layout)
+    # 0: until the end of the run, or it strikes once.
+    ticks = 0
+    if fault.cycles is not None:
+        ticks = fault.cycles * cycle_ticks(layout, fault.board)
+    elif fault.lasts is not None:
+        ticks = max(1, round(fault.lasts * 1e9 / layout.clock_ns))
     return Injection(
         kind=kind.number,
         task=task,
         mailbox=_mailbox(fault, kind, layout),
         tick=first_tick(fault, layout.clock_ns),
-        ticks=_ticks(fault, layout),
+        ticks=ticks,
         phase=int(fault.phase * PHASES),
         seed=seed,
         when=when,
@@ -63,19 +277,12 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
 
 def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
     """Return the index of the mailbox; -1: all that the task writes, or none."""
-    if fault.mailbox is None and kind.where != "bus":
-        return -1
-    boxes = enumerate(layout.mailboxes)
-    if fault.mailbox is None:
-        # One message is forged, in one mailbox: by default the first that has a reader.
-        found = (at for at, box in boxes if box.writer == fault.board and box.readers)
-    else:
-        found = (at for at, box in boxes if box.name == fault.mailbox)
-    return next(found, -1)
-
-
-def _ticks(fault: FaultConfig, layout: Layout) -> int:
-    """Return the duration of a fault; 0: until the end of the run, or it strikes once."""
-    if fault.cycles is not None:
-        return fault.cycles * cycle_ticks(layout, fault.board)
-    return 0 if fault.lasts is None else max(1, round(fault.lasts * 1e9 / layout.clock_ns))
+    if fault.mailbox is not None:
+        return layout.index(fault.mailbox)
+    # One message is forged, in one mailbox: by default the first that has a reader.
+    forged = (
+        at
+        for at, box in enumerate(layout.mailboxes)
+        if kind.where == "bus" and box.writer == fault.board and box.readers
+    )
+    return next(forged, -1)

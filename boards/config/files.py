@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -28,14 +29,28 @@ EXTENDS = "configs that this file extends, by name or path, in order; its own ke
 """Meaning of `extends`, the one key that only files have."""
 
 
+@dataclass(frozen=True)
+class Assembled:
+    """The tables of a config as they were read.
+
+    Attributes:
+        tables: The tables.
+        mistakes: Mistakes in files, fault script and settings.
+        broken: Tables that settings with mistakes were to change.
+        is_whole: False if files are missing, with tables that nobody knows.
+    """
+
+    tables: Tables
+    mistakes: Sequence[Mistake] = ()
+    broken: frozenset[str] = frozenset()
+    is_whole: bool = True
+
+
 def assembled(
     name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
-) -> Tables:
+) -> Assembled:
     """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults
-    of a script.
-
-    Paths in an override are relative to the current folder. Raises `ConfigError`.
-    """
+    of a script. Paths in an override are relative to the current folder."""
     mistakes: list[Mistake] = []
     tables: Tables = {}
     folder = CONFIGS
@@ -51,26 +66,8 @@ def assembled(
     overridden = override(tables, overrides, wrong)
     # Settings may refer to what only the files hold.
     found = anchor(overridden if is_whole else tables, Path.cwd())
-    if mistakes or wrong:
-        broken = frozenset(table_of(setting.value) for setting in wrong)
-        raise PartialConfigError([*mistakes, *wrong], found, broken, is_whole)
-    return found
-
-
-class PartialConfigError(ConfigError):
-    """Mistakes in files, fault script and settings, with the tables that were read all the same.
-
-    `broken` names the tables that settings with mistakes were to change. `is_whole` is false if
-    files are missing, with tables that nobody knows.
-    """
-
-    def __init__(
-        self, mistakes: list[Mistake], tables: Tables, broken: frozenset[str], is_whole: bool
-    ) -> None:
-        super().__init__(mistakes)
-        self.tables = tables
-        self.broken = broken
-        self.is_whole = is_whole
+    broken = frozenset(table_of(setting.value) for setting in wrong)
+    return Assembled(found, [*mistakes, *wrong], broken, is_whole)
 
 
 @contextmanager
@@ -261,20 +258,16 @@ def _bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
     place = f"{path.name}: extends"
     if not isinstance(extends, list) or not all(isinstance(item, str) for item in extends):
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
-    found = {
-        item: _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item)
-        for item in extends
-    }
-    mistakes += [
-        Mistake(
-            place,
-            item,
-            f"no such file next to {path.name} or among the bundled configs: {', '.join(names())}",
-        )
-        for item, base in found.items()
-        if base is None
-    ]
-    return [base for base in found.values() if base is not None]
+    bases = []
+    for item in extends:
+        base = _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item)
+        if base is None:
+            known = ", ".join(names())
+            why = f"no such file next to {path.name} or among the bundled configs: {known}"
+            mistakes.append(Mistake(place, item, why))
+        else:
+            bases.append(base)
+    return bases
 
 
 def _named(name: str, folder: Path = CONFIGS) -> Path | None:

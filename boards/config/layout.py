@@ -8,8 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import (
     SPARE,
@@ -86,17 +84,15 @@ class LayoutMaker:
         self._kept = round(KEPT_S * 1e9 / wiring.config.clock_ns)
         self._tasks = {ports.task: self._task(ports.place) for ports in wiring.tasks}
         self._hosts = {ports.task: self._host(ports.place) for ports in wiring.hosts}
-        self._both = {**self._tasks, **self._hosts}
 
     def layout(self) -> Layout:
         """Return the layout."""
-        wiring = self._wiring
-        mailboxes = [box for name in wiring.writers for box in self._written(name)]
+        mailboxes = [box for name in self._wiring.writers for box in self._written(name)]
         # The clock passes an operator's commands on.
-        for name, kind in wiring.operated.items():
-            mailboxes.append(
-                self._mailbox(name, kind, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
-            )
+        mailboxes += [
+            self._mailbox(name, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
+            for name in self._wiring.operated
+        ]
         tasks = tuple(self._tasks.values())
         hosts = tuple(self._hosts.values())
         return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
@@ -105,29 +101,23 @@ class LayoutMaker:
         """Yield a mailbox that a task or host board writes; with a queue the one of its reader's
         position."""
         ports, output = self._wiring.writers[name]
+        capacity = self._config.protocol.depth.get(name, UNREAD)
         if name in self._wiring.from_host:
             # The ring of a host board: a queue that is not by ticks.
-            capacity = self._capacity(name)
             depth = depth_for(capacity + SPARE, 1)
             yield self._mailbox(
-                name,
-                output.message.message_type,
-                writer=ports.task,
-                every=1,
-                delay=0,
-                capacity=capacity,
-                depth=depth,
+                name, writer=ports.task, every=1, delay=0, depth=depth, capacity=capacity
             )
             return
         writer = self._tasks[ports.task]
         every = writer.every * output.cycles
         delay = writer.slice
         # A reader may read as late as the end of its slice a message that was visible at its start.
-        readers = [self._both[reader] for reader in self._wiring.readers(name)]
+        both = self._tasks | self._hosts
+        readers = [both[reader] for reader in self._wiring.readers(name)]
         slowest = max((reader.slice for reader in readers), default=0)
         box = self._mailbox(
             name,
-            output.message.message_type,
             writer=writer.name,
             every=every,
             delay=delay,
@@ -144,36 +134,34 @@ class LayoutMaker:
             yield self._with_interrupts(box, writer, readers)
         # A board with mistakes of its own may be its reader.
         elif box.protocol == "queue" and readers:
-            yield from self._queue(box, readers[0], writer)
+            yield from self._queue(box, capacity, readers[0], writer)
         else:
             yield box
 
-    def _queue(self, box: MailboxSpec, reader: TaskSpec, writer: TaskSpec) -> Iterator[MailboxSpec]:
+    def _queue(
+        self, box: MailboxSpec, capacity: int, reader: TaskSpec, writer: TaskSpec
+    ) -> Iterator[MailboxSpec]:
         """Yield a queue with its size, and the mailbox in which its reader writes its position for
         the writer."""
         delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
-        capacity = self._capacity(box.name)
         # From its release until it can know what the reader has taken, the writer can send no more
         # than the capacity.
         most = capacity * (1 + self._kept // (box.delay + delay))
         # A deep queue keeps fewer.
         slots = depth_for(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
         yield replace(box, capacity=capacity, depth=slots)
-        depth = depth_for(max(writer.slice + delay, self._kept), read.every)
-        visible = (read.phase + delay) % read.every
-        place = {
-            "writer": reader.name,
-            "every": read.every,
-            "delay": delay,
-            "depth": depth,
-            "phase": visible,
-        }
-        position = self._mailbox(taken_name(box.name), QueueTaken.message_type, **place)
-        yield replace(position, readers=(writer.name,), protocol="time-slice")
-
-    def _capacity(self, queue: str) -> int:
-        return self._config.protocol.depth.get(queue, UNREAD)
+        yield self._mailbox(
+            taken_name(box.name),
+            QueueTaken.message_type,
+            readers=(writer.name,),
+            protocol="time-slice",
+            writer=reader.name,
+            every=read.every,
+            delay=delay,
+            depth=depth_for(max(writer.slice + delay, self._kept), read.every),
+            phase=(read.phase + delay) % read.every,
+        )
 
     def _with_interrupts(
         self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]
@@ -193,7 +181,12 @@ class LayoutMaker:
         }
         words = -(-box.size // WORD_BYTES)
         service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
-        sent_ns = self._sent_ns(writer)
+        # A plan is sent at the end of its slice, other messages when the budget is used up, or
+        # after a tick.
+        sent_ns = writer.slice * clock_ns
+        if writer.role != "planner":
+            busy_ms = self._config.board[writer.board].busy_ms
+            sent_ns = min(round(busy_ms * NS_PER_MS) or clock_ns, sent_ns)
         slots = tuple(sorted({task.slot for task in readers} - spared - {writer.slot}))
         delay = -(-(sent_ns + service_ns * bool(slots)) // clock_ns)
         interrupt = InterruptSpec(
@@ -205,26 +198,11 @@ class LayoutMaker:
         depth = depth_for(max(slowest + delay + waits, self._kept), box.every)
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
 
-    def _sent_ns(self, writer: TaskSpec) -> int:
-        """Return the time from a release until its messages are sent: its budget, or a tick; a
-        plan's: its slice."""
-        longest_ns = writer.slice * self._config.clock_ns
-        if writer.role == "planner":
-            return longest_ns
-        budget = self._config.board[writer.board].budget
-        busy_ms = 0.0 if budget is None else budget.cycle_ms
-        return min(round(busy_ms * NS_PER_MS) or self._config.clock_ns, longest_ns)
-
     def _task(self, place: TaskPlace) -> TaskSpec:
         board = self._config.board[place.board]
         every = self._wiring.every[place.board]
         wake = board.wake or self._config.clock.wake
-        within_cycles = 1
-        if place.role == "planner":
-            within_cycles = board.within_cycles
-            if wake == "poll":
-                # The planner of a polling executor must not poll too.
-                wake = "timer"
+        is_planner = place.role == "planner"
         return TaskSpec(
             name=place.name,
             board=place.board,
@@ -233,45 +211,48 @@ class LayoutMaker:
             core=obtained_core(place.core),
             priority=place.priority,
             every=every,
-            within_cycles=within_cycles,
+            within_cycles=board.within_cycles if is_planner else 1,
             depth=depth_for(self._kept, every),
-            wake=wake,
+            # The planner of a polling executor must not poll too.
+            wake="timer" if is_planner and wake == "poll" else wake,
             phase=board.phase,
         )
 
     def _host(self, place: TaskPlace) -> TaskSpec:
         """Return the record of a host board: it has no rate, and leaves no trace."""
-        is_external = self._config.host[place.board].external
         return TaskSpec(
-            place.name,
-            place.board,
-            place.role,
-            place.slot,
-            place.core,
-            0,
-            1,
-            1,
-            0,
-            is_external=is_external,
+            name=place.name,
+            board=place.board,
+            role=place.role,
+            slot=place.slot,
+            core=place.core,
+            priority=0,
+            every=1,
+            within_cycles=1,
+            depth=0,
+            is_external=self._config.host[place.board].external,
         )
 
-    def _mailbox(self, name: str, kind: MessageType, **times: Any) -> MailboxSpec:
+    def _mailbox(self, name: str, kind: MessageType | None = None, **given: Any) -> MailboxSpec:
         """Return the record of a mailbox: its message, readers and protocol, and the other fields
-        as given."""
-        reading = self._wiring.reading.get(name, ())
-        dtype = kind.dtype(self._sizes)
+        as given. `kind`: its message type, of a mailbox that is no port's."""
+        wiring = self._wiring
+        kind = kind or wiring.types[name]
+        reading = wiring.reading.get(name, ())
+        found = {
+            "readers": wiring.readers(name),
+            "protocol": wiring.protocol(name),
+            "exchanges": tuple(
+                exchanges(wiring, p)[port] for p, port in reading if port in p.exchange
+            ),
+        }
         return MailboxSpec(
             name=name,
-            readers=self._wiring.readers(name),
-            exchanges=tuple(
-                exchanges(self._wiring, p)[port] for p, port in reading if port in p.exchange
-            ),
-            protocol=self._wiring.protocol(name),
             message=kind.name,
             version=kind.version,
-            size=dtype.itemsize,
+            size=kind.dtype(self._sizes).itemsize,
             fields=field_specs(kind, self._sizes),
-            **times,
+            **{**found, **given},
         )
 
 
@@ -282,28 +263,20 @@ def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec,
     specs = []
     for field in kind.fields:
         dtype, offset = offsets[field.name][:2]
-        scalar, shape = dtype.subdtype or (dtype, ())
-        type_name = np.dtype(scalar).str
-        inner: tuple[FieldSpec, ...] = ()
-        if isinstance(field.kind, MessageType):
-            type_name = f"V{scalar.itemsize}"
-            inner = field_specs(field.kind, sizes)
-        unit = field.unit
-        values: tuple[tuple[str, int], ...] = ()
-        if not isinstance(unit, str):
-            # An enum: its numbers have names.
-            values = tuple((number.name.lower(), int(number)) for number in unit)
-            unit = unit.__name__
+        scalar = dtype.base
+        group = field.kind if isinstance(field.kind, MessageType) else None
+        # The numbers of an enum have names.
+        names = () if isinstance(field.unit, str) else field.unit
         specs.append(
             FieldSpec(
                 name=field.name,
-                kind=type_name,
-                shape=tuple(shape),
+                kind=scalar.str if group is None else f"V{scalar.itemsize}",
+                shape=dtype.shape,
                 offset=offset,
-                unit=unit,
+                unit=field.unit if isinstance(field.unit, str) else field.unit.__name__,
                 meaning=field.meaning,
-                fields=inner,
-                values=values,
+                fields=() if group is None else field_specs(group, sizes),
+                values=tuple((number.name.lower(), int(number)) for number in names),
                 length=field.length,
             )
         )

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import Field, TypeAdapter, create_model
 from pydantic.fields import FieldInfo
@@ -20,18 +20,17 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.segment import Segment
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.wiring import commandable, executors
+from rack.boards.config.wiring import executors, takes_commands
 from rack.boards.faults.kind import KINDS, Kind
 from rack.boards.faults.kinds import BUILT_IN
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor
-from rack.levels.operator import NAMED, Commands, Goal, Operation
+from rack.levels.operator import NAMED, Goal, Operation
 from rack.levels.tables import Table, keys_of, live_keys, read_params
 
 TYPES: Mapping[str, type] = {kind.__name__: kind for kind in (bool, int, float, str)}
 """Types of parameters whose values can be checked without the level's class."""
 Constraint = Literal["gt", "ge", "lt", "le", "allow_inf_nan"]
-CONSTRAINTS: tuple[Constraint, ...] = ("gt", "ge", "lt", "le", "allow_inf_nan")
 
 
 @dataclass(frozen=True)
@@ -135,17 +134,12 @@ CODE: Any = {
 
 def publish(config: RackConfig) -> PublishedRack:
     """Gather the facts about a rack's levels from their classes, which are imported."""
-    taken = commandable(config)
-    levels = {
-        name: _level(config, name, kind, taken.get(name, {}))
-        for name, kind in executors(config).items()
-    }
+    levels = {name: _level(config, name, kind) for name, kind in executors(config).items()}
     return PublishedRack(levels, tuple(kind for kind in KINDS if kind.name not in BUILT_IN))
 
 
-def _level(
-    config: RackConfig, board: str, kind: type[Executor], commands: Commands
-) -> PublishedLevel:
+def _level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
+    commands = kind.commands if takes_commands(kind) else {}
     given = config.board[board].params
     live: dict[str, PublishedParam] = {}
     if kind.params is not None and (keys := live_keys(kind.params)):
@@ -173,7 +167,7 @@ def _level(
 def _param(declared: FieldInfo, launched: object) -> PublishedParam:
     constraints: dict[Constraint, float | bool] = {}
     for bound in declared.metadata:
-        for key in CONSTRAINTS:
+        for key in get_args(Constraint):
             value = getattr(bound, key, None)
             # An infinite bound is none, and JSON has no infinity.
             if value is not None and isfinite(value):

@@ -123,31 +123,28 @@ def _tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
 def _walk(schema: Schema, known: Schema, name: str, path: str, heading: str) -> Iterator[KeyTable]:
     """Yield a table, then those in it."""
     keys = []
-    inner = []
+    inner: list[KeyTable] = []
     for key, entry in schema.get("properties", {}).items():
         below = f"{path}.{key}".lstrip(".")
-        if found := list(_inner(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")):
-            inner += found
-        else:
+        found = [*_inner(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")]
+        inner += found
+        if not found:
             keys.append(_key(key, entry, key in schema.get("required", ())))
     if keys:
         yield KeyTable(name, heading, _summary(schema.get("description", "")), tuple(keys))
-    for entry, at, below, title in inner:
-        yield from _walk(entry, known, at, below, title)
+    yield from inner
 
 
-def _inner(
-    entry: Schema, known: Schema, name: str, path: str, heading: str
-) -> Iterator[tuple[Schema, str, str, str]]:
-    """Yield the tables that a value may be or contain, each with its name, path and heading."""
+def _inner(entry: Schema, known: Schema, name: str, path: str, heading: str) -> Iterator[KeyTable]:
+    """Yield the tables that a value may be or contain."""
     if "$ref" in entry:
-        yield known[entry["$ref"].rpartition("/")[2]], name, path, heading
+        yield from _walk(known[entry["$ref"].rpartition("/")[2]], known, name, path, heading)
     for option in entry.get("anyOf", ()):
         yield from _inner(option, known, name, path, heading)
     kinds = entry.get("discriminator", {"mapping": {}})
     for value, ref in kinds["mapping"].items():
         chosen = f'{heading} with {kinds["propertyName"]} = "{value}"'
-        yield known[ref.rpartition("/")[2]], f"{name}.{value}", path, chosen
+        yield from _inner({"$ref": ref}, known, f"{name}.{value}", path, chosen)
     if isinstance(entry.get("items"), dict):
         yield from _inner(entry["items"], known, name, path, f"[[{path}]]")
     for held in _named(entry):
@@ -165,41 +162,46 @@ def _key(name: str, entry: Schema, is_required: bool) -> Key:
     unit = UNIT.search(description)
     given = entry.get("default")
     default = "" if given in (None, [], {}) else shown(given)
-    options = [option for option in entry.get("anyOf", [entry]) if option.get("type") != "null"]
+    kind, permitted = _values(entry)
     return Key(
         name=name,
-        type=" or ".join(map(_type, options)),
+        type=kind,
         unit=unit[1] if unit else "",
-        permitted=next(filter(None, map(_permitted, options)), ""),
+        permitted=permitted[0] if permitted else "",
         default=REQUIRED if is_required else default,
         meaning=UNIT.sub("", description, count=1) + "; live: `rack set`" * ("live" in entry),
     )
 
 
-def _held(entry: Schema) -> Schema | None:
-    """Return the schema of the items of a list or table of like items; None for other types."""
-    places = (entry.get("items"), *entry.get("prefixItems", ()), *_named(entry))
-    return next((found for found in places if isinstance(found, dict)), None)
+def _values(entry: Schema) -> tuple[str, list[str]]:
+    """Return the type of a value, and the permitted values of each of its alternatives that has
+    limits; of a list or table of like items, those of the items."""
+    kinds = []
+    limits = []
+    for option in entry.get("anyOf", [entry]):
+        kind = "path" if option.get("format") == "path" else option.get("type", "any")
+        kind = {"array": "list", "object": "table"}.get(kind, kind)
+        listed = option.get("prefixItems", ())
+        places = (option.get("items"), *listed, *_named(option))
+        held = next((found for found in places if isinstance(found, dict)), None)
+        if held is None:
+            permitted = _limits(option)
+        else:
+            of, inner = _values(held)
+            first, _, rest = of.partition(" ")
+            count = f"{len(listed)} " if listed else ""
+            kind = f"{kind} of {count}{first}s {rest}".rstrip()
+            if "maxItems" in option and "items" in option:
+                inner = [f"{option['minItems']} to {option['maxItems']} items", *inner]
+            permitted = "; ".join(inner)
+        if kind != "null":
+            kinds.append(kind)
+            limits += [permitted] if permitted else []
+    return " or ".join(kinds), limits
 
 
-def _type(entry: Schema) -> str:
-    kind = "path" if entry.get("format") == "path" else entry.get("type", "any")
-    kind = {"array": "list", "object": "table"}.get(kind, kind)
-    if (held := _held(entry)) is None:
-        return kind
-    count = f"{len(entry['prefixItems'])} " if "prefixItems" in entry else ""
-    options = held.get("anyOf", [held])
-    first, _, rest = " or ".join(map(_type, options)).partition(" ")
-    return f"{kind} of {count}{first}s {rest}".rstrip()
-
-
-def _permitted(entry: Schema) -> str:
-    """Return the permitted values of a type; for a list, those of its items."""
-    if (held := _held(entry)) is not None:
-        count = ""
-        if "maxItems" in entry and "items" in entry:
-            count = f"{entry['minItems']} to {entry['maxItems']} items"
-        return "; ".join(filter(None, (count, *map(_permitted, held.get("anyOf", [held])))))
+def _limits(entry: Schema) -> str:
+    """Return the permitted values of a value that contains no others."""
     if values := entry.get("enum", [entry["const"]] if "const" in entry else []):
         return ", ".join(map(shown, values))
     if {"minimum", "maximum"} <= entry.keys():

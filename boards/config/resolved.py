@@ -1,21 +1,16 @@
-"""From TOML to a rack: `load` reads and validates the tables, `resolve` checks and wires
-everything, once.
+"""From a config to a rack: `resolve` checks and wires everything, once.
 
-The two are separate so that at launch the crate imports the levels while this process resolves the
-config.
+`rack.boards.config.loader` reads the config before that, so that at launch the crate imports the
+levels while this process resolves the config.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
-from typing import Any, TypeVar, cast
-
-from pydantic import ValidationError
+from typing import Any, cast
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
@@ -23,21 +18,16 @@ from rack.backplane.operator_table import Request
 from rack.backplane.process import DEADLINE, cores_kept_awake, mapped_and_locked
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
-from rack.boards.classes import extend_path
-from rack.boards.config.cell import cell_sizes, with_derived
-from rack.boards.config.commands import requests
-from rack.boards.config.faults import injections, places
-from rack.boards.config.files import CONFIGS, PartialConfigError, anchor, assembled
+from rack.boards.config.cell import cell_sizes
+from rack.boards.config.commands import command_mistakes, requests
+from rack.boards.config.faults import fault_mistakes, injections, places
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
-from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.published import PublishedRack, publish
 from rack.boards.config.rules import broken_rules, network_rules
-from rack.boards.config.rules.commands import command_mistakes
-from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.rules.levels import memory, neighbours, sizes
-from rack.boards.config.schema import LAN, LAST_SLOT, CommandConfig, RackConfig
+from rack.boards.config.schema import LAN, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
-from rack.boards.config.toml import Tables, parse, table_of
+from rack.boards.config.toml import table_of, without
 from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -51,7 +41,7 @@ from rack.boards.wiring import (
     mailboxes_of,
 )
 from rack.levels.level import LevelContext, Pace
-from rack.levels.tables import GoalConfig, RobotConfig, Table
+from rack.levels.tables import GoalConfig, RobotConfig
 
 LINGER_S = 0.5
 """Simulated time that a run continues after the task ends, to let the arm come to rest."""
@@ -74,44 +64,6 @@ that it writes."""
 
 LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
 """Tables without which there is no layout, and no level can judge its neighbours."""
-
-T = TypeVar("T", bound=Table)
-
-
-def load(
-    name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None
-) -> RackConfig:
-    """Return a config by name or path, with `key.sub=value` overrides, and add its levels to the
-    import path.
-
-    Faults of the script `faults`, by name or path, are appended to its own. Paths in an override
-    are relative to the current folder. Raises `ConfigError` with every mistake if a file, a setting
-    or a single table is wrong; `resolve` checks the rest.
-    """
-    try:
-        tables = assembled(name_or_path, overrides, faults)
-    except PartialConfigError as error:
-        return validated(error.tables, error)
-    return validated(tables)
-
-
-def loads(text: str) -> RackConfig:
-    """Return the config in TOML text, as `RackConfig.text` writes it, and add its levels to the
-    import path. Raises `ConfigError` as `load` does."""
-    return validated(anchor(parse(text), CONFIGS))
-
-
-def read_stored(text: str) -> RackConfig:
-    """Return the config that a rack or a run holds as text, which may be somebody else's.
-
-    Nothing that it names is imported, and its levels do not come into the import path. Raises
-    `ConfigError` with every mistake in a single table.
-    """
-    tables = anchor(parse(text), CONFIGS)
-    try:
-        return with_derived(RackConfig.model_validate(tables))
-    except ValidationError as error:
-        raise ConfigError(mistakes_of(error, RackConfig, tables)) from None
 
 
 def resolve(config: RackConfig) -> Resolved:
@@ -174,46 +126,36 @@ class Resolved:
     def clock(self, seconds: float | None) -> ClockWiring:
         """Return the clock's wiring for a run of `seconds` of simulated time; None: until the task
         ends."""
-        clock = self.config.clock
-        tick_ns = self.config.clock_ns
+        config = self.config
+        clock = config.clock
         ends_run = self.ends_run
-        # The demand on the arm while a board is lost; none if the level below holds.
-        demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         silent = self._ticks(SILENT_S)
         if ends_run is not None:
             writer = self.layout.mailbox(ends_run).writer
             silent = max(silent, 8 * self.layout.task(writer).every)
-        stop_tick = 0 if seconds is None else max(1, self._ticks(seconds))
+        executors = [task for task in self.layout.tasks if task.role == "executor"]
+        core = obtained_core(clock.core)
+        # In lockstep the core of the fastest board, since a switch is faster than waking up a core.
+        # A polling board does not give its core away.
+        if config.is_lockstep and (giving := [task for task in executors if task.wake != "poll"]):
+            core = min(giving, key=lambda task: (task.every, task.slot)).core
+        # The demand on the arm while a board is lost; none if the level below holds.
+        demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         return ClockWiring(
-            lockstep=clock.mode == "lockstep",
-            period_ns=round(tick_ns / clock.speed),
-            stop_tick=stop_tick,
+            lockstep=config.is_lockstep,
+            period_ns=config.tick_ns,
+            stop_tick=0 if seconds is None else max(1, self._ticks(seconds)),
             ends_run=ends_run,
             linger=self._ticks(LINGER_S),
             silent=silent,
             history=self._ticks(AHEAD_S),
-            core=self._clock_core,
+            core=core,
             priority=clock.priority,
-            keeps_awake=clock.mode == "realtime" and clock.idle_cores == "awake",
-            reservation=reservation(self.config, self.config.timing.clock_ms, 1),
-            restart_ticks=max(1, self._ticks(self.config.supervision.lockstep_restart_s)),
-            on_loss={
-                task.name: demands[self.config.board[task.board].on_loss]
-                for task in self.layout.tasks
-                if task.role == "executor"
-            },
+            keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
+            reservation=reservation(config, config.timing.clock_ms, 1),
+            restart_ticks=max(1, self._ticks(config.supervision.lockstep_restart_s)),
+            on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
-
-    @property
-    def _clock_core(self) -> int:
-        """Core of the clock: in lockstep that of the fastest board, since a switch is faster than
-        waking up a core."""
-        if self.config.clock.mode == "lockstep":
-            # A polling board does not give its core away.
-            boards = [t for t in self.layout.tasks if t.role == "executor" and t.wake != "poll"]
-            if boards:
-                return min(boards, key=lambda task: (task.every, task.slot)).core
-        return obtained_core(self.config.clock.core)
 
     def _ticks(self, seconds: float) -> int:
         return round(seconds * 1e9 / self.config.clock_ns)
@@ -229,9 +171,7 @@ class Resolved:
     def crate_priority(self) -> int:
         """SCHED_FIFO priority of the crate: below all real-time boards, above all ordinary
         processes."""
-        priorities = [
-            task.priority for task in self.layout.tasks if task.priority and task.role == "executor"
-        ]
+        priorities = [t.priority for t in self.layout.tasks if t.priority and t.role == "executor"]
         return max(min(priorities, default=0) - 1, 0)
 
     def notes(self, segment: Segment) -> list[str]:
@@ -249,7 +189,7 @@ class Resolved:
                 found.append(
                     f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}'
                 )
-        if self.config.clock.mode == "lockstep":
+        if self.config.is_lockstep:
             why = "sends enters at ticks that depend on its timing; --entries RUN repeats a run"
             found += [f"what {host.board} {why}" for host in self.hosts if host.is_external]
         return found
@@ -266,23 +206,21 @@ class Resolved:
             why = f"at most {allowed} open files are permitted (ulimit -n); the rack needs {needed}"
             raise LaunchError(f"rack '{self.config.name}': {why}")
 
-    def _unlocked(self, segment: Segment) -> list[str]:
-        if self.config.clock.mode == "lockstep":
-            return []
-        memory = {
-            t.name: mapped_and_locked(segment.block(t.name)[Block.PID]) for t in self.layout.tasks
-        }
-        unlocked = {name: mapped for name, (mapped, locked) in memory.items() if not locked}
-        if not unlocked:
-            return []
-        limit = (
-            f"the limit is {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps"
-            f" {max(unlocked.values())}"
-        )
-        return [
-            f"memory not locked for {', '.join(unlocked)}: {limit}; page faults may delay cycles."
-            f" {PERMIT_LOCK}"
-        ]
+    def _unlocked(self, segment: Segment) -> Iterator[str]:
+        """Yield which tasks have not locked their memory, and the limit."""
+        if self.config.is_lockstep:
+            return
+        unlocked = {}
+        for task in self.layout.tasks:
+            mapped, locked = mapped_and_locked(segment.block(task.name)[Block.PID])
+            if not locked:
+                unlocked[task.name] = mapped
+        if unlocked:
+            yield (
+                f"memory not locked for {', '.join(unlocked)}: the limit is"
+                f" {getrlimit(RLIMIT_MEMLOCK)[0]} bytes, a board maps {max(unlocked.values())};"
+                f" page faults may delay cycles. {PERMIT_LOCK}"
+            )
 
     def _reserved(self, segment: Segment) -> Iterator[str]:
         """Yield who has a reservation, on which cores, and who was refused one."""
@@ -302,7 +240,7 @@ class Resolved:
                 yield f"{what}: {', '.join(sorted(names))}"
 
     def _refused(self, segment: Segment) -> str:
-        if self.config.clock.mode == "lockstep":
+        if self.config.is_lockstep:
             # It has no deadlines to miss.
             return ""
         refused = [
@@ -315,15 +253,15 @@ class Resolved:
         )
 
 
-def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> _Examined:
+def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
-    examined = _Examined(config, places(config), commands)
+    examined = Examination(config, places(config), commands)
     if mistakes := [*examined.mistakes, *further]:
         raise ConfigError(mistakes)
     return examined
 
 
-class _Examined:
+class Examination:
     """A config with the findings of its check.
 
     `broken` names tables that were removed for mistakes already known; nothing that depends on them
@@ -401,13 +339,7 @@ class _Examined:
         # What is on the host side, a bus adapter exchanges by itself.
         of_host = self._wiring.of_host
         from_host = self._wiring.from_host
-        critical_priority = 0
-        if not is_executor and is_critical(self._config, layout, spec.board):
-            critical_priority = board.priority
-        # Planners are below all reservations.
-        busy_ms = 0.0
-        if is_executor and board.budget is not None:
-            busy_ms = board.budget.cycle_ms
+        is_locked = not is_executor and is_critical(self._config, layout, spec.board)
         return TaskWiring(
             task=ports.task,
             target=ports.place.target,
@@ -418,13 +350,16 @@ class _Examined:
             },
             outputs={port: box for port, box in ports.writes.items() if box not in of_host},
             context=self._contexts[spec.board],
-            critical_priority=critical_priority,
+            critical_priority=board.priority if is_locked else 0,
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
             guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
             entries=None,
             exchange=exchanges(self._wiring, ports),
-            reservation=reservation(self._config, busy_ms, spec.every),
+            # Planners are below all reservations.
+            reservation=reservation(
+                self._config, board.busy_ms if is_executor else 0.0, spec.every
+            ),
             transfer=BusTimes(
                 **{f"{key.removesuffix('_ms')}_ns": round(ms * 1e6) for key, ms in board.transfer}
             ),
@@ -466,94 +401,9 @@ class _Examined:
         )
 
 
-def validated(tables: Tables, partial: PartialConfigError | None = None) -> RackConfig:
-    """Return the config in tables, and add its levels to the import path.
-
-    Args:
-        tables: Tables of a config, assembled.
-        partial: Earlier mistakes, which are raised together with those that are found here.
-
-    Raises:
-        ConfigError: The config has mistakes. All stages run on the tables that are valid.
-    """
-    mistakes: list[Mistake] = []
-    broken: frozenset[str] = frozenset()
-    is_whole = True
-    if partial is not None:
-        mistakes += partial.mistakes
-        broken = partial.broken
-        is_whole = partial.is_whole
-    unset = broken
-    try:
-        config = RackConfig.model_validate(tables)
-    except ValidationError as error:
-        broken |= _broken(error)
-        mistakes += [
-            mistake
-            for mistake in mistakes_of(error, RackConfig, tables)
-            # A setting or a file with mistakes may hold what is missing.
-            if not mistake.why.startswith("missing")
-            or (is_whole and table_of(mistake.place) not in unset)
-        ]
-    if not is_whole:
-        raise ConfigError(mistakes)
-    if broken:
-        config = _intact(tables, broken)
-    extend_path(config.python_path)
-    try:
-        config = with_derived(config)
-    except ConfigError as error:
-        broken |= {"robot"}
-        mistakes += error.mistakes
-        config = _intact(tables, broken)
-    if not mistakes:
-        return config
-    faults = _readable(tables, "fault", FaultConfig)
-    commands = _readable(tables, "command", CommandConfig)
-    raise ConfigError([*mistakes, *_Examined(config, faults, commands, broken).mistakes])
-
-
-def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
-    """Yield place and table for the valid tables of a list; the mistakes of the others are already
-    known."""
-    entries = tables.get(key)
-    if not isinstance(entries, list):
-        return
-    for at, entry in enumerate(entries):
-        with suppress(ValidationError):
-            yield f"{key}[{at}]", kind.model_validate(entry)
-
-
-def _broken(error: ValidationError) -> frozenset[str]:
-    """Return the tables with mistakes, as "robot", "board.servo" or "host.program"."""
-    places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
-    return frozenset(
-        ".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places
-    )
-
-
-def _without(tables: Tables, broken: frozenset[str]) -> Tables:
-    """Return tables without those with mistakes, as "robot" or "board.servo"."""
-    kept = {key: value for key, value in tables.items() if key not in broken}
-    for key in ("board", "host"):
-        own = kept.get(key, {})
-        kept[key] = {name: t for name, t in own.items() if f"{key}.{name}" not in broken}
-    return kept
-
-
 def _reduced(config: RackConfig, unsound: frozenset[str]) -> RackConfig:
     """Return a config without the boards and host boards that have mistakes."""
-    kept = _without({"board": config.board, "host": config.host}, unsound)
+    kept = without({"board": config.board, "host": config.host}, unsound)
     if "adapter" in unsound:
         kept["board"].pop(LAN, None)
     return config.model_copy(update=kept)
-
-
-def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
-    """Return a config made of the tables without mistakes."""
-    kept = _without({key: tables[key] for key in RackConfig.model_fields if key in tables}, broken)
-    # Stand-ins for required tables; nothing that depends on a broken table is checked.
-    spare = {"name": "unnamed", "clock": {"period_ms": 1}}
-    none = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
-    config = RackConfig.model_validate({**spare, **kept, "board": kept["board"] or none})
-    return config if kept["board"] else config.model_copy(update={"board": {}})

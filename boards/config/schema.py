@@ -7,7 +7,7 @@ unit follows a comma; `rack schema` shows it in a separate column.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
@@ -44,8 +44,6 @@ ANY_CORE = -1
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
 OnLoss = Literal["hold", "stop", "brake"]
-Motion = Literal["hold", "resume", "setpoint", "goto", "modify", "table", "do", "set"]
-Power = Literal["enable", "disable", "reset", "release"]
 
 
 def _listed(value: Any) -> Any:
@@ -148,11 +146,6 @@ class BudgetConfig(Table):
     """U: write the plan, per plan, ms"""
     plan_within_ms: float | None = Field(None, gt=0, le=1e7)
     """longest acceptable time for a new plan, ms; an upper limit on within_cycles"""
-
-    @property
-    def cycle_ms(self) -> float:
-        """Of a cycle of the executor."""
-        return self.exchange_ms + self.read_ms + self.process_ms + self.write_ms
 
 
 class TransferConfig(Table):
@@ -264,6 +257,12 @@ class BoardConfig(PlacedConfig):
     """while this board is lost: hold: the level below holds; stop: the arm ramps to rest, then
     brakes; brake: the arm brakes at once"""
 
+    @property
+    def busy_ms(self) -> float:
+        """Processor time of a cycle of the executor by its budget, ms; 0: it has none."""
+        own = self.budget
+        return 0.0 if own is None else own.exchange_ms + own.read_ms + own.process_ms + own.write_ms
+
 
 LAN = "lan"
 """Name of the board that exchanges mailboxes with other racks."""
@@ -278,10 +277,7 @@ class LanConfig(PlacedConfig, LanTable):
 
     def board(self) -> BoardConfig:
         """Return the board."""
-        own = {
-            key: getattr(self, key)
-            for key in LanConfig.model_fields.keys() - LanTable.model_fields.keys()
-        }
+        own = {key: value for key, value in self if key not in LanTable.model_fields}
         params = self.model_dump(
             exclude_none=True, by_alias=True, include=set(LanTable.model_fields)
         )
@@ -325,7 +321,20 @@ class CommandConfig(Table):
 
     level: str
     """board whose level is commanded, as in servo or task"""
-    what: Literal[Motion, Power]
+    what: Literal[
+        "hold",
+        "resume",
+        "setpoint",
+        "goto",
+        "modify",
+        "table",
+        "do",
+        "set",
+        "enable",
+        "disable",
+        "reset",
+        "release",
+    ]
     """hold: come to rest; resume: continue; setpoint, goto: move to a goal and stay there; modify:
     put a control modification in or take it out; table: decide by another state table; do: do one
     of the level's own commands; set: set a live parameter of the level; enable, disable: give
@@ -448,6 +457,11 @@ class RackConfig(Table):
         return [CHANGED] if self.format < FORMAT else []
 
     @property
+    def is_lockstep(self) -> bool:
+        """Whether each tick comes once every task is done, instead of by wall-clock time."""
+        return self.clock.mode == "lockstep"
+
+    @property
     def clock_ns(self) -> int:
         """One tick, in ns of simulated time."""
         return round(self.clock.period_ms * 1e6)
@@ -514,6 +528,22 @@ class RackConfig(Table):
     def table(self, of: TaskPlace | TaskSpec) -> BoardConfig | HostConfig:
         """Return the table of a task's board, or of a host board."""
         return self.host[of.board] if of.role == "host" else self.board[of.board]
+
+    def rewired(self, place: TaskPlace) -> Mapping[str, Sources]:
+        """Return the mailboxes that the config gives to ports of a task or host board, by port."""
+        found: Mapping[str, Sources] = getattr(self.table(place), place.reads_key)
+        return found
+
+    @property
+    def outside(self) -> str:
+        """Whose state is not the rack's, so that it has no snapshots; empty: nobody's.
+
+        Such a rack repeats itself only with what came from outside of it then.
+        """
+        hosts = ", ".join(map(repr, self.host))
+        found = [f"{hosts}: a host program's state"] if hosts else []
+        found += [f"'{LAN}': what comes from the network"] if self.adapter.lan is not None else []
+        return "; ".join(found)
 
     def text(self) -> str:
         """Return the config as self-contained TOML that loads to the same config."""

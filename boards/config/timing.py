@@ -11,7 +11,6 @@ from rack.backplane.mailbox.inbox import InterruptSource
 from rack.backplane.mailbox.interrupt import how_sent
 from rack.backplane.process import Reservation
 from rack.boards.config.schema import (
-    BoardConfig,
     BudgetConfig,
     CommandConfig,
     RackConfig,
@@ -27,7 +26,8 @@ NS_PER_MS = 1e6
 RESERVED = 2
 """Times its budget that a board may use up in a cycle: budgets are 99th percentiles, and the kernel
 lets whoever uses more wait for the next cycle."""
-PARTS = tuple(field.name for field in fields(Budget))
+KEYS = {part.name: part.name.replace("_ns", "_ms") for part in fields(Budget)}
+"""The key of a config's budget for each field of a `Budget`."""
 PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 """Keys of a budget that only a board with a planner has."""
 
@@ -44,7 +44,7 @@ def rack_timing(
     goal_ns = None if goal_ms is None else goal_ms * NS_PER_MS
     schedule = None if config.schedule is None else frames(config.schedule, config.clock_ns)
     return RackTiming(
-        is_lockstep=config.clock.mode == "lockstep",
+        is_lockstep=config.is_lockstep,
         speed=config.clock.speed,
         clock_ns=config.clock_ns,
         clock=TimedTask(
@@ -71,12 +71,11 @@ def inboxes(layout: Layout) -> dict[str, InboxTiming]:
         if boxes := layout.interrupting(slot):
             name = layout.handler(slot)
             names = tuple(box.name for box in boxes)
-            how = [how_sent(box) for box in boxes]
-            times = zip(boxes, how, strict=True)
-            sources = [
-                InterruptSource(box.every * layout.clock_ns, sent.service_ns) for box, sent in times
-            ]
-            found[name] = InboxTiming(name, names, tuple(sources), how[0].depth)
+            sources = tuple(
+                InterruptSource(box.every * layout.clock_ns, how_sent(box).service_ns)
+                for box in boxes
+            )
+            found[name] = InboxTiming(name, names, sources, how_sent(boxes[0]).depth)
     return found
 
 
@@ -124,19 +123,18 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
 def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
     """Return the ticks at which an executor reads the messages of others, by writer, if not in
     every cycle."""
-    own = [
-        (box.writer, exchange.grid)
-        for box in layout.mailboxes
-        for exchange in box.exchanges
-        if exchange.task == board
-    ]
-    return {writer: max(grid for other, grid in own if other == writer) for writer, _ in own}
+    found: dict[str, TickGrid] = {}
+    for box in layout.mailboxes:
+        for exchange in box.exchanges:
+            if exchange.task == board:
+                found[box.writer] = max(found.get(box.writer, exchange.grid), exchange.grid)
+    return found
 
 
 def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
     """Return what a board that computes so long in `every` ticks reserves of its processor, ms;
     None: it asks for a priority."""
-    if config.clock.scheduler == "fixed-priority" or config.clock.mode == "lockstep" or not busy_ms:
+    if config.clock.scheduler == "fixed-priority" or config.is_lockstep or not busy_ms:
         return None
     period_ns = every * config.tick_ns
     return Reservation(min(round(RESERVED * busy_ms * NS_PER_MS), period_ns), period_ns)
@@ -160,33 +158,25 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
 
 def budgets(config: RackConfig) -> dict[str, Budget]:
     """Return the config's budgets, by board; boards without one are omitted."""
-    tables = {name: board.budget for name, board in config.board.items()}
     return {
         name: Budget(
-            **{
-                key: round(getattr(table, f"{key.removesuffix('_ns')}_ms") * NS_PER_MS)
-                for key in PARTS
-            }
+            **{part: round(getattr(board.budget, key) * NS_PER_MS) for part, key in KEYS.items()}
         )
-        for name, table in tables.items()
-        if table is not None
+        for name, board in config.board.items()
+        if board.budget is not None
     }
 
 
 def with_budgets(config: RackConfig, found: Mapping[str, Budget]) -> RackConfig:
     """Return the config with exactly these budgets, by board; each `plan_within_ms` is kept."""
-    boards = {name: _budgeted(board, found.get(name)) for name, board in config.board.items()}
+    boards = {}
+    for name, board in config.board.items():
+        budget = None
+        if name in found:
+            times = {KEYS[part]: ns / NS_PER_MS for part, ns in asdict(found[name]).items()}
+            if board.planner is None:
+                times = {key: ms for key, ms in times.items() if key not in PLANNER_BUDGET}
+            within_ms = None if board.budget is None else board.budget.plan_within_ms
+            budget = BudgetConfig(**times, plan_within_ms=within_ms)
+        boards[name] = board.model_copy(update={"budget": budget})
     return config.model_copy(update={"board": boards})
-
-
-def _budgeted(board: BoardConfig, budget: Budget | None) -> BoardConfig:
-    wanted = None if board.budget is None else board.budget.plan_within_ms
-    if budget is None:
-        return board.model_copy(update={"budget": None})
-    times = {
-        f"{part.removesuffix('_ns')}_ms": time_ns / NS_PER_MS
-        for part, time_ns in asdict(budget).items()
-    }
-    if board.planner is None:
-        times = {key: time for key, time in times.items() if key not in PLANNER_BUDGET}
-    return board.model_copy(update={"budget": BudgetConfig(**times, plan_within_ms=wanted)})

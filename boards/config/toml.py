@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any
 
 import tomli_w
@@ -12,10 +13,8 @@ import tomli_w
 from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_LONG, load_toml
 from rack.boards.errors import ConfigError, Mistake, shown
 
-PART = r"""(?:"(?:[^"\\]|\\.)*"|'[^']*'|[^."'=\s]+)"""
-SETTING = re.compile(rf"\s*({PART}(?:\s*\.\s*{PART})*)\s*=(.*)", re.DOTALL)
-""""key.sub=value"; a key that contains a dot is quoted, as in TOML:
-protocol.mailbox."level.plan"=lock."""
+SETTING = re.compile(r"""((?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[^"'=\n])+)=([^\0]*)""")
+""""key.sub=value", with a key of TOML: protocol.mailbox."level.plan"=lock."""
 FREE_FORM = ("params", "task")
 """Tables of the levels, where an empty list is an ordinary value."""
 
@@ -31,32 +30,29 @@ def parse(text: str, place: str = "config") -> Tables:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
     except ValueError as error:
         raise ConfigError([Mistake(place, None, str(error))]) from None
-    if mistakes := list(_out_of_bounds(tables, place)):
+    found = (_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items())
+    if mistakes := list(chain.from_iterable(found)):
         raise ConfigError(mistakes)
     return tables
 
 
-def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
+def _out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
     """Yield mistakes that are valid TOML: deep nesting, long integers, NUL in text, dates."""
-    waiting: list[tuple[str, int, Any]] = [
-        (f"{place}: {key}", 1, value) for key, value in tables.items()
-    ]
-    while waiting:
-        where, depth, value = waiting.pop()
-        if isinstance(value, dict | list) and depth >= MAX_DEPTH:
-            yield Mistake(where, None, TOO_DEEP)
-        elif isinstance(value, dict):
-            waiting += [(f"{where}.{key}", depth + 1, item) for key, item in value.items()]
-        elif isinstance(value, list):
-            waiting += [(f"{where}[{at}]", depth + 1, item) for at, item in enumerate(value)]
-        elif isinstance(value, int) and value.bit_length() >= INTEGER_BITS:
-            yield Mistake(where, value, TOO_LONG)
-        elif isinstance(value, str) and "\0" in value:
-            yield Mistake(where, value, "text must not contain NUL")
-        elif not isinstance(value, str | int | float):
-            yield Mistake(
-                where, str(value), "dates and times are not permitted; use a number or quoted text"
-            )
+    if isinstance(value, dict | list) and depth >= MAX_DEPTH:
+        yield Mistake(where, None, TOO_DEEP)
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _out_of_bounds(f"{where}.{key}", item, depth + 1)
+    elif isinstance(value, list):
+        for at, item in enumerate(value):
+            yield from _out_of_bounds(f"{where}[{at}]", item, depth + 1)
+    elif isinstance(value, int) and value.bit_length() >= INTEGER_BITS:
+        yield Mistake(where, value, TOO_LONG)
+    elif isinstance(value, str) and "\0" in value:
+        yield Mistake(where, value, "text must not contain NUL")
+    elif not isinstance(value, str | int | float):
+        why = "dates and times are not permitted; use a number or quoted text"
+        yield Mistake(where, str(value), why)
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
@@ -84,9 +80,7 @@ def merge(base: Tables, top: Tables) -> Tables:
     return merged
 
 
-def override(
-    tables: Tables, settings: Sequence[str], mistakes: list[Mistake] | None = None
-) -> Tables:
+def override(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -> Tables:
     """Return the tables with each setting `key.sub=value` applied, in order.
 
     Values are TOML; any other text is taken as a string. A number in a key is an index into a list,
@@ -96,43 +90,34 @@ def override(
         tables: Tables of a config, which are not changed.
         settings: The settings.
         mistakes: Gets every mistake; the settings without one are applied.
-
-    Raises:
-        ConfigError: There are mistakes, and no list for them.
     """
-    raises = mistakes is None
-    mistakes = [] if mistakes is None else mistakes
     for setting in settings:
         try:
-            keys, value = _parts(setting)
-            tables = _put(tables, keys, value)
+            keys, text = _parts(setting)
+            tables = _put(tables, keys, _value(text))
         except LookupError as error:
             mistakes.append(Mistake("--set", setting, str(error.args[0])))
         except ConfigError as error:
             mistakes += [Mistake("--set", setting, mistake.why) for mistake in error.mistakes]
-    if mistakes and raises:
-        raise ConfigError(mistakes)
     return tables
 
 
-def _parts(setting: str) -> tuple[list[str], Any]:
-    """Return the keys and the value of a setting. Raises `LookupError` and `ConfigError`."""
+def _parts(setting: str) -> tuple[list[str], str]:
+    """Return the keys and the value of a setting. Raises `LookupError`."""
     found = SETTING.fullmatch(setting)
-    if found is None or "\0" in setting:
-        raise LookupError("must be key=value, as in clock.speed=2")
-    parts = re.findall(PART, found[1])
-    if len(parts) > MAX_DEPTH:
-        raise LookupError(TOO_DEEP)
-    return [_key(part) for part in parts], _value(found[2])
-
-
-def _key(part: str) -> str:
-    if part[0] not in "\"'":
-        return part
+    keys: list[str] = []
     try:
-        return str(tomllib.loads(f"key = {part}")["key"])
-    except tomllib.TOMLDecodeError as error:
-        raise LookupError(f"{part} is not a valid key: {error}") from None
+        node: Any = load_toml(f"{found[1]} = 0") if found else 0
+    except tomllib.TOMLDecodeError:
+        node = 0
+    except ValueError as error:
+        raise LookupError(str(error)) from None
+    while isinstance(node, dict):
+        ((key, node),) = node.items()
+        keys.append(key)
+    if found is None or not keys:
+        raise LookupError("must be key=value, as in clock.speed=2")
+    return keys, found[2]
 
 
 def _value(text: str) -> Any:
@@ -166,3 +151,12 @@ def table_of(place: str) -> str:
     """Return the table of a place, as "board.servo" of "board.servo.rate_hz = 3"."""
     kind, *name = re.split(r"[.\[=]", place.replace("mailbox ", "board."))[:2]
     return f"{kind}.{name[0]}" if name and kind in ("board", "host") else kind
+
+
+def without(tables: Tables, broken: frozenset[str]) -> Tables:
+    """Return tables without those with mistakes, as "robot" or "board.servo"."""
+    kept = {key: value for key, value in tables.items() if key not in broken}
+    for key in ("board", "host"):
+        own = kept.get(key, {})
+        kept[key] = {name: t for name, t in own.items() if f"{key}.{name}" not in broken}
+    return kept

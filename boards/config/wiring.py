@@ -8,16 +8,16 @@ A port's source is a mailbox, or is relative to its board: "above.command", "bel
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 from pydantic import BaseModel
 
 from rack.backplane.errors import ClockError
-from rack.backplane.layout import Protocol, Role
+from rack.backplane.layout import Protocol
 from rack.backplane.message import Message
 from rack.backplane.message_type import MessageType
 from rack.boards.classes import find_class
@@ -28,55 +28,32 @@ from rack.boards.config.schema import (
     Sources,
     TaskPlace,
 )
+from rack.boards.errors import Mistake
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import Source, mailboxes_of
 from rack.levels.host_program import HostProgram
-from rack.levels.level import Executor, Output, Planner, Program
-from rack.levels.operator import Commands, OperatorCommand
+from rack.levels.level import Executor, MadePorts, Output, Planner, Program
+from rack.levels.operator import OperatorCommand
 from rack.levels.ports import InputPort
 
 OWN_OPERATOR = "own.operator"
 LevelClass = type[Executor] | type[Planner] | type[HostProgram]
 
 
-class Connection(NamedTuple):
-    """How a config connects an input: the key that says so, what it gives there, and the mailboxes
-    that follow."""
-
-    port: str
-    entry: InputPort[Any]
-    key: str
-    given: Sources
-    mailboxes: Sources
-    is_there: bool = True
-    """Whether the boards that it names exist."""
-
-    @property
-    def fits(self) -> bool:
-        """Whether the port can read so many mailboxes."""
-        count = len(self.mailboxes)
-        return count > 0 or self.entry.optional if self.entry.many else count == 1
-
-    @property
-    def source(self) -> Source:
-        """What the port reads: a mailbox, or mailboxes by board, or by their names if one board
-        writes several."""
-        if not self.entry.many:
-            return self.mailboxes[0]
-        boards = [box.partition(".")[0] for box in self.mailboxes]
-        found = zip(boards, self.mailboxes, strict=True)
-        return {board if boards.count(board) == 1 else box: box for board, box in found}
-
-
 @dataclass(frozen=True)
 class TaskPorts:
     """The class of a task or host board, and the mailbox of each port.
 
-    `reads` holds a mailbox by port or, for a port that reads many, a dict of mailboxes by board;
-    `inputs` and `outputs` the declarations of the ports; `exchange` when an executor reads them;
-    `connections` where the inputs that its class declares are connected; not `is_whole` if mistakes
-    keep some ports unknown.
+    Attributes:
+        place: Its place in the config.
+        kind: Its class.
+        inputs: The declarations of what it reads, by port.
+        outputs: The declarations of what it writes, by port.
+        reads: A mailbox by port or, for a port that reads many, a dict of mailboxes by board.
+        exchange: When an executor reads its ports.
+        mistakes: Why inputs that the class declares are not connected.
+        is_whole: False if mistakes keep some ports unknown.
     """
 
     place: TaskPlace
@@ -85,8 +62,8 @@ class TaskPorts:
     outputs: Mapping[str, Output[Any]]
     reads: Mapping[str, Source]
     exchange: Mapping[str, ExchangeConfig]
-    connections: tuple[Connection, ...]
-    is_whole: bool = True
+    mistakes: Sequence[Mistake]
+    is_whole: bool
 
     @property
     def task(self) -> str:
@@ -118,173 +95,214 @@ class TaskPorts:
         return () if source is None else mailboxes_of(self.reads.get(source.name, {}))
 
 
-def rewired(config: RackConfig, place: TaskPlace) -> Mapping[str, Sources]:
-    """Return the mailboxes that a config gives to ports of a task or host board, by port."""
-    found: Mapping[str, Sources] = getattr(config.table(place), place.reads_key)
-    return found
-
-
-def declared_ports(config: RackConfig, place: TaskPlace) -> TaskPorts:
-    """Return the ports that the class of a task or host board declares. Raises `LookupError` if
-    there is none."""
-    kind, outputs = _class(place.target, place.role)
-    connections = tuple(_connections(config, place, kind.inputs))
-    reads = {c.port: c.source for c in connections if c.fits and c.is_there}
-    exchange = config.board[place.board].exchange if place.role == "executor" else {}
-    return TaskPorts(place, kind, kind.inputs, outputs, reads, exchange, connections)
-
-
-def with_made_ports(
-    config: RackConfig, ports: TaskPorts, types: Mapping[str, type[Message]]
+def _connected(
+    config: RackConfig, place: TaskPlace, kind: LevelClass, types: Mapping[str, type[Message]]
 ) -> TaskPorts:
-    """Add the ports that the config makes: their types may be those of other mailboxes."""
-    if not issubclass(ports.kind, Executor):
-        return ports
-    made = ports.kind.made_ports(config.board[ports.place.board].params, types)
+    """Return the ports of a task or host board.
+
+    Args:
+        config: The config of the rack.
+        place: The place of the task in it.
+        kind: Its class.
+        types: The message classes of mailboxes, as far as they are known. Ports that the config
+            makes have the types of other mailboxes.
+    """
+    mistakes: list[Mistake] = []
+    reads = dict(_connections(config, place, kind.inputs, mistakes))
+    exchange: Mapping[str, ExchangeConfig] = {}
+    made = MadePorts()
+    if issubclass(kind, Executor):
+        board = config.board[place.board]
+        exchange = board.exchange
+        made = kind.made_ports(board.params, types)
     for port, entry in made.inputs.items():
         entry.name = port
-    return replace(
-        ports,
-        inputs={**ports.inputs, **made.inputs},
-        outputs={**ports.outputs, **made.outputs},
-        reads={**ports.reads, **{port: entry.source for port, entry in made.inputs.items()}},
-        is_whole=made.is_whole,
-    )
+        reads[port] = entry.source
+    outputs = {**kind.outputs, **made.outputs}
+    if exchange and made.is_whole:
+        # An output of that name of its own stays.
+        outputs.setdefault(EXCHANGE, Output(exchange_message(reads)))
+    inputs = {**kind.inputs, **made.inputs}
+    return TaskPorts(place, kind, inputs, outputs, reads, exchange, mistakes, made.is_whole)
 
 
-def with_exchange(ports: TaskPorts) -> TaskPorts:
-    """Add the mailbox of the exchange to a board whose config has one; one of that name of its own
-    stays."""
-    if not ports.exchange or not ports.is_whole:
-        return ports
-    outputs = dict(ports.outputs)
-    outputs.setdefault(EXCHANGE, Output(exchange_message(ports.reads)))
-    return replace(ports, outputs=outputs)
-
-
-def _class(wanted: str, role: Role) -> tuple[LevelClass, Mapping[str, Output[Any]]]:
-    if role == "host":
-        program = find_class(wanted, HostProgram)
-        if many := [port for port, entry in program.inputs.items() if entry.many]:
-            raise LookupError(
-                f"port '{many[0]}' reads many mailboxes; permitted on the host side: one"
-            )
-        return program, program.outputs
-    if role == "executor":
-        executor = find_class(wanted, Executor)
-        return executor, executor.outputs
-    planner = find_class(wanted, Planner)
-    if not planner.outputs:
-        raise LookupError("the class has no 'output', the port of its plan")
-    return planner, planner.outputs
+def _class(place: TaskPlace) -> LevelClass:
+    """Return the class of a task or host board. Raises `LookupError` if there is none."""
+    if place.role == "executor":
+        return find_class(place.target, Executor)
+    if place.role == "planner":
+        planner = find_class(place.target, Planner)
+        if not planner.outputs:
+            raise LookupError("the class has no 'output', the port of its plan")
+        return planner
+    program = find_class(place.target, HostProgram)
+    if many := [port for port, entry in program.inputs.items() if entry.many]:
+        raise LookupError(f"port '{many[0]}' reads many mailboxes; permitted on the host side: one")
+    return program
 
 
 def _connections(
-    config: RackConfig, place: TaskPlace, inputs: Mapping[str, InputPort[Any]]
-) -> Iterator[Connection]:
-    own = {place.board}
-    wired = rewired(config, place)
+    config: RackConfig,
+    place: TaskPlace,
+    inputs: Mapping[str, InputPort[Any]],
+    mistakes: list[Mistake],
+) -> Iterator[tuple[str, Source]]:
+    """Yield what each input reads; of inputs that cannot be connected, add the mistakes."""
     table = config.table(place)
+    wired = config.rewired(place)
     neighbours = {"own": (place.board,), "above": getattr(table, "above", ()), "below": table.below}
+    others = config.board.keys() - {place.board}
     for port, entry in inputs.items():
         start, _, rest = entry.source.partition(".")
-        if port in wired:
-            yield Connection(port, entry, f"{place.reads_key}.{port}", wired[port], wired[port])
-            continue
         boards = neighbours.get(start, (start,))
-        is_there = start not in ("above", "below") or {*boards} <= config.board.keys() - own
-        yield Connection(
-            port, entry, start, boards, tuple(f"{board}.{rest}" for board in boards), is_there
-        )
+        key = f"{place.reads_key}.{port}" if port in wired else start
+        mailboxes = wired.get(port, tuple(f"{board}.{rest}" for board in boards))
+        what = f"port '{port}' of the {place.role}"
+        if not mailboxes and not entry.optional:
+            mistakes.append(Mistake(f"{place.table}.{start}", None, f"missing; {what} needs it"))
+        elif len(mailboxes) > 1 and not entry.many:
+            why = f"{what} reads one mailbox, not {len(mailboxes)}"
+            mistakes.append(Mistake(f"{place.table}.{key}", wired.get(port, boards), why))
+        elif key not in ("above", "below") or others.issuperset(boards):
+            yield port, _by_board(mailboxes) if entry.many else mailboxes[0]
+
+
+def _by_board(mailboxes: Sources) -> Source:
+    """Return mailboxes by board, or by their names if one board writes several."""
+    boards = [box.partition(".")[0] for box in mailboxes]
+    found = zip(boards, mailboxes, strict=True)
+    return {board if boards.count(board) == 1 else box: box for board, box in found}
 
 
 class Wiring:
     """The ports of all tasks and host boards, connected.
 
-    `broken` names the tables that the config lacks since they have mistakes of their own, as in
-    "board.servo".
+    Attributes:
+        config: The config of the rack.
+        broken: Tables that the config lacks since they have mistakes of their own, as in
+            "board.servo".
+        ports: The ports of all tasks and host boards that have a class, in order.
+        missing: Why there is no class, of the others.
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
         self.config = config
         self.broken = broken
-        self.broken_boards = [
-            place.removeprefix("board.") for place in broken if place.startswith("board.")
-        ]
+        kinds: dict[TaskPlace, LevelClass] = {}
         self.missing: dict[TaskPlace, str] = {}
-        """Why there is no class, of the tasks and host boards without one."""
-        self.ports = self._connected()
-        """The ports of all others, in order."""
-        self.tasks = [ports for ports in self.ports.values() if ports.place.role != "host"]
-        self.hosts = [ports for ports in self.ports.values() if ports.place.role == "host"]
-        self.writers: dict[str, tuple[TaskPorts, Output[Any]]] = {}
+        for place in (*config.tasks(), *config.hosts()):
+            try:
+                kinds[place] = _class(place)
+            except LookupError as error:
+                self.missing[place] = str(error.args[0])
+        types: dict[str, type[Message]] = {}
+        while True:
+            self.ports = {
+                place: _connected(config, place, kind, types) for place, kind in kinds.items()
+            }
+            written = {
+                box: ports.outputs[port].message
+                for ports in self.ports.values()
+                for port, box in ports.writes.items()
+            }
+            # What one board makes another may pass on.
+            if len(written) == len(types):
+                return
+            types = written
+
+    @property
+    def broken_boards(self) -> list[str]:
+        """The boards whose tables are broken."""
+        return [name.removeprefix("board.") for name in self.broken if name.startswith("board.")]
+
+    @property
+    def tasks(self) -> list[TaskPorts]:
+        """The ports of the tasks."""
+        return [ports for ports in self.ports.values() if ports.place.role != "host"]
+
+    @property
+    def hosts(self) -> list[TaskPorts]:
+        """The ports of the host boards."""
+        return [ports for ports in self.ports.values() if ports.place.role == "host"]
+
+    @cached_property
+    def writers(self) -> dict[str, tuple[TaskPorts, Output[Any]]]:
         """The first task that writes each mailbox, and its declaration."""
-        self.reading: dict[str, list[tuple[TaskPorts, str]]] = {}
-        """Tasks and their ports that read each mailbox."""
+        found: dict[str, tuple[TaskPorts, Output[Any]]] = {}
         for ports in self.ports.values():
             for port, mailbox in ports.writes.items():
-                self.writers.setdefault(mailbox, (ports, ports.outputs[port]))
+                found.setdefault(mailbox, (ports, ports.outputs[port]))
+        return found
+
+    @cached_property
+    def reading(self) -> dict[str, list[tuple[TaskPorts, str]]]:
+        """Tasks and their ports that read each mailbox."""
+        found: dict[str, list[tuple[TaskPorts, str]]] = {}
+        for ports in self.ports.values():
             for port, mailbox in ports.sources:
-                self.reading.setdefault(mailbox, []).append((ports, port))
-        self.operated = {
-            f"{board}.operator": OperatorCommand.message_type for board in commandable(config)
-        }
-        """The message types of operators' mailboxes."""
-        self.from_host = {mailbox for ports in self.hosts for mailbox in ports.writes.values()}
+                found.setdefault(mailbox, []).append((ports, port))
+        return found
+
+    @cached_property
+    def operated(self) -> list[str]:
+        """The operators' mailboxes."""
+        found = executors(self.config).items()
+        return [f"{board}.operator" for board, kind in found if takes_commands(kind)]
+
+    @cached_property
+    def types(self) -> dict[str, MessageType]:
+        """The message type of every mailbox."""
+        written = {name: output.message.message_type for name, (_, output) in self.writers.items()}
+        return written | dict.fromkeys(self.operated, OperatorCommand.message_type)
+
+    @property
+    def names(self) -> str:
+        """The names of all mailboxes, as a list to read."""
+        return ", ".join(self.types)
+
+    @cached_property
+    def from_host(self) -> set[str]:
         """The mailboxes that host boards write."""
-        self.passed = {
+        return {mailbox for ports in self.hosts for mailbox in ports.writes.values()}
+
+    @cached_property
+    def passed(self) -> dict[str, str]:
+        """The mailboxes that bus adapters write, with those that they pass on."""
+        return {
             f"{ports.place.board}.{port}": source
             for ports in self.tasks
             if ports.joins_sides
             for port, source in ports.sources
         }
-        """The mailboxes that bus adapters write, with those that they pass on."""
-        self.to_host = {
-            mailbox for mailbox, source in self.passed.items() if source not in self.from_host
-        }
-        self.of_host = self.from_host | self.to_host
+
+    @cached_property
+    def to_host(self) -> set[str]:
+        """The mailboxes that bus adapters write for host boards."""
+        return {mailbox for mailbox, box in self.passed.items() if box not in self.from_host}
+
+    @property
+    def of_host(self) -> set[str]:
         """The host side. Only a bus adapter reads on one side and writes on the other."""
-        self.every = dict(self._periods())
+        return self.from_host | self.to_host
+
+    @cached_property
+    def every(self) -> dict[str, int]:
         """The periods of the boards whose rate is on the clock's grid, ticks."""
-        whole = {ports.task for ports in self.ports.values() if ports.is_whole}
-        self.unknown = {
-            place.board for place in (*self.missing, *self.ports) if place.name not in whole
-        }
+        found: dict[str, int] = {}
+        for name in self.config.board if "clock" not in self.broken else ():
+            with suppress(ClockError):
+                found[name] = self.config.every(name)
+        return found
+
+    @cached_property
+    def unknown(self) -> set[str]:
         """Boards with mistakes of their own: a reader that lacks a mailbox of theirs is not at
         fault."""
-        self.unknown |= {place.removeprefix("board.").removeprefix("host.") for place in broken}
-        self.unknown |= {LAN} if "adapter" in broken or is_taken(config) else set()
-
-    def _connected(self) -> dict[TaskPlace, TaskPorts]:
-        config = self.config
-        declared = dict[TaskPlace, TaskPorts]()
-        types = dict[str, type[Message]]()
-        for place in (*config.tasks(), *config.hosts()):
-            try:
-                declared[place] = declared_ports(config, place)
-            except LookupError as error:
-                self.missing[place] = str(error.args[0])
-        found = declared
-        before = -1
-        # What one board makes another may pass on.
-        while len(types) != before:
-            before = len(types)
-            types = {
-                box: p.outputs[port].message
-                for p in found.values()
-                for port, box in p.writes.items()
-            }
-            found = {
-                place: with_made_ports(config, ports, types) for place, ports in declared.items()
-            }
-        return {place: with_exchange(ports) for place, ports in found.items()}
-
-    def _periods(self) -> Iterator[tuple[str, int]]:
-        if "clock" in self.broken:
-            return
-        for name in self.config.board:
-            with suppress(ClockError):
-                yield name, self.config.every(name)
+        found = {place.board for place in self.missing}
+        found |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
+        found |= {place.removeprefix("board.").removeprefix("host.") for place in self.broken}
+        is_lan_unknown = "adapter" in self.broken or is_taken(self.config)
+        return found | {LAN} if is_lan_unknown else found
 
     @property
     def params(self) -> Iterable[tuple[str, type[BaseModel]]]:
@@ -302,27 +320,15 @@ class Wiring:
         )
 
     def is_known(self, mailbox: str) -> bool:
-        """Say whether a mailbox exists, or may: its board has mistakes of its own."""
-        return self.type_of(mailbox) is not None or mailbox.partition(".")[0] in self.unknown
-
-    def type_of(self, mailbox: str) -> MessageType | None:
-        """Return the message type of a mailbox; None if it does not exist."""
-        return (
-            self.writers[mailbox][1].message.message_type
-            if mailbox in self.writers
-            else self.operated.get(mailbox)
-        )
-
-    def names(self) -> str:
-        """Return the names of all mailboxes, as a list to read."""
-        return ", ".join([*self.writers, *self.operated])
+        """Return whether a mailbox exists, or may: its board has mistakes of its own."""
+        return mailbox in self.types or mailbox.partition(".")[0] in self.unknown
 
     def readers(self, mailbox: str) -> tuple[str, ...]:
         """Return the tasks and host boards that read a mailbox."""
         return tuple(dict.fromkeys(ports.task for ports, _ in self.reading.get(mailbox, ())))
 
     def is_of_network(self, name: str) -> bool:
-        """Say whether a board is the network adapter, or a mailbox one that it writes."""
+        """Return whether a board is the network adapter, or a mailbox one that it writes."""
         return self.config.adapter.lan is not None and name.partition(".")[0] == LAN
 
     def protocol(self, mailbox: str) -> Protocol:
@@ -351,14 +357,9 @@ def executors(config: RackConfig) -> dict[str, type[Executor]]:
     return found
 
 
-def commandable(config: RackConfig) -> dict[str, Commands]:
-    """Return the commands that each level takes from an operator, by board; levels that take none
-    are omitted."""
-    return {
-        name: executor.commands
-        for name, executor in executors(config).items()
-        if any(port.source == OWN_OPERATOR for port in executor.inputs.values())
-    }
+def takes_commands(executor: type[Executor]) -> bool:
+    """Return True if a level reads the commands of an operator."""
+    return any(port.source == OWN_OPERATOR for port in executor.inputs.values())
 
 
 def is_taken(config: RackConfig) -> bool:

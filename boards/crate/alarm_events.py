@@ -18,8 +18,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import geom_name
+from rack.boards.config.loader import read_stored
 from rack.boards.config.published import Levels, PublishedRack
-from rack.boards.config.resolved import read_stored
 from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
 from rack.boards.faults.bounds import counting
 from rack.boards.faults.describe import board_of, joint_name, subject_of

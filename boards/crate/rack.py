@@ -25,8 +25,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.config.commands import asked, request
-from rack.boards.config.outside import outside
-from rack.boards.config.resolved import classes, load, resolve
+from rack.boards.config.loader import load
+from rack.boards.config.resolved import classes, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.crate.clean import remove_dead, remove_own
@@ -229,7 +229,7 @@ class Rack:
         if self.config.clock.mode != "lockstep":
             return "they are taken in lockstep; add --lockstep"
         # In a replay what came from outside is in the wiring.
-        return "" if self._plan.is_replay else outside(self.config)
+        return "" if self._plan.is_replay else self.config.outside
 
     def _inject(self) -> None:
         """Fill the tables with the config's faults and commands; start the faults that are

@@ -35,14 +35,11 @@ from typing import Any
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.mailbox.mailbox import Reader
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import Message, State, Status, field, make_message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.host.entries import (
-    NEVER,
     AdapterEntry,
     AdapterParams,
     Crossing,
@@ -51,6 +48,7 @@ from rack.boards.host.entries import (
     Inward,
     Outward,
     Replayed,
+    last_written,
 )
 from rack.boards.wiring import Entries
 from rack.levels.errors import CannotGoOn
@@ -116,47 +114,41 @@ class BusAdapter(Adapter):
         instead."""
         layout = segment.layout
         hosts = {host.name for host in layout.hosts}
-        self._resume_counts(open_observer(segment, f"{self.context.board}.{STATUS}"))
+        board = self.context.board
+        # What the process before this one has written, if the bridge is restarted.
+        status, tick = last_written(segment, f"{board}.{STATUS}")
         for port, table in self._tables.items():
-            # What the process before this one has written, if the bridge is restarted.
-            own = open_observer(segment, f"{self.context.board}.{port}")
-            before = own.peek()
+            count = self._counts[port]
+            if status is not None:
+                count.resume(getattr(status, port), tick)
+            own = f"{board}.{port}"
+            before, since = last_written(segment, own)
             writer = layout.mailbox(table.source).writer
             entry: Crossing
             if writer not in hosts:
-                entry = Outward(segment, own.spec.name, port, table, self._counts[port])
+                entry = Outward(segment, own, port, table, count)
             else:
-                if before.is_there:
-                    self._before[port] = bytes(before.message.raw)
+                if before is not None:
+                    self._before[port] = bytes(before.raw)
                 if entries is None:
                     self._hosts[writer] = segment.block(writer)
-                    entry = Inward(segment, port, table, self._counts[port])
+                    entry = Inward(segment, port, table, count)
                 else:
-                    since = own.newest if before.is_there else NEVER
                     entry = Replayed(entries[port], port, table.asynchronous, since)
             self._entries.append((table, entry))
         if segment.words[System.LOCKSTEP] and entries is None:
-            board = self.context.board
             self._turns = [
                 HostTurn(segment, host) for host in layout.hosts if board in layout.pacers(host)
             ]
         if entries is not None:
             self._statuses = Replayed(entries[STATUS], STATUS, is_sent=False)
 
-    def _resume_counts(self, status: Reader) -> None:
-        before = status.peek()
-        if not before.is_there:
-            return
-        for port, count in self._counts.items():
-            count.resume(getattr(before.message, port), status.newest)
-
     def process(self, tick: int) -> None:
         """Exchange the entries that are due; then, in lockstep, let programs run."""
-        if self._before:
-            for port, message in self._before.items():
-                out = self.ports[port]
-                (out.message if isinstance(out, Sender) else out).raw[:] = message
-            self._before.clear()
+        for port, message in self._before.items():
+            out = self.ports[port]
+            (out.message if isinstance(out, Sender) else out).raw[:] = message
+        self._before.clear()
         cycle = (tick - self.context.phase) // self.context.every
         for table, entry in self._entries:
             if table.is_due(cycle):

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from pydantic import Field as Key
 from pydantic import ValidationError, model_validator
@@ -27,20 +27,19 @@ RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clea
 """Names that the status of a bridge needs for itself."""
 
 
+def counter(doc: str) -> Any:
+    """Declare a counter in the status of an adapter."""
+    return field("u4", unit="1", doc=doc)
+
+
 class AdapterEntry(Message, version=1):
     """One entry, in the status of its bridge."""
 
-    passed: int = field("u4", unit="1", doc="messages passed to the other side")
-    refused: int = field(
-        "u4", unit="1", doc="messages refused: damaged, forged, or not what its type permits"
-    )
-    superseded: int = field(
-        "u4", unit="1", doc="messages that a newer one overtook before the exchange"
-    )
-    full: int = field(
-        "u4", unit="1", doc="messages that the host board could not send, since too many waited"
-    )
-    waiting: int = field("u4", unit="1", doc="messages that wait for the next cycles")
+    passed: int = counter("messages passed to the other side")
+    refused: int = counter("messages refused: damaged, forged, or not what its type permits")
+    superseded: int = counter("messages that a newer one overtook before the exchange")
+    full: int = counter("messages that the host board could not send, since too many waited")
+    waiting: int = counter("messages that wait for the next cycles")
     arrived: int = field(
         unit="tick", doc="tick at which the newest message reached the other side; -1: none yet"
     )
@@ -106,8 +105,7 @@ class AdapterParams(Table):
 @dataclass
 class EntryCount:
     """The counts of one entry: the fields of `AdapterEntry`. `written`: tick at which the newest
-    message
-    was written."""
+    message was written."""
 
     passed: int = 0
     refused: int = 0
@@ -134,15 +132,6 @@ class EntryCount:
         """Write the counts into the status of a cycle."""
         age = NEVER if self.written == NEVER else tick - self.written
         fill_counts(record, (*(getattr(self, name) for name in _COUNTED), age))
-
-
-class Crossing(Protocol):
-    """One entry, at work."""
-
-    def exchange(
-        self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
-    ) -> object:
-        """Exchange, in a cycle in which that is due."""
 
 
 class Inward:
@@ -218,6 +207,14 @@ class Outward:
                 semaphore.release()
 
 
+def last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None, int]:
+    """Return the newest message of a mailbox, with the tick at which it was written; None and
+    `NEVER` if there is none."""
+    own = open_observer(segment, mailbox)
+    reading = own.peek()
+    return (reading.message, own.newest) if reading.is_there else (None, NEVER)
+
+
 class Replayed:
     """A mailbox of an adapter in a replay: what the recorded run wrote to it, at the same ticks.
 
@@ -246,3 +243,7 @@ class Replayed:
             if self._is_sent:
                 out.send(basis)
         return self._at > before
+
+
+Crossing = Inward | Outward | Replayed
+"""One entry, at work: `exchange` is called in the cycles in which that is due."""

@@ -45,17 +45,36 @@ def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, An
     by_subject: dict[str, list[Rule]] = {}
     is_known = has_tls(table)
     if is_operator:
-        by_subject[ANYONE] = _operator(own)
+        # It may set the emergency stop of any rack.
+        by_subject[ANYONE] = [
+            (IN, ("declare_queryable",), [estop_key("*", "*")]),
+            (OUT, ("query",), [estop_key(own, "*")]),
+            (IN, ("reply",), [estop_key(own, "*")]),
+            (OUT, WATCH_TOKENS, [ALL_ALIVE]),
+            (IN, TOKEN, [ALL_ALIVE]),
+        ]
     elif not is_known:
         exported = [out_key(own, entry.source) for entry in table.exports.values()]
-        by_subject[ANYONE] = [*_visible(own), *_shown(exported), *_compared(own)]
+        by_subject[ANYONE] = [
+            *_visible(own),
+            *_shown(exported),
+            # Others may compare their clocks with this rack's: messages of unknown age are no use.
+            (OUT, SUBSCRIBE, [ping_key("*", own)]),
+            (IN, PUT, [ping_key("*", own)]),
+            (IN, SUBSCRIBE, [pong_key("*", "*")]),
+            (OUT, PUT, [pong_key(own, "*")]),
+        ]
     for peer in dict.fromkeys([*table.racks, *table.estop_from]):
         rules = by_subject.setdefault(peer if is_known else ANYONE, [])
         rules += _visible(own)
         if peer in table.racks:
             rules += _exchange(own, peer, table)
         if peer in table.estop_from:
-            rules += _stopped_by(own, peer)
+            rules += [
+                (OUT, ("declare_queryable",), [estop_key("*", own)]),
+                (IN, ("query",), [estop_key(peer, own)]),
+                (OUT, ("reply",), [estop_key(peer, own)]),
+            ]
     return _configured(by_subject)
 
 
@@ -81,66 +100,34 @@ def _shown(keys: Sequence[str]) -> list[Rule]:
     return [(IN, SUBSCRIBE, keys), (OUT, PUT, keys)] if keys else []
 
 
-def _compared(own: str) -> list[Rule]:
-    """Return the rules for others that may compare their clocks with this rack's: messages of
-    unknown age are no use."""
-    return [
-        (OUT, SUBSCRIBE, [ping_key("*", own)]),
-        (IN, PUT, [ping_key("*", own)]),
-        (IN, SUBSCRIBE, [pong_key("*", "*")]),
-        (OUT, PUT, [pong_key(own, "*")]),
-    ]
-
-
 def _visible(own: str) -> list[Rule]:
     """Return the rules for others that may know that this rack is there."""
     return [(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(own)]), (OUT, TOKEN, [any_alive(own)])]
 
 
-def _stopped_by(own: str, peer: str) -> list[Rule]:
-    """Return the rules for a peer that may set the emergency stop."""
-    return [
-        (OUT, ("declare_queryable",), [estop_key("*", own)]),
-        (IN, ("query",), [estop_key(peer, own)]),
-        (OUT, ("reply",), [estop_key(peer, own)]),
-    ]
-
-
-def _operator(own: str) -> list[Rule]:
-    """Return the rules for setting the emergency stop of any rack."""
-    return [
-        (IN, ("declare_queryable",), [estop_key("*", "*")]),
-        (OUT, ("query",), [estop_key(own, "*")]),
-        (IN, ("reply",), [estop_key(own, "*")]),
-        (OUT, WATCH_TOKENS, [ALL_ALIVE]),
-        (IN, TOKEN, [ALL_ALIVE]),
-    ]
-
-
 def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
-    rules = []
-    policies = []
-    subjects: list[dict[str, Any]] = []
-    for subject, allowed in by_subject.items():
-        names = []
-        for at, (flow, messages, keys) in enumerate(allowed):
-            names.append(f"{subject}-{at}")
-            rules.append(
-                {
-                    "id": names[-1],
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": list(messages),
-                    "key_exprs": list(keys),
-                }
-            )
-        policies.append({"rules": names, "subjects": [subject]})
-        known = {} if subject == ANYONE else {"cert_common_names": [subject]}
-        subjects.append({"id": subject, **known})
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
+        "rules": [
+            {
+                "id": f"{subject}-{at}",
+                "permission": "allow",
+                "flows": [flow],
+                "messages": list(messages),
+                "key_exprs": list(keys),
+            }
+            for subject, allowed in by_subject.items()
+            for at, (flow, messages, keys) in enumerate(allowed)
+        ],
+        "subjects": [
+            {"id": subject}
+            if subject == ANYONE
+            else {"id": subject, "cert_common_names": [subject]}
+            for subject in by_subject
+        ],
+        "policies": [
+            {"rules": [f"{subject}-{at}" for at in range(len(allowed))], "subjects": [subject]}
+            for subject, allowed in by_subject.items()
+        ],
     }

@@ -13,27 +13,28 @@ In a replay there is no network: see `rack.boards.lan.replayed`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.layout import Layout
-from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import Message, State, Status, field, fill_counts, make_message
+from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Head, System, switch
 from rack.boards.host.adapter import STATUS, Adapter
+from rack.boards.host.entries import last_written
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import RETRY_MS, Carrier, LanLink
+from rack.boards.lan.link import RETRY_MS, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import Peers
 from rack.boards.lan.replayed import ReplayedNetwork
+from rack.boards.lan.status import status_of
 from rack.boards.wiring import Entries
 from rack.levels.errors import LevelError
 from rack.levels.level import Input, LevelContext, MadePorts, Output, TimedOutput
@@ -41,103 +42,6 @@ from rack.levels.peer import PeerPresence, peer_port
 from rack.levels.tables import read_params
 
 _LAUNCH_MASK = (1 << 62) - 1
-
-
-class LanExport(Message, version=1):
-    """Counts of one export, in the status of the network adapter."""
-
-    sent: int = field("u4", unit="1", doc="messages sent")
-    serial: int = field(unit="1", doc="serial of the newest message sent; 0: none")
-
-
-class LanImport(Message, version=1):
-    """Counts of one import, and its newest message, in the status of the network adapter."""
-
-    taken: int = field("u4", unit="1", doc="messages passed to the backplane")
-    missing: int = field(
-        "u4", unit="1", doc="messages sent that never came, or came after a later one"
-    )
-    disordered: int = field(
-        "u4", unit="1", doc="messages that came after a later one, and were not passed"
-    )
-    repeated: int = field("u4", unit="1", doc="messages that came twice")
-    late: int = field("u4", unit="1", doc="messages older than max_age_ms when they came")
-    refused: int = field(
-        "u4",
-        unit="1",
-        doc="messages refused: malformed, unsigned, oversized, or not what its type permits",
-    )
-    unknown_launch: int = field(
-        "u4", unit="1", doc="messages of a launch that is over, or not there"
-    )
-    superseded: int = field(
-        "u4", unit="1", doc="messages that a newer one overtook before the exchange"
-    )
-    launch: int = field(
-        unit="1",
-        doc="number of the launch that wrote the newest message taken; 0: none, or in lockstep",
-    )
-    number: int = field(unit="1", doc="number of that message among those sent from its mailbox")
-    serial: int = field(unit="1", doc="its serial in its mailbox; 0: none")
-    age: int = field(unit="tick", doc="age of its information in this rack's ticks; -1: none yet")
-    age_s: float = field(unit="s", doc="the same in simulated time; -1: none yet")
-
-
-class LanFlaws(Message, version=1):
-    """Counts of what came over the network and was dropped unread, by cause."""
-
-    malformed: int = field(
-        "u4",
-        unit="1",
-        doc="not of this protocol, or of another version of it; in lockstep always 0",
-    )
-    unsigned: int = field(
-        "u4",
-        unit="1",
-        doc="changed on the way, under another key, or not sealed by whom it names; likewise",
-    )
-    oversized: int = field("u4", unit="1", doc="longer than most_bytes; likewise")
-
-
-class LanClocks(Message, version=1):
-    """Counts of the round trips by which racks compare their clocks."""
-
-    taken: int = field("u4", unit="1", doc="round trips measured")
-    answered: int = field("u4", unit="1", doc="pings of other racks answered")
-    withheld: int = field(
-        "u4", unit="1", doc="pings not answered: they came too fast, or from too many racks"
-    )
-    refused: int = field(
-        "u4",
-        unit="1",
-        doc="pings and answers refused: malformed, unsigned, or to nothing that was asked",
-    )
-
-
-class LanDesk(Message, version=1):
-    """Counts of the emergency stops that other machines asked for."""
-
-    answered: int = field(
-        "u4",
-        unit="1",
-        doc="emergency stops from other machines that were set; in lockstep always 0",
-    )
-    refused: int = field("u4", unit="1", doc="emergency stops refused: not permitted; likewise")
-    dropped: int = field(
-        "u4", unit="1", doc="requests dropped: malformed, unsigned or oversized; likewise"
-    )
-
-
-def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
-    """Return the class of an adapter's status: a group for each export and import."""
-    groups = {
-        "clocks": field(LanClocks, doc="round trips to compare clocks; none in lockstep"),
-        **{f"export_{port}": field(LanExport, doc=f"export {port}") for port in exports},
-        **{f"import_{port}": field(LanImport, doc=f"import {port}") for port in imports},
-        "desk": field(LanDesk, doc="emergency stops from other machines"),
-        "flaws": field(LanFlaws, doc="all that came and was dropped unread, by cause"),
-    }
-    return make_message("lan_status", 1, Status, groups)
 
 
 class LanAdapter(Adapter):
@@ -208,10 +112,9 @@ class LanAdapter(Adapter):
         # come.
         seen_by = words[System.TICK] + self._grid.ticks_in((table.lease_ms + RETRY_MS[1]) * 1e6)
         for peer in self._peers:
-            if (
-                before := open_observer(segment, f"{board}.{peer_port(peer.rack)}").peek()
-            ).is_there:
-                peer.resume(before.message, seen_by)
+            before, _ = last_written(segment, f"{board}.{peer_port(peer.rack)}")
+            if before is not None:
+                peer.resume(before, seen_by)
         self._imports = {
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack], self._grid)
             for port, entry in table.imports.items()
@@ -228,14 +131,14 @@ class LanAdapter(Adapter):
         names = self.names(self.context.params)
         subjects = {name: names.index(name) for name in table.estop_from}
         self._desk = Desk(segment, self._grid, subjects, self.findings)
-        observer = open_observer(segment, f"{board}.{STATUS}")
-        if (before := observer.peek()).is_there:
+        status, tick = last_written(segment, f"{board}.{STATUS}")
+        if status is not None:
             for port, export in self._exports.items():
-                export.resume(getattr(before.message, f"export_{port}"))
+                export.resume(getattr(status, f"export_{port}"))
             for port, entry in self._imports.items():
-                entry.resume(getattr(before.message, f"import_{port}"), observer.newest)
-            self._desk.resume(before.message.desk)
-            self._flaws = before.message.flaws.tolist()
+                entry.resume(getattr(status, f"import_{port}"), tick)
+            self._desk.resume(status.desk)
+            self._flaws = status.flaws.tolist()
         if self._grid.is_lockstep and table.racks:
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
 
@@ -247,31 +150,27 @@ class LanAdapter(Adapter):
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume(self._flaws)
         barrier = self._barrier
-        carrier: Carrier = barrier or link
         # A step has one seal for all that is in it.
         sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
         for entry in self._imports.values():
-            entry.open(carrier, sealer)
+            entry.open(barrier or link, sealer)
         for export in self._exports.values():
-            export.open(carrier, sealer)
+            export.open(barrier or link, sealer)
         self._clocks.open(link, link.sealer)
         self._desk.open(link, self._launch)
         if barrier is not None:
             barrier.open(link, self._launch)
-            self._recall(barrier)
+            # The adapter before this one may have died with its last step before that left the
+            # machine.
+            if barrier.done >= 0:
+                for export in self._exports.values():
+                    export.recall(barrier.done, self.context.every)
+                barrier.prepare(barrier.done)
         self._peers.watch(
             link.watch_alive() if barrier is None else barrier.changes, barrier is not None
         )
         # Last: whoever sees it knows all subscriptions, and loses nothing.
         link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
-
-    def _recall(self, barrier: Barrier) -> None:
-        """Repeat the last step of an adapter before this one: it may have died with that before it
-        left the machine."""
-        if barrier.done >= 0:
-            for export in self._exports.values():
-                export.recall(barrier.done, self.context.every)
-            barrier.prepare(barrier.done)
 
     def process(self, tick: int) -> None:
         """Exchange what is due."""
@@ -299,22 +198,18 @@ class LanAdapter(Adapter):
         self._report(tick)
 
     def _look(self, tick: int) -> None:
-        """Note who has come, and who has gone."""
+        """Note who has come, and who has gone; demand that the arm stop while a rack that had been
+        there is lost, if it is to stop then."""
         arrivals = self._peers.arrivals
         self.findings += self._peers.look(tick)
-        self._demand_stop(tick)
-        if self._peers.arrivals != arrivals:
-            for export in self._exports.values():
-                export.is_asked = True
-
-    def _demand_stop(self, tick: int) -> None:
-        """Demand that the arm stop while a rack that had been there is lost, if it is to stop
-        then."""
         must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost)
         if must_stop != bool(self._words[System.PEER_STOP] & 1):
             # In lockstep other boards, and the clock, may be ahead in their ticks of this cycle.
             since = tick + self.context.every if self._grid.is_lockstep else tick
             self._words[System.PEER_STOP] = switch(since, must_stop)
+        if self._peers.arrivals != arrivals:
+            for export in self._exports.values():
+                export.is_asked = True
 
     def _report(self, tick: int) -> None:
         own = self.ports[STATUS]

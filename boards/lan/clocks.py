@@ -202,17 +202,16 @@ class Clocks:
                 return
             self._again[asker] = received + ANSWER_NS
             self.answered += 1
-            self._answer(asker, head, received)
-
-    def _answer(self, asker: str, ping: Envelope, received: int) -> None:
-        key = pong_key(self._rack, asker)
-        words = self._segment.words
-        if asker not in self._put:
-            self._put[asker] = self._link.publish(key)
-        grid = words[System.EPOCH_NS], words[System.PERIOD_NS], self._segment.layout.clock_ns
-        payload = _PONG.pack(ping.launch, received, *grid)
-        head = Envelope(_PONG_KIND, self._launch, ping.serial, ping.serial, 0, 0, monotonic_ns())
-        self._put[asker](payload, self._sealer.seal(key, head, payload))
+            key = pong_key(self._rack, asker)
+            if asker not in self._put:
+                self._put[asker] = self._link.publish(key)
+            words = self._segment.words
+            grid = words[System.EPOCH_NS], words[System.PERIOD_NS], self._segment.layout.clock_ns
+            content = _PONG.pack(head.launch, received, *grid)
+            pong = Envelope(
+                _PONG_KIND, self._launch, head.serial, head.serial, 0, 0, monotonic_ns()
+            )
+            self._put[asker](content, self._sealer.seal(key, pong, content))
 
     def exchange(self) -> None:
         """Take the answers that have come, and ask again where it is time."""

@@ -56,6 +56,7 @@ MOST_KNOWN = 1024
 """Certificates of others that are remembered."""
 OTHERS = stat.S_IRWXG | stat.S_IRWXO
 OWNER_ONLY = 0o600
+MINUTE = "%Y-%m-%d %H:%M"
 _ALGORITHM = ECDSA(Prehashed(SHA256()))
 
 
@@ -142,31 +143,21 @@ class Credentials:
                 found[path] = load_certificates(path)
             except Credential as flaw:
                 yield flaw
-        chain = found[self.certificate]
+        authorities, chain = found.values()
         if chain:
-            yield from self._flaws_of(chain, found[self.authority], addresses)
+            if (name := _common_name(chain[0])) != self.rack:
+                yield Credential(self.certificate, f"for '{name}', not for rack '{self.rack}'")
+            if authorities and not _path(chain, authorities):
+                yield Credential(self.certificate, f"not signed by {self.authority.name}")
+            known = _addresses(chain[0])
+            if lost := [address for address in addresses if address not in known]:
+                permitted = ", ".join(known) or "none"
+                why = f"not for address {', '.join(lost)}; for {permitted}"
+                yield Credential(self.certificate, why)
         try:
-            if chain:
-                _ = self.pair
-            else:
-                load_private_key(self.key)
+            _ = self.pair if chain else load_private_key(self.key)
         except Credential as flaw:
             yield flaw
-
-    def _flaws_of(
-        self, chain: list[Certificate], authorities: list[Certificate], addresses: Iterable[str]
-    ) -> Iterator[Credential]:
-        if (name := _common_name(chain[0])) != self.rack:
-            yield Credential(self.certificate, f"for '{name}', not for rack '{self.rack}'")
-        if authorities and not _path(chain, authorities):
-            yield Credential(self.certificate, f"not signed by {self.authority.name}")
-        if lost := [
-            address for address in addresses if address not in (known := _addresses(chain[0]))
-        ]:
-            yield Credential(
-                self.certificate,
-                f"not for address {', '.join(lost)}; for {', '.join(known) or 'none'}",
-            )
 
 
 def _content(path: Path, is_private: bool = False) -> bytes:
@@ -191,14 +182,14 @@ def load_certificates(path: Path) -> list[Certificate]:
         raise Credential(path, "no certificate in PEM form") from None
     now = datetime.now(UTC)
     for certificate in found:
-        if now > certificate.not_valid_after_utc:
-            raise Credential(
-                path, f"expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC"
+        first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+        if not first <= now <= last:
+            why = (
+                f"not valid before {first:{MINUTE}}"
+                if now < first
+                else f"expired on {last:{MINUTE}}"
             )
-        if now < certificate.not_valid_before_utc:
-            raise Credential(
-                path, f"not valid before {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
-            )
+            raise Credential(path, f"{why} UTC")
     return found
 
 

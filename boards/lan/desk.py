@@ -9,7 +9,6 @@ and whoever gets no answer asks again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from xxhash import xxh3_64_intdigest as xxh3
@@ -22,6 +21,7 @@ from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
 from rack.boards.lan.link import LanLink, Question
+from rack.boards.lan.status import LanDesk, zero_counts
 from rack.levels.level import Finding
 
 ESTOP_KIND = xxh3(b"rack estop 1")
@@ -29,15 +29,6 @@ CHECK = 1
 """Flags of a request that is answered as a stop would be, and sets none."""
 REQUESTS_A_CYCLE = 16
 """Requests that wait for a cycle, and that a cycle looks at."""
-
-
-@dataclass
-class DeskCount:
-    """Requests so far: see `rack.boards.lan.adapter.DESK`."""
-
-    answered: int = 0
-    refused: int = 0
-    dropped: int = 0
 
 
 class Desk:
@@ -53,7 +44,7 @@ class Desk:
         self._findings = findings
         self._lines = UtilityLines(segment)
         self._requests: Callable[[], Iterator[Question]] = lambda: iter(())
-        self.count = DeskCount()
+        self.count = zero_counts(LanDesk)
 
     def open(self, link: LanLink, launch: int) -> None:
         """Take requests from now on."""
@@ -64,35 +55,30 @@ class Desk:
 
     def answer(self, tick: int) -> None:
         """Answer the requests that have come."""
-        for request in self._requests():
-            head = self._sealer.opened(request.key, request.envelope, request.payload)
-            asker = request.key.split("/")[1]
-            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or request.payload:
+        for asked, reply in self._requests():
+            head = self._sealer.opened(*asked)
+            asker = asked.key.split("/")[1]
+            if isinstance(head, Flaw) or head.kind != ESTOP_KIND or asked.payload:
                 self.count.dropped += 1
-            elif asker not in self._askers:
+                continue
+            if asker not in self._askers:
                 self.count.refused += 1
-            else:
-                self.count.answered += 1
-                if head.flags != CHECK:
-                    self._stop(asker)
-                self._reply(request, asker, head, tick)
-
-    def _stop(self, asker: str) -> None:
-        if not self._lines.emergency_stop:
-            self._findings.append(Finding(Alarm.REMOTE_STOP, self._askers[asker]))
-        self._lines.latch_emergency_stop()
-
-    def _reply(self, request: Question, asker: str, head: Envelope, tick: int) -> None:
-        # With session and number of the request: it cannot pass for the answer to another one.
-        answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
-        request.reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
+                continue
+            self.count.answered += 1
+            if head.flags != CHECK:
+                if not self._lines.emergency_stop:
+                    self._findings.append(Finding(Alarm.REMOTE_STOP, self._askers[asker]))
+                self._lines.latch_emergency_stop()
+            # With session and number of the request: it cannot pass for the answer to another one.
+            answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
+            reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
 
     def resume(self, record: Any) -> None:
         """Count on from the group of its predecessor's last status."""
-        self.count = DeskCount(*record.tolist())
+        self.count.record[...] = record
 
     def fill(self, record: object) -> None:
         """Write its counts into the group of a status; in lockstep none, since they do not depend
         on ticks alone."""
         if not self._grid.is_lockstep:
-            fill_counts(record, vars(self.count).values())
+            fill_counts(record, self.count.record.item())

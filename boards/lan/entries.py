@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import chain, repeat
 from typing import Any
 
 from rack.backplane.mailbox.host_ring import is_proper
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.mailbox.slots import Slots, message_dtype
+from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import AnyMessage, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, switch
+from rack.boards.host.entries import NEVER
 from rack.boards.lan.config import ExportConfig, ImportConfig
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.link import Arrived, Carrier
+from rack.boards.lan.link import Arrived, LanLink
+from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import NONE, PeerRack
+from rack.boards.lan.status import LanExport, LanImport, zero_counts
 from rack.levels.ports import Sender
 
-NEVER = -1
 LARGEST = 1 << 62
 """Greater than every number of a launch, serial or message: larger values are forged."""
 
@@ -31,85 +31,52 @@ WINDOW = 64
 _WHOLE = (1 << WINDOW) - 1
 
 
-@dataclass
-class ImportCount:
-    """The first fields of `LanImport`, in their order."""
-
-    taken: int = 0
-    missing: int = 0
-    disordered: int = 0
-    repeated: int = 0
-    late: int = 0
-    refused: int = 0
-    unknown_launch: int = 0
-    superseded: int = 0
-
-    @property
-    def values(self) -> tuple[int, ...]:
-        """The counts."""
-        return tuple(vars(self).values())
-
-    def resume(self, record: Any) -> None:
-        """Continue with the counts in a status."""
-        for name in vars(self):
-            setattr(self, name, int(record[name]))
-
-
 class MessageOrder:
     """The messages of one import as they were sent: which is new, which came twice, which are
     missing.
 
-    `launch`, `number` and `serial` are those of the newest one: see `Envelope`.
+    Attributes:
+        count: Counts all of it, and holds number and serial of the newest message.
+        launch: The launch of the newest message: see `Envelope`.
     """
 
-    def __init__(self, count: ImportCount) -> None:
-        self._count = count
+    def __init__(self, count: LanImport) -> None:
+        self.count = count
         self.launch = NONE
-        self.number = 0
-        self.serial = 0
         self._came = 0  # bit n: message `number` - n came
 
-    def resume(self, launch: int, number: int, serial: int) -> None:
-        """Continue after that message; those before it count as having come."""
-        self.launch = launch
-        self.number = number
-        self.serial = serial
+    def resume(self) -> None:
+        """Continue after the message in the counts; those before it count as having come."""
+        self.launch = self.count.launch
         self._came = _WHOLE
 
     def admits(self, head: Envelope) -> bool:
-        """Say whether a message is newer than all before it; count what is missing, or why it is
-        not."""
+        """Return True if a message is newer than all before it. Count what is missing before it, or
+        else why it is not newer."""
+        count = self.count
         if head.launch != self.launch:
-            self._begin(head)
-        if head.serial <= self.serial:
-            self._note_old(head)
-            return False
+            # Resumed in lockstep, where launches are not on record, it is the same one. What
+            # another launch sent before its first message is not missing.
+            if self.launch != NONE or not count.serial:
+                count.number = head.number
+                count.serial = 0
+                self._came = 0
+            self.launch = head.launch
         # A sender that was restarted may give one number twice.
-        step = max(0, head.number - self.number)
-        self._count.missing += max(0, step - 1)
-        self._came = (self._came << min(step, WINDOW) | 1) & _WHOLE
-        self.number = head.number
-        self.serial = head.serial
+        step = head.number - count.number
+        if head.serial <= count.serial:
+            bit = 1 << min(max(0, -step), WINDOW)
+            if head.serial == count.serial or self._came & bit:
+                count.repeated += 1
+            else:
+                count.disordered += 1
+                self._came |= bit & _WHOLE
+            return False
+        count.missing += max(0, step - 1)
+        self._came = (self._came << min(max(0, step), WINDOW) | 1) & _WHOLE
+        count.number = head.number
+        count.serial = head.serial
         return True
-
-    def _begin(self, head: Envelope) -> None:
-        """Begin with the messages of a launch; what it sent before is not missing."""
-        if self.launch == NONE and self.serial:
-            # Resumed in lockstep, where launches are not on record: it is the same one.
-            self.launch = head.launch
-        else:
-            self.launch = head.launch
-            self.number = head.number
-            self.serial = 0
-            self._came = 0
-
-    def _note_old(self, head: Envelope) -> None:
-        bit = 1 << min(max(0, self.number - head.number), WINDOW)
-        if head.serial == self.serial or self._came & bit:
-            self._count.repeated += 1
-        else:
-            self._count.disordered += 1
-            self._came |= bit & _WHOLE
 
 
 class Export:
@@ -127,15 +94,14 @@ class Export:
         self._grid = grid
         self.every = grid.cycles(table.rate_hz)
         self.is_asked = False
-        self.sent = self.serial = 0
+        self.count = zero_counts(LanExport)
         self._put: Callable[[bytes, bytes], None]
 
     def resume(self, record: Any) -> None:
         """Continue with the counts in the status of an adapter before this one."""
-        self.sent = int(record["sent"])
-        self.serial = int(record["serial"])
+        self.count.record[...] = record
 
-    def open(self, carrier: Carrier, sealer: Sealer) -> None:
+    def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
         """Publish it."""
         self._put = carrier.publish(self._key)
         self._sealer = sealer
@@ -148,9 +114,9 @@ class Export:
         self._source.read(tick - self.every * ticks)
         before = self._source.serial
         self._source.read(tick)
-        if self._source.serial == self.serial != before:
-            self.sent -= 1
-            self.serial = before
+        if self._source.serial == self.count.serial != before:
+            self.count.sent -= 1
+            self.count.serial = before
             self.exchange(tick)
 
     def exchange(self, tick: int) -> None:
@@ -162,21 +128,22 @@ class Export:
         reading = source.read(tick)
         if not reading.is_there:
             return
-        if source.serial != self.serial:
-            self.sent += 1
-            self.serial = source.serial
+        count = self.count
+        if source.serial != count.serial:
+            count.sent += 1
+            count.serial = source.serial
         elif not self.is_asked or grid.is_lockstep:
             return
         self.is_asked = False
         written = source.newest
         payload = bytes(reading.message.raw)
         times = written, grid.time_ns(written), grid.stamp_ns(written)
-        head = Envelope(self._kind, self._launch, self.serial, self.sent, *times)
+        head = Envelope(self._kind, self._launch, count.serial, count.sent, *times)
         self._put(payload, self._sealer.seal(self._key, head, payload))
 
     def fill(self, record: Any) -> None:
         """Write its counts into the group of a status."""
-        fill_counts(record, (self.sent, self.serial))
+        fill_counts(record, self.count.record.item())
 
 
 class Import:
@@ -199,26 +166,27 @@ class Import:
         self._max_age = spec.max_age
         self._delay = spec.delay
         self._peer = peer
-        self._box = Slots(segment, spec).box
+        self._box = segment.box(own)
         self._word = int(Box.KEPT if peer.goes_on else Box.VOID)
         self._is_away = bool(self._box[self._word] & 1)
         self._losses = peer.losses
         self._grid = grid
         self.every = grid.cycles(table.rate_hz)
         self._basis: int | None = None
-        # What came before its time, with the tick at which it came.
+        # The newest message that came before its time, with the tick at which it came.
         self._early: list[tuple[int, Arrived]] = []
-        self.count = ImportCount()
+        self.count = zero_counts(LanImport)
         self._order = MessageOrder(self.count)
         self._arrived: Callable[[], Iterator[Arrived]]
 
     def resume(self, record: Any, tick: int) -> None:
         """Continue after the status that an adapter before this one wrote at `tick`."""
-        self.count.resume(record)
-        self._order.resume(*(int(record[name]) for name in ("launch", "number", "serial")))
-        self._basis = None if record["age"] == NEVER else tick - int(record["age"])
+        count = self.count
+        count.record[...] = record
+        self._order.resume()
+        self._basis = None if count.age == NEVER else tick - count.age
 
-    def open(self, carrier: Carrier, sealer: Sealer) -> None:
+    def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
         """Subscribe to it."""
         self._arrived = carrier.subscribe(self._key)
         self._sealer = sealer
@@ -245,10 +213,10 @@ class Import:
 
     def exchange(self, out: Sender[AnyMessage], tick: int) -> None:
         """Take what has come, and pass the newest good message on."""
-        early = self._early
+        waiting = [*self._early, *((tick, arrived) for arrived in self._arrived())]
         self._early = []
         newest: Envelope | None = None
-        for came, arrived in chain(early, zip(repeat(tick), self._arrived(), strict=False)):
+        for came, arrived in waiting:
             head = self._opened(arrived)
             if (
                 head is not None
@@ -274,11 +242,10 @@ class Import:
         """Return the head of what came, if it may be a message of this mailbox; else count that it
         was refused."""
         head = self._sealer.opened(*arrived)
-        is_fit = len(arrived.payload) == len(self._buffer.raw)
         if (
             not isinstance(head, Flaw)
             and head.kind == self._kind
-            and is_fit
+            and len(arrived.payload) == len(self._buffer.raw)
             and max(head[1:4]) < LARGEST
         ):
             return head
@@ -286,51 +253,47 @@ class Import:
         return None
 
     def _is_due(self, head: Envelope, arrived: Arrived, came: int, tick: int) -> bool:
-        """Say whether a message is of the launch that is there, and of known age. If it may yet be,
-        keep it for later.
+        """Return True if a message is of the launch that is there, and of known age. If it may yet
+        be, keep it for later.
 
         In lockstep it is: see `Barrier`.
         """
         if self._grid.is_lockstep:
             return True
-        is_strange = self._peer.is_over(head.launch) or tick - came > self._max_age
-        # Its age decides: until the clocks have been compared it may be too old.
-        is_due = self._is_present(head) and self._peer.offset_ns is not None
-        if is_strange:
+        if self._peer.is_over(head.launch) or tick - came > self._max_age:
             self.count.unknown_launch += 1
-        elif not is_due:
-            self._early.append((came, arrived))
-            if len(self._early) > 1:
-                self._pass_over(self._early.pop(0)[1])
-        return is_due and not is_strange
+            return False
+        # Its age decides: until the clocks have been compared it may be too old.
+        if self._is_present(head) and self._peer.offset_ns is not None:
+            return True
+        for _, before in self._early:
+            older = self._opened(before)
+            if older is not None and self._is_present(older):
+                # It has come, so it is not missing.
+                self.count.superseded += self._order.admits(older)
+            else:
+                self.count.unknown_launch += 1
+        self._early = [(came, arrived)]
+        return False
 
     def _is_present(self, head: Envelope) -> bool:
         return self._peer.is_there and head.launch == self._peer.launch
 
-    def _pass_over(self, arrived: Arrived) -> None:
-        """Count a message that was kept, and that a newer one replaces."""
-        head = self._opened(arrived)
-        if head is not None and self._is_present(head):
-            # It has come, so it is not missing.
-            self.count.superseded += self._order.admits(head)
-        else:
-            self.count.unknown_launch += 1
-
     def _is_next(self, head: Envelope, payload: bytes) -> bool:
-        """Say whether a message is good and the newest so far, and if so keep its content."""
+        """Return True if a message is good and the newest so far, and if so keep its content."""
         message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not is_proper(message.record, self._fields):
             self.count.refused += 1
             return False
         if not self._order.admits(head):
             return False
-        self._buffer.raw[:] = message.raw
+        self._buffer.copy_from(message)
         return True
 
     def fill(self, record: Any, tick: int) -> None:
         """Write its counts into the group of a status."""
-        age = NEVER if self._basis is None else tick - self._basis
-        age_s = -1.0 if age == NEVER else age * self._grid.tick_s
-        order = self._order
-        launch = NONE if self._grid.is_lockstep else self._order.launch
-        fill_counts(record, (*self.count.values, launch, order.number, order.serial, age, age_s))
+        count = self.count
+        count.launch = NONE if self._grid.is_lockstep else self._order.launch
+        count.age = NEVER if self._basis is None else tick - self._basis
+        count.age_s = NEVER if count.age == NEVER else count.age * self._grid.tick_s
+        fill_counts(record, count.record.item())

@@ -16,7 +16,7 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import zenoh
 
@@ -63,26 +63,13 @@ class Arrived(NamedTuple):
         return cls(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
 
 
-class Carrier(Protocol):
-    """Carries exports and imports: the network itself, or in lockstep the steps of all racks."""
-
-    def publish(self, key: str) -> Callable[[bytes, bytes], None]:
-        """Return a function that sends payload and envelope under a key expression."""
-
-    def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
-        """Return a function that yields what has come under a key expression since its last
-        call."""
-
-
 class Question(NamedTuple):
     """A query that has come. `reply` sends an answer, a payload and its envelope.
 
     The asker is done when the next question is taken, or none is left.
     """
 
-    key: str
-    envelope: bytes | None
-    payload: bytes
+    asked: Arrived
     reply: Callable[[bytes, bytes], None]
 
 
@@ -158,9 +145,8 @@ class LanLink:
             callback(Arrived.of(sample))
 
         # Direct: a thread between would add its wake-up, and a queue without a bound.
-        self._kept.append(
-            self.session.declare_subscriber(key, zenoh.handlers.Callback(take, indirect=False))
-        )
+        handler = zenoh.handlers.Callback(take, indirect=False)
+        self._kept.append(self.session.declare_subscriber(key, handler))
 
     def answer(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Question]]:
         """Return a function that yields the questions asked under a key expression since the last
@@ -173,10 +159,10 @@ class LanLink:
         def questions() -> Iterator[Question]:
             for query in waiting():
                 with query:
-                    asked = str(query.key_expr)
                     content = _bytes_of(query.payload) or b""
-                    if "*" not in asked:
-                        yield Question(asked, _bytes_of(query.attachment), content, _reply(query))
+                    asked = Arrived(str(query.key_expr), _bytes_of(query.attachment), content)
+                    if "*" not in asked.key:
+                        yield Question(asked, _reply(query))
 
         return questions
 
@@ -261,7 +247,16 @@ def _settings(
         ),
     }
     if credentials is not None and has_tls(table):
-        settings["transport/link/tls"] = _tls(credentials)
+        own = {"certificate": str(credentials.certificate), "private_key": str(credentials.key)}
+        settings["transport/link/tls"] = {
+            "root_ca_certificate": str(credentials.authority),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+            **{
+                f"{side}_{key}": path for side in ("listen", "connect") for key, path in own.items()
+            },
+        }
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, encode_json(value))
@@ -280,9 +275,8 @@ def _locator(text: str) -> str:
         about = folder.lstat()
     except OSError as error:
         raise LevelError(f"adapter.lan: {folder}: {error.strerror}") from None
-    is_folder = stat.S_ISDIR(about.st_mode)
     if (
-        not is_folder
+        not stat.S_ISDIR(about.st_mode)
         or about.st_uid != os.getuid()
         or about.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
     ):
@@ -291,18 +285,3 @@ def _locator(text: str) -> str:
             " 0700"
         )
     return f"{SOCKET}/{folder / endpoint.host}"
-
-
-def _tls(credentials: Credentials) -> dict[str, Any]:
-    certificate = str(credentials.certificate)
-    key = str(credentials.key)
-    return {
-        "root_ca_certificate": str(credentials.authority),
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-        "close_link_on_expiration": True,
-        "listen_certificate": certificate,
-        "listen_private_key": key,
-        "connect_certificate": certificate,
-        "connect_private_key": key,
-    }

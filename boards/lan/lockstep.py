@@ -32,7 +32,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 from zenoh.ext import Int64, ZDeserializeError, z_deserialize, z_serialize
 
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Run, System
+from rack.backplane.words import Block, System
 from rack.boards.lan.awaited import GIVE_UP_S, Why, word_of
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle, step_key
@@ -56,12 +56,10 @@ class Step(NamedTuple):
     """One step of a rack. `cycle_ns`: length of its adapter's cycle; `racks`: those for which it
     waits."""
 
-    launch: int
-    time_ns: int
-    flags: int
+    head: Envelope
     cycle_ns: int
-    racks: tuple[str, ...]
-    exports: tuple[Arrived, ...]
+    racks: list[str]
+    exports: list[Arrived]
 
 
 def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[Arrived]) -> bytes:
@@ -78,11 +76,11 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
         cycle_ns, racks, parts = z_deserialize(_CONTENT, zenoh.ZBytes(content))
     except ZDeserializeError:
         return None
-    exports = tuple(Arrived(*part) for part in parts)
+    exports = [Arrived(*part) for part in parts]
     # What is left behind the last part would be ignored.
     if pack_step(cycle_ns, racks, exports) != content:
         return None
-    return Step(head.launch, head.time_ns, head.flags, cycle_ns, tuple(racks), exports)
+    return Step(head, cycle_ns, racks, exports)
 
 
 LOOK_S = 0.1
@@ -117,6 +115,10 @@ class Partner:
         seen = Why.UNSEEN if self.launch == NONE else Why.SLOWER
         return word_of(self.place, seen if self.gone_s is None else Why.GONE)
 
+    def is_gone_for(self, time_s: float) -> bool:
+        """Return True if it has been gone for longer than that."""
+        return self.gone_s is not None and time.monotonic() - self.gone_s > time_s
+
     def has_reached(self, now_ns: int) -> bool:
         """Say whether nothing more comes of it up to this time."""
         return self.time_ns >= now_ns or self.is_out
@@ -124,21 +126,21 @@ class Partner:
     def take(self, step: Step) -> None:
         """Note a step, which may have come before."""
         self.gone_s = None
-        if step.time_ns > self.time_ns:
-            self.time_ns = step.time_ns
+        if step.head.time_ns > self.time_ns:
+            self.time_ns = step.head.time_ns
             self.steps.append(step)
-        self.is_out = bool(step.flags & StepFlag.OVER)
+        self.is_out = bool(step.head.flags & StepFlag.OVER)
 
     def passed(self, now_ns: int) -> Iterator[Step]:
         """Yield its steps up to this time, once."""
-        while self.steps and self.steps[0].time_ns <= now_ns:
+        while self.steps and self.steps[0].head.time_ns <= now_ns:
             yield self.steps.popleft()
 
 
 class Barrier:
     """The end of an adapter's cycles, common to all racks in lockstep.
 
-    It is the `Carrier` of exports and imports, in place of the network.
+    Exports and imports use it in place of the `LanLink`, with the same methods.
     """
 
     def __init__(
@@ -146,7 +148,6 @@ class Barrier:
     ) -> None:
         """Step with `racks`, except those that an adapter before this one has `lost`."""
         self._segment = segment
-        self._words = segment.words
         self._block = segment.block(board)
         self._partners = {rack: Partner(rack, place) for place, rack in enumerate(racks)}
         for rack in lost:
@@ -237,7 +238,10 @@ class Barrier:
             except Empty:
                 if self._is_over:
                     return False
-                self._look_at(late[0])
+                # Show for whom we wait, and give up one who is gone for too long.
+                first = late[0]
+                self._block[Block.AWAITS] = first.word
+                first.is_out |= first.is_gone_for(GIVE_UP_S)
         self._block[Block.AWAITS] = 0
         for partner in self._partners.values():
             self._pass_on(partner)
@@ -270,15 +274,7 @@ class Barrier:
 
     @property
     def _is_over(self) -> bool:
-        words = self._words
-        is_over = words[System.STOP_REQUEST] or words[System.STATE] == Run.STOPPED
-        return bool(is_over) or not self._segment.launcher_is_alive
-
-    def _look_at(self, late: Partner) -> None:
-        """Show for whom we wait, and give up one who is gone for too long."""
-        self._block[Block.AWAITS] = late.word
-        if late.gone_s is not None and time.monotonic() - late.gone_s > GIVE_UP_S:
-            late.is_out = True
+        return bool(self._segment.words[System.STOP_REQUEST]) or self._segment.run_is_over
 
     def _note(self, sample: zenoh.Sample) -> None:
         """Note what has come: a step of another rack, or the sign that it is there or gone."""
@@ -293,7 +289,7 @@ class Barrier:
         arrived = Arrived.of(sample)
         head = self._sealer.opened(*arrived)
         step = None if isinstance(head, Flaw) else unpack_step(head, arrived.payload)
-        if step is not None and self._is_of(partner, step.launch):
+        if step is not None and self._is_of(partner, step.head.launch):
             self._note_step(partner, step)
 
     def _note_sign(self, partner: Partner, launch: int, cycle_ns: int, is_there: bool) -> None:
@@ -311,21 +307,23 @@ class Barrier:
 
     def _note_step(self, partner: Partner, step: Step) -> None:
         self._check_cycle(partner, step.cycle_ns)
-        if not step.flags & StepFlag.OVER and self._rack not in step.racks:
+        flags = step.head.flags
+        if not flags & StepFlag.OVER and self._rack not in step.racks:
             self._refuse(
                 f"rack '{partner.rack}' does not wait for '{self._rack}' in lockstep: name it in"
                 " adapter.lan.peers there, and start all racks anew"
             )
-        if not self._has_begun and partner.time_ns == NEVER and step.time_ns > self._now_ns:
+        time_ns = step.head.time_ns
+        if not self._has_begun and partner.time_ns == NEVER and time_ns > self._now_ns:
             self._refuse(
-                f"rack '{partner.rack}' is at {step.time_ns * 1e-9:g} s already: racks in lockstep"
+                f"rack '{partner.rack}' is at {time_ns * 1e-9:g} s already: racks in lockstep"
                 " begin together, start all anew"
             )
         partner.take(step)
-        if partner.is_out and step.flags & StepFlag.FIRST and not self._has_begun:
+        if partner.is_out and flags & StepFlag.FIRST and not self._has_begun:
             # Neither has begun: it may be started again.
             partner.forget()
-        elif step.flags & StepFlag.FIRST:
+        elif flags & StepFlag.FIRST:
             # Before this rack goes on: it may come too late for the other one to have received its
             # step.
             self._send_again(StepFlag(0))
@@ -358,7 +356,7 @@ class Barrier:
         """Pass on what a rack has exported up to now, and whether it is there."""
         for step in partner.passed(self._now_ns):
             # What comes once more after a restart was passed on before it.
-            for export in step.exports if step.time_ns > self._passed_ns else ():
+            for export in step.exports if step.head.time_ns > self._passed_ns else ():
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:
                     self._imports[export.key].append(export)
         is_there = partner.time_ns >= self._now_ns

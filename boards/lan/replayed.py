@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.boards.host.adapter import STATUS
-from rack.boards.host.entries import NEVER, Replayed
+from rack.boards.host.entries import NEVER, Replayed, last_written
 from rack.boards.lan.entries import Import
 from rack.boards.lan.peers import NONE, Peers
 from rack.boards.wiring import Entries, Rows
@@ -32,10 +31,11 @@ class ReplayedNetwork:
         peers: Peers,
         imports: Mapping[str, Import],
     ) -> None:
-        self._imports = {
-            port: (entry, _sent(segment, board, port, entries[port]))
-            for port, entry in imports.items()
-        }
+        self._imports: dict[str, tuple[Import, Replayed]] = {}
+        for port, entry in imports.items():
+            # After what an adapter before this one has sent.
+            _, sent = last_written(segment, f"{board}.{port}")
+            self._imports[port] = entry, Replayed(entries[port], port, is_sent=True, since=sent)
         ports = {peer.rack: peer_port(peer.rack) for peer in peers}
         self._shown = [
             Replayed(entries[port], port, is_sent=False) for port in (*ports.values(), STATUS)
@@ -62,13 +62,6 @@ class ReplayedNetwork:
                 entry.comes(tick)
         for shown in self._shown:
             shown.exchange({}, write, tick)
-
-
-def _sent(segment: Segment, board: str, port: str, rows: Rows) -> Replayed:
-    """Return the messages of an import, after those that an adapter before this one has sent."""
-    own = open_observer(segment, f"{board}.{port}")
-    since = own.newest if own.peek().is_there else NEVER
-    return Replayed(rows, port, is_sent=True, since=since)
 
 
 def _seen(rack: str, rows: Rows) -> Iterator[tuple[int, str, bool]]:

@@ -16,7 +16,8 @@ import typer
 
 from rack.backplane.segment import Segment
 from rack.boards.classes import find_class
-from rack.boards.config.resolved import loads, resolve
+from rack.boards.config.loader import loads
+from rack.boards.config.resolved import resolve
 from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram

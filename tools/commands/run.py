@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.boards.config.files import PartialConfigError, assembled, named_classes
+from rack.boards.config.files import assembled, named_classes
 from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.requests import Preload
 from rack.tools.console.answer import Document, Failure
@@ -148,9 +148,9 @@ def run(
 
         config = str(run_of(origin))
     assert config is not None
-    tables = _tables(config, overrides, faults)
-    crate = _informed(context.obj, tables)
-    from rack.boards.config.resolved import validated
+    read = assembled(config, overrides, faults)
+    crate = _informed(context.obj, read.tables)
+    from rack.boards.config.loader import validated
     from rack.tools.live.display import display_for
     from rack.tools.live.folder import folder_of
     from rack.tools.live.launch import NO_TIME, Beginning, run_rack
@@ -159,7 +159,7 @@ def run(
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries
 
-    found = validated(tables)
+    found = validated(read)
     if step and found.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
@@ -191,17 +191,6 @@ def run(
         # On stderr and last, where it is seen in any case.
         print(headline(found.name, report["outcome"], report["failures"]), file=sys.stderr)
     sys.exit(0 if report["worked"] else 1)
-
-
-def _tables(config: str, overrides: list[str], faults: str | None) -> Tables:
-    """Return the assembled tables. Raises `ConfigError` with the mistakes of all stages."""
-    try:
-        return assembled(config, overrides, faults)
-    except PartialConfigError:
-        from rack.boards.config.resolved import load
-
-        load(config, overrides, faults)
-        raise
 
 
 def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:

@@ -24,8 +24,8 @@ from rack.backplane.mailbox.history import chains
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.classes import extend_path
-from rack.boards.config.outside import outside
-from rack.boards.config.resolved import classes, load
+from rack.boards.config.loader import load
+from rack.boards.config.resolved import classes
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.rack import cell_of
@@ -101,7 +101,7 @@ class RunAgain:
         """What host boards and other racks sent in the run; None: its rack has none."""
         run = self.recording
         config = run.rack_config
-        return recorded_entries(config, run.folder, self._asked) if outside(config) else None
+        return recorded_entries(config, run.folder, self._asked) if config.outside else None
 
     def reach(self, tick: int) -> None:
         """Have a snapshot before `tick`, in which all is as it was in the run then; note on stderr

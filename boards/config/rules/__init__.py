@@ -2,18 +2,16 @@
 wiring to mistakes.
 
 All mistakes are reported at once. A rule skips what depends on a broken table, whose own mistakes
-are already reported. Faults and commands, which may come live too, have rules of their own in
-`faults` and `commands`.
+are already reported. Faults and commands, which may come live too, have rules of their own:
+`rack.boards.config.faults` and `rack.boards.config.commands`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from importlib import import_module
 from types import ModuleType
 
-from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.rules import boards, levels, mailboxes
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.wiring import Wiring
@@ -26,15 +24,12 @@ know of certificates."""
 
 def network_rules(config: RackConfig) -> ModuleType | None:
     """Return the module with the rules of a rack's network; None for a rack without one."""
-    is_wanted = config.adapter.lan is not None or any(
-        board.executor == LAN_ADAPTER for board in config.board.values()
-    )
-    return import_module(NETWORK) if is_wanted else None
+    return None if config.adapter.lan is None else import_module(NETWORK)
 
 
-def _of_network(name: str, wiring: Wiring) -> Mistakes:
+def _network(wiring: Wiring) -> Mistakes:
     if (rules := network_rules(wiring.config)) is not None:
-        yield from getattr(rules, name)(wiring)
+        yield from rules.network(wiring, wiring.config.adapter.lan)
 
 
 Rule = Callable[[Wiring], Mistakes]
@@ -45,8 +40,7 @@ RULES: tuple[Rule, ...] = (
     boards.slots,
     boards.ends,
     boards.record,
-    partial(_of_network, "lan"),
-    partial(_of_network, "network"),
+    _network,
     levels.scene,
     levels.robot,
     boards.clock,
@@ -62,7 +56,6 @@ RULES: tuple[Rule, ...] = (
     mailboxes.reads,
     mailboxes.mailboxes,
     mailboxes.statuses,
-    partial(_of_network, "entries"),
     mailboxes.sides,
     mailboxes.queues,
     mailboxes.asynchronous,

@@ -14,6 +14,7 @@ from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeated
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.schema import (
+    LAN,
     LONGEST_EVERY,
     SHORTEST_MS,
     BoardConfig,
@@ -40,6 +41,9 @@ def boards(wiring: Wiring) -> Mistakes:
         for key, neighbours in (("above", board.above), ("below", board.below)):
             yield from _neighbours(f"{place}.{key}", neighbours, others, "other board")
         yield from _planner(place, board)
+        if board.executor == LAN_ADAPTER and (name != LAN or wiring.config.adapter.lan is None):
+            why = "permitted: [adapter.lan], which makes its board"
+            yield Mistake(f"{place}.executor", board.executor, why)
 
 
 def hosts(wiring: Wiring) -> Mistakes:
@@ -177,7 +181,7 @@ def clock(wiring: Wiring) -> Mistakes:
     clock = wiring.config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
         yield Mistake("clock.period_ms", clock.period_ms, "not a whole number of ns")
-    if clock.mode == "lockstep" and clock.speed != 1.0:
+    if config.is_lockstep and clock.speed != 1.0:
         yield Mistake(
             "clock.speed",
             clock.speed,
@@ -239,7 +243,7 @@ def reservations(wiring: Wiring) -> Mistakes:
         yield Mistake("timing.clock_ms", 0.0, "missing; the clock reserves twice as much")
     for name, board in config.board.items():
         place = f"board.{name}"
-        if board.budget is None or not board.budget.cycle_ms:
+        if not board.busy_ms:
             yield Mistake(f"{place}.budget", None, "missing; the board reserves twice as much")
         if (board.wake or config.clock.wake) == "poll":
             yield Mistake(f"{place}.wake", "poll", "busy-waiting uses up what it reserves")
@@ -297,15 +301,11 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
         key = "rate_hz" if board.every is None else "every"
         below = [cycle for cycle in fitting if cycle < every]
         above = [cycle for cycle in fitting if cycle > every]
-        nearest = (*below[-1:], *above[:1])
-        if key == "rate_hz":
-            written = [
-                f"{cycle * tick_ms:g} ms, {rate_text(1e3 / (cycle * tick_ms))} Hz"
-                for cycle in nearest
-            ]
-        else:
-            written = [f"{cycle * tick_ms:g} ms, every {cycle}" for cycle in nearest]
-        rates = " or ".join(written)
+        rates = " or ".join(
+            f"{(ms := cycle * tick_ms):g} ms, "
+            + (f"{rate_text(1e3 / ms)} Hz" if key == "rate_hz" else f"every {cycle}")
+            for cycle in (*below[-1:], *above[:1])
+        )
         why = (
             f"a cycle of {every * tick_ms:g} ms does not fit the schedule, a multiple of the minor"
             f" frame, {table.minor_ms:g} ms, that divides the major one, {table.major_ms:g} ms;"

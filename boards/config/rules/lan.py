@@ -15,7 +15,6 @@ from pathlib import Path
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.errors import ClockError
-from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeats
 from rack.boards.config.schema import LAN, LanConfig, RackConfig
 from rack.boards.config.wiring import Wiring, is_taken
@@ -33,33 +32,34 @@ _OWN = re.compile(rf"\bboard\.{LAN}(\.params)?(?=[.\[]|\b)")
 _MAILBOX = f"mailbox {LAN}."
 
 
-def lan(wiring: Wiring) -> Mistakes:
-    """Check what shows without the ports of the boards."""
+def network(wiring: Wiring, table: LanConfig) -> Mistakes:
+    """Check the table, and what it names."""
+    yield from _endpoints(table)
+    if is_taken(wiring.config):
+        why = f"[{PLACE}] makes the board of this name; rename the board, or leave one out"
+        yield Mistake(ITSELF, None, why)
+    else:
+        yield from _board(wiring, table)
+    for port, export in table.exports.items():
+        for why in _export(wiring, export.source):
+            yield Mistake(f"{PLACE}.export.{port}.from", export.source, why)
+    for port, entry in table.imports.items():
+        try:
+            entry.message_class()
+        except LookupError as error:
+            yield Mistake(f"{PLACE}.import.{port}.type", entry.type, str(error))
+
+
+def _board(wiring: Wiring, table: LanConfig) -> Mistakes:
+    """Check the rates, the priority and the names of the adapter's board."""
     config = wiring.config
-    table = wiring.config.adapter.lan
-    for name, board in config.board.items():
-        if board.executor == LAN_ADAPTER and (table is None or name != LAN):
-            yield Mistake(
-                f"board.{name}.executor",
-                board.executor,
-                f"permitted: [{PLACE}], which makes its board",
-            )
-    if table is None:
-        return
-    if is_taken(config):
-        yield Mistake(
-            ITSELF,
-            None,
-            f"[{PLACE}] makes the board of this name; rename the board, or leave one out",
-        )
-        return
     yield from _names(table, config.name)
     if LAN in wiring.every:
         cycle_ns = wiring.every[LAN] * config.clock_ns
         for key, entries in (("export", table.exports), ("import", table.imports)):
             for port, entry in entries.items():
                 yield from _rate(f"{PLACE}.{key}.{port}", entry, cycle_ns)
-    if config.clock.mode == "realtime":
+    if not config.is_lockstep:
         yield from _priority(config, table)
         if config.protocol.strict:
             why = (
@@ -140,21 +140,6 @@ def _priority(config: RackConfig, table: LanConfig) -> Mistakes:
         )
 
 
-def entries(wiring: Wiring) -> Mistakes:
-    """Check what the entries name: mailboxes of this rack, and message types."""
-    table = wiring.config.adapter.lan
-    if table is None:
-        return
-    for port, export in table.exports.items():
-        for why in _export(wiring, export.source):
-            yield Mistake(f"{PLACE}.export.{port}.from", export.source, why)
-    for port, entry in table.imports.items():
-        try:
-            entry.message_class()
-        except LookupError as error:
-            yield Mistake(f"{PLACE}.import.{port}.type", entry.type, str(error))
-
-
 def _export(wiring: Wiring, source: str) -> Iterator[str]:
     """Yield why a mailbox cannot be exported. A queue is found with the other queues."""
     board = source.partition(".")[0]
@@ -163,7 +148,7 @@ def _export(wiring: Wiring, source: str) -> Iterator[str]:
     elif source in wiring.operated:
         yield "what an operator commands stays in its rack; permitted: mailboxes that levels write"
     elif not wiring.is_known(source):
-        yield f"no such mailbox; mailboxes: {wiring.names()}"
+        yield f"no such mailbox; mailboxes: {wiring.names}"
     elif source in wiring.writers and board in wiring.every:
         every = wiring.every[board] * wiring.writers[source][1].cycles
         rate_hz = 1e9 / (every * wiring.config.clock_ns)
@@ -190,37 +175,8 @@ SOON = timedelta(days=30)
 """Time before the end of certificates from which a launch warns."""
 
 
-def network(wiring: Wiring) -> Mistakes:
-    """Check the endpoints, judged by the config alone."""
-    table = wiring.config.adapter.lan
-    if table is None:
-        return
-    yield from _endpoints(table)
-    if table.estop_from and (at := _open(table)):
-        could = "pass for any of them"
-        if table.certificates is not None:
-            could = "repeat what one of them has asked"
-        why = f"whoever reaches {at[0]} could {could}; permitted: tls/ or quic/ with"
-        yield Mistake(
-            f"{PLACE}.estop_from",
-            ", ".join(table.estop_from),
-            f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
-        )
-    if has_tls(table) and table.certificates is None:
-        yield Mistake(
-            f"{PLACE}.certificates",
-            None,
-            "missing; TLS needs them: see rack lan certificates --help",
-        )
-    if has_tls(table) and table.exports and not table.racks:
-        yield Mistake(
-            f"{PLACE}.peers",
-            None,
-            "missing; with TLS only racks that it names may import from this one",
-        )
-
-
 def _endpoints(table: LanTable) -> Mistakes:
+    """Check the endpoints, judged by the config alone."""
     for key in ("listen", "connect"):
         for at, text in enumerate(getattr(table, key)):
             try:
@@ -229,6 +185,22 @@ def _endpoints(table: LanTable) -> Mistakes:
                 why = str(error)
             if why:
                 yield Mistake(f"{PLACE}.{key}[{at}]", text, why)
+    if table.estop_from and (exposed := _open(table)):
+        could = "pass for any of them"
+        if table.certificates is not None:
+            could = "repeat what one of them has asked"
+        why = f"whoever reaches {exposed[0]} could {could}; permitted: tls/ or quic/ with"
+        yield Mistake(
+            f"{PLACE}.estop_from",
+            ", ".join(table.estop_from),
+            f"{why} certificates (rack lan certificates --help), or unix/ on one machine",
+        )
+    if has_tls(table) and table.certificates is None:
+        why = "missing; TLS needs them: see rack lan certificates --help"
+        yield Mistake(f"{PLACE}.certificates", None, why)
+    if has_tls(table) and table.exports and not table.racks:
+        why = "missing; with TLS only racks that it names may import from this one"
+        yield Mistake(f"{PLACE}.peers", None, why)
 
 
 def _open(table: LanTable) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 
 from pydantic import ValidationError
 
@@ -16,7 +17,6 @@ from rack.boards.config.wiring import Wiring
 from rack.boards.errors import Mistake, Mistakes
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, LevelContext
-from rack.levels.tables import RobotConfig, SceneConfig
 
 MAX_SEGMENT_BYTES = 2**30
 MAX_MODEL_BYTES = 2**30
@@ -120,29 +120,24 @@ def robot(wiring: Wiring) -> Mistakes:
 def cell(wiring: Wiring) -> Mistakes:
     """Check that arm and scene fit the model. If a table of theirs has mistakes of its own, only
     names are checked."""
-    config = wiring.config
-    found = ""
-    if config.robot is None:
+    robot_table, scene_table = wiring.config.robot, wiring.config.scene
+    found: list[str] = []
+    if robot_table is None:
         return
     if not wiring.broken & {"robot", "scene"} and not [*robot(wiring), *scene(wiring)]:
         try:
-            cell_sizes(config)
+            cell_sizes(wiring.config)
             return
         except RobotError as error:
-            found = str(error)
-    for line in _unknown_names(config.robot, config.scene) or filter(None, [found]):
+            found = [str(error)]
+    from rack.levels.robot.lookup import unknown_names
+
+    # Every name that the model lacks; none are known if the model cannot be read.
+    with suppress(RobotError):
+        found = [*unknown_names(robot_table, scene_table)] or found
+    for line in found:
         place, colon, why = line.partition(": ")
         if colon and place.startswith(("robot", "scene")):
             yield Mistake(place, None, why)
         else:
             yield Mistake("robot", None, line)
-
-
-def _unknown_names(robot: RobotConfig, scene: SceneConfig) -> tuple[str, ...]:
-    """Return a line for every name missing from the model; none if the model cannot be read."""
-    from rack.levels.robot.lookup import unknown_names
-
-    try:
-        return tuple(unknown_names(robot, scene))
-    except RobotError:
-        return ()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
 from rack.backplane.message import State
-from rack.boards.config.schema import LAN, TaskPlace
-from rack.boards.config.wiring import TaskPorts, Wiring, rewired
+from rack.boards.config.schema import LAN
+from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import Mistake, Mistakes
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter
@@ -16,37 +16,21 @@ PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 
 def ports(wiring: Wiring) -> Mistakes:
     """Check that each class is there, and that its inputs are connected as it declares."""
-    config = wiring.config
-    for place in (*config.tasks(), *config.hosts()):
-        if place in wiring.missing:
-            yield Mistake(f"{place.table}.{place.class_key}", place.target, wiring.missing[place])
-        else:
-            yield from _connected(wiring, place, wiring.ports[place])
-
-
-def _connected(wiring: Wiring, place: TaskPlace, ports: TaskPorts) -> Mistakes:
-    role = place.role
-    table = place.table
-    inputs = ", ".join(ports.kind.inputs) or "none"
-    for output, told in ports.outputs.items():
-        if told.rests_on is not None and told.rests_on.name not in ports.inputs:
-            why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
-            yield Mistake(f"{table}.{role}", place.target, why)
-    for port, given in rewired(wiring.config, place).items():
-        if port not in ports.kind.inputs:
-            key = f"{place.reads_key}.{port}"
-            yield Mistake(f"{table}.{key}", given, f"the {role} has no such port; ports: {inputs}")
-    for port, entry, key, given, mailboxes, _ in (
-        found for found in ports.connections if not found.fits
-    ):
-        if mailboxes:
-            why = f"port '{port}' of the {role} reads one mailbox, not {len(mailboxes)}"
-            yield Mistake(f"{table}.{key}", given, why)
-        else:
-            start = entry.source.partition(".")[0]
-            yield Mistake(
-                f"{table}.{start}", None, f"missing; port '{port}' of the {role} needs it"
-            )
+    for place, why in wiring.missing.items():
+        yield Mistake(f"{place.table}.{place.class_key}", place.target, why)
+    for place, ports in wiring.ports.items():
+        table = place.table
+        role = place.role
+        inputs = ", ".join(ports.kind.inputs) or "none"
+        for output, told in ports.outputs.items():
+            if told.rests_on is not None and told.rests_on.name not in ports.inputs:
+                why = f"its output '{output}' rests on '{told.rests_on.name}'; inputs: {inputs}"
+                yield Mistake(f"{table}.{role}", place.target, why)
+        for port, given in wiring.config.rewired(place).items():
+            if port not in ports.kind.inputs:
+                why = f"the {role} has no such port; ports: {inputs}"
+                yield Mistake(f"{table}.{place.reads_key}.{port}", given, why)
+        yield from ports.mistakes
 
 
 def writers(wiring: Wiring) -> Mistakes:
@@ -65,10 +49,10 @@ def reads(wiring: Wiring) -> Mistakes:
             place = _wired_at(ports, port)
             wanted = ports.inputs[port].message.message_type
             if not wiring.is_known(mailbox):
-                yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names()}")
+                yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names}")
             elif (
                 ports.is_whole
-                and (found := wiring.type_of(mailbox)) is not None
+                and (found := wiring.types.get(mailbox)) is not None
                 and found != wanted
             ):
                 why = (
@@ -93,7 +77,7 @@ def statuses(wiring: Wiring) -> Mistakes:
             continue
         if not wiring.is_known(f"{name}.status"):
             yield Mistake(f"board.{name}.ends_run", True, "its executor writes no status")
-        elif (found := wiring.type_of(f"{name}.status")) is not None and not any(
+        elif (found := wiring.types.get(f"{name}.status")) is not None and not any(
             field.name == "state" and field.unit is State for field in found.fields
         ):
             yield Mistake(
@@ -206,7 +190,9 @@ def mailboxes(wiring: Wiring) -> Mistakes:
     for mailbox in wiring.config.protocol.mailbox:
         if not wiring.is_known(mailbox):
             yield Mistake(
-                f"protocol.mailbox.{mailbox}", None, f"no such mailbox; mailboxes: {wiring.names()}"
+                f"protocol.mailbox.{mailbox}",
+                None,
+                f"no such mailbox; mailboxes: {wiring.names}",
             )
 
 
@@ -226,7 +212,9 @@ def queues(wiring: Wiring) -> Mistakes:
     for mailbox, depth in table.depth.items():
         if not wiring.is_known(mailbox):
             yield Mistake(
-                f"protocol.depth.{mailbox}", depth, f"no such mailbox; mailboxes: {wiring.names()}"
+                f"protocol.depth.{mailbox}",
+                depth,
+                f"no such mailbox; mailboxes: {wiring.names}",
             )
         elif wiring.protocol(mailbox) != "queue":
             queues = [name for name in wiring.writers if wiring.protocol(name) == "queue"]
@@ -287,15 +275,12 @@ def asynchronous(wiring: Wiring) -> Mistakes:
 def interrupts(wiring: Wiring) -> Mistakes:
     """Check that messages of which the config demands it can interrupt."""
     for mailbox, given in wiring.config.protocol.mailbox.items():
-        why = ""
         if given != "interrupt":
             continue
+        place = f"protocol.mailbox.{mailbox}"
         if mailbox in wiring.of_host:
             why = "it is on the host side, where nothing is interrupted; permitted: no entry"
+            yield Mistake(place, given, why)
         elif wiring.is_of_network(mailbox):
-            why = (
-                "the network adapter writes it as messages come in; permitted: time-slice,"
-                " double-buffer"
-            )
-        if why:
-            yield Mistake(f"protocol.mailbox.{mailbox}", given, why)
+            why = "the network adapter writes it as messages come in"
+            yield Mistake(place, given, f"{why}; permitted: time-slice, double-buffer")

@@ -26,7 +26,7 @@ def test_every_bundled_config_survives_as_text_and_is_of_the_newest_format(name:
     config = load(name)
     assert loads(config.text()) == config
     assert config.changed == []
-    assert named_classes(assembled(name, (), None)) == classes(config)
+    assert named_classes(assembled(name, (), None).tables) == classes(config)
 
 
 def test_text_names_a_bundled_model_without_its_folder() -> None:
@@ -253,9 +253,9 @@ def test_every_impossible_override_is_reported(small: Path) -> None:
 
 def test_a_fault_script_by_name_is_the_racks_own_before_a_bundled_one(write: Write) -> None:
     rack = write("mine.toml", 'name = "mine"')
-    bundled = assembled(rack, (), "overload")["fault"]
+    bundled = assembled(rack, (), "overload").tables["fault"]
     write("overload.toml", "[[fault]]\nkind = 'kill'\nboard = 'lower'\ntick = 5")
-    own = assembled(rack, (), "overload")["fault"]
+    own = assembled(rack, (), "overload").tables["fault"]
     assert (len(own), own[0]["board"]) == (1, "lower")
     assert bundled != own
 
@@ -274,5 +274,5 @@ def test_a_name_may_be_that_of_a_config_in_the_current_folder(
     (tmp_path / "mine" / "mine.toml").write_text('format = 2\nname = "mine"\nextends = ["fig2"]\n')
     (tmp_path / "fig2.toml").write_text('format = 2\nname = "other"\n')
     monkeypatch.chdir(tmp_path)
-    assert assembled("mine", (), None)["name"] == "mine"
-    assert assembled("fig2", (), None)["name"] == "fig2"
+    assert assembled("mine", (), None).tables["name"] == "mine"
+    assert assembled("fig2", (), None).tables["name"] == "fig2"

@@ -9,7 +9,8 @@ import pytest
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.boards.config import load, loads, rack_timing, resolve, wire
-from rack.boards.config.resolved import validated
+from rack.boards.config.files import Assembled
+from rack.boards.config.loader import validated
 from rack.boards.config.timing import without_interrupts
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError
@@ -70,7 +71,7 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
 )
 def test_what_does_not_fit_is_refused(setting: str, why: str) -> None:
     with pytest.raises(ConfigError) as error:
-        resolve(validated(override(parse(RACK), [setting])))
+        resolve(validated(Assembled(override(parse(RACK), [setting], []))))
     assert why in str(error.value)
 
 

@@ -96,7 +96,7 @@ def test_the_reference_has_every_key_of_every_shipped_config_with_meaning_and_un
     name: str,
 ) -> None:
     known = reference(name)
-    tables = assembled(name, (), None)
+    tables = assembled(name, (), None).tables
     assert {
         (at, key) for at, key in used(tables) if key not in known.get(general(at, known), {})
     } == set()

@@ -11,7 +11,8 @@ import pytest
 
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Demand
-from rack.boards.config.resolved import Resolved, load, resolve
+from rack.boards.config.loader import load
+from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.errors import LaunchError
 from tests.boards.conftest import MakeConfig
 

@@ -18,7 +18,7 @@ LIMITS = ("home", "velocity", "acceleration", "jerk")
 
 
 def tables_of(path: Path) -> dict[str, Any]:
-    return assembled(path, (), None)
+    return assembled(path, (), None).tables
 
 
 POSES = [action["joints"] for action in tables_of(TASKS / "three-poses.toml")["task"]["action"]]

@@ -10,7 +10,8 @@ import pytest
 
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System
-from rack.boards.config.resolved import loads, wire
+from rack.boards.config.loader import loads
+from rack.boards.config.resolved import wire
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.lan.link import Arrived
 from tests.boards.lan.racks import rack_text
@@ -41,7 +42,9 @@ def segment(rack_name: str, request: pytest.FixtureRequest) -> Iterator[Segment]
     simulated times."""
     config = loads(
         to_toml(
-            override(parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"])
+            override(
+                parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"], []
+            )
         )
     )
     made = Segment.create(wire(config), config.text())

@@ -54,9 +54,9 @@ class Home:
                 self._came[key] += 1
                 self._sizes[key].add(len(payload))
                 self._good[key] += not isinstance(sealer.opened(key, envelope, payload), Flaw)
-        for question in self._questions():
-            self._asked[question.key] += 1
-            question.reply(b"answer", sealer.seal(question.key, HEAD, b"answer"))
+        for asked, reply in self._questions():
+            self._asked[asked.key] += 1
+            reply(b"answer", sealer.seal(asked.key, HEAD, b"answer"))
         for key, put in self._exports:
             put(b"content", sealer.seal(key, HEAD, b"content"))
         self._tokens += [

@@ -14,9 +14,10 @@ from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import System, is_on
 from rack.boards.classes import find_class
 from rack.boards.config import resolve
-from rack.boards.lan.adapter import LanAdapter, status_of
+from rack.boards.lan.adapter import LanAdapter
 from rack.boards.lan.clocks import UNKNOWN_NS
 from rack.boards.lan.envelope import Flaw, Sealer
+from rack.boards.lan.status import status_of
 from rack.levels.peer import PeerPresence
 from tests.boards.lan.racks import configs, rack_text
 

@@ -11,7 +11,8 @@ import pytest
 
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block
-from rack.boards.config.resolved import loads, wire
+from rack.boards.config.loader import loads
+from rack.boards.config.resolved import wire
 from rack.boards.lan.awaited import Why, word_of
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.keys import out_key, step_key
@@ -109,17 +110,17 @@ def test_what_was_passed_on_before_a_restart_is_not_passed_on_again(segment: Seg
 
 def step(time_ns: int, flags: int = 0) -> Step:
     """Return a step of that time."""
-    return Step(launch=7, time_ns=time_ns, flags=flags, cycle_ns=8, racks=("a",), exports=())
+    return Step(HEAD._replace(launch=7, time_ns=time_ns, flags=flags), 8, ["a"], [])
 
 
 def test_steps_are_passed_on_once_and_up_to_a_time() -> None:
     partner = Partner("b", 3)
     for time_ns in (8, 16, 16, 8, 24):
         partner.take(step(time_ns))
-    assert [passed.time_ns for passed in partner.passed(16)] == [8, 16]
-    assert [passed.time_ns for passed in partner.passed(16)] == []
+    assert [passed.head.time_ns for passed in partner.passed(16)] == [8, 16]
+    assert [passed.head.time_ns for passed in partner.passed(16)] == []
     assert [partner.has_reached(time_ns) for time_ns in (24, 25)] == [True, False]
-    assert [passed.time_ns for passed in partner.passed(100)] == [24]
+    assert [passed.head.time_ns for passed in partner.passed(100)] == [24]
 
 
 def test_a_rack_that_is_over_is_awaited_no_more_until_it_sends_again() -> None:
@@ -163,14 +164,14 @@ EXPORTS = (
 @pytest.mark.parametrize("count", range(4))
 def test_a_step_arrives_as_it_was_sent(count: int) -> None:
     content = pack_step(5_000_000, ("puma", "k1607"), EXPORTS[:count])
-    expected = Step(11, 100_000_000, StepFlag.OVER, 5_000_000, ("puma", "k1607"), EXPORTS[:count])
+    expected = Step(HEAD, 5_000_000, ["puma", "k1607"], [*EXPORTS[:count]])
     assert unpack_step(HEAD, content) == expected
 
 
 def test_an_export_without_an_envelope_arrives_with_an_empty_one() -> None:
     step = unpack_step(HEAD, pack_step(1, ("puma",), [Arrived("a", None, b"payload")]))
     assert step is not None
-    assert step.exports == (Arrived("a", b"", b"payload"),)
+    assert step.exports == [Arrived("a", b"", b"payload")]
 
 
 def test_what_is_cut_off_continued_or_of_another_kind_is_no_step() -> None:

@@ -17,7 +17,7 @@ from rack.boards.lan.desk import CHECK, ESTOP_KIND, Desk
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
-from rack.boards.lan.link import Question
+from rack.boards.lan.link import Arrived, Question
 from rack.levels.level import Finding
 from rack.tools.network.certificates import make_credentials
 from tests.boards.commanded_racks import COMMANDED
@@ -69,7 +69,9 @@ class Line:
             assert payload == b""
             self.answers.append(head)
 
-        self._waiting.append(Question(estop_key(asker, self.rack), envelope, payload, reply))
+        self._waiting.append(
+            Question(Arrived(estop_key(asker, self.rack), envelope, payload), reply)
+        )
 
 
 class Bench:
@@ -98,7 +100,7 @@ class Bench:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        return tuple(vars(self.desk.count).values())
+        return self.desk.count.record.item()
 
 
 @pytest.fixture

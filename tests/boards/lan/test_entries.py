@@ -13,14 +13,15 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import watched
-from rack.boards.config.resolved import loads
-from rack.boards.lan.adapter import LanAdapter, status_of
+from rack.boards.config.loader import loads
+from rack.boards.lan.adapter import LanAdapter
 from rack.boards.lan.entries import Import
 from rack.boards.lan.envelope import Envelope, Sealer, kind_of
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import Arrived
 from rack.boards.lan.peers import PeerRack
+from rack.boards.lan.status import status_of
 from rack.boards.run.ports import OutputPort
 from tests.boards.lan.conftest import EVERY, LAUNCH, Network
 
@@ -101,7 +102,9 @@ class Importing:
         return reading.verdict, reading.message.count, reading.is_lost
 
     def counts(self) -> dict[str, int]:
-        return {name: number for name, number in vars(self.entry.count).items() if number}
+        record = self.entry.count.record
+        counted = record.dtype.names[: record.dtype.names.index("launch")]
+        return {name: int(record[name]) for name in counted if record[name]}
 
 
 @pytest.fixture

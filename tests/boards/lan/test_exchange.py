@@ -18,7 +18,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand, System, switch
 from rack.boards import Rack
-from rack.boards.config.resolved import loads
+from rack.boards.config.loader import loads
 from rack.boards.crate.clean import remove_dead
 from rack.boards.lan.link import UNREAD
 from rack.levels.peer import Presence

@@ -5,12 +5,12 @@ from __future__ import annotations
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config.resolved import loads
-from rack.boards.lan.adapter import status_of
+from rack.boards.config.loader import loads
 from rack.boards.lan.entries import Export
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
+from rack.boards.lan.status import status_of
 from tests.boards.lan.conftest import EVERY, LAUNCH, Network
 
 
@@ -74,7 +74,7 @@ def test_what_an_adapter_before_this_one_sent_in_its_last_cycle_is_sent_again(
         exporting.entry.resume(exporting.status.export_pulse)
         exporting.entry.recall(died_after, EVERY)
         assert exporting.heads() == again
-        assert exporting.entry.sent == 2
+        assert exporting.entry.count.sent == 2
 
 
 def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) -> None:
@@ -87,7 +87,7 @@ def test_whoever_comes_gets_the_newest_though_it_is_not_new(segment: Segment) ->
     # In lockstep nobody comes late, and nothing may depend on when a token comes.
     times = 1 if segment.words[System.LOCKSTEP] else 2
     assert [(head.number, head.serial) for head in exporting.heads()] == [(1, 1)] * times
-    assert exporting.entry.sent == 1
+    assert exporting.entry.count.sent == 1
 
 
 def test_a_restarted_adapter_goes_on_with_the_numbers_of_the_one_before(segment: Segment) -> None:

@@ -14,7 +14,8 @@ from rich.console import Console
 
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment, unlink
-from rack.boards.config.resolved import loads, wire
+from rack.boards.config.loader import loads
+from rack.boards.config.resolved import wire
 from rack.levels.peer import Presence
 from rack.tools.live.display import RackView
 from rack.tools.live.network import (

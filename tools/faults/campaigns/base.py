@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rack.boards import Rack
-from rack.boards.config.outside import outside
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import UNKEPT
@@ -56,7 +55,7 @@ class BaseRack:
         self._snapshots = SnapshotPolicy(part=0, every=every)
         self._crate: WarmCrate | None = None
         self._events: Sequence[Event] = ()
-        self._why_none = outside(config)
+        self._why_none = config.outside
 
     def snapshots_for(self, plan: Plan) -> SnapshotPolicy | None:
         """Return the snapshots that a trial takes: the faultless run is the base of the others."""

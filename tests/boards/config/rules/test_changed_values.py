@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from rack.boards.config import resolve
-from rack.boards.config.files import assembled
-from rack.boards.config.resolved import validated
+from rack.boards.config.files import Assembled, assembled
+from rack.boards.config.loader import validated
 from rack.boards.config.timing import rack_timing
 from rack.boards.errors import ConfigError
 from tests.snapshots import ROOT, Snapshots, digest
@@ -62,7 +62,7 @@ def others(value: Any) -> list[Any]:
 def outcome(tables: dict[str, Any]) -> str:
     """Return what is said of a config, or a digest of what comes of it."""
     try:
-        rack = resolve(validated(tables))
+        rack = resolve(validated(Assembled(tables)))
     except ConfigError as error:
         return str(error)
     timing = rack_timing(rack.config, rack.layout)
@@ -74,7 +74,7 @@ def test_a_changed_value_has_the_outcome_that_it_had(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})
-    tables = assembled(ROOT / "configs" / name, (), None)
+    tables = assembled(ROOT / "configs" / name, (), None).tables
     parts: dict[str, object] = {}
     for path in places(tables):
         changed = deepcopy(tables)

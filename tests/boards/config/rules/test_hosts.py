@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import resolve
-from rack.boards.config.resolved import loads
+from rack.boards.config.loader import loads
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.errors import ConfigError
 from tests.boards.host.test_board import HOSTED
@@ -103,7 +103,7 @@ MISTAKES = {
 def test_a_mistake_is_one_line(name: str) -> None:
     settings, line = MISTAKES[name]
     with pytest.raises(ConfigError) as error:
-        resolve(loads(to_toml(override(parse(HOSTED), settings))))
+        resolve(loads(to_toml(override(parse(HOSTED), settings, []))))
     (mistake,) = error.value.mistakes
     assert line in str(mistake)
 

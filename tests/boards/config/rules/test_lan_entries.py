@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load, resolve
-from rack.boards.config.resolved import loads
+from rack.boards.config.loader import loads
 from rack.boards.config.toml import override, parse, to_toml
 from rack.boards.errors import ConfigError
 from tests.boards.lan.racks import rack_text
@@ -161,7 +161,7 @@ MISTAKES = {
 
 def resolved(*settings: str) -> None:
     """Check the config with these settings, in lockstep if they do not say otherwise."""
-    resolve(loads(to_toml(override(parse(TEXT), ["clock.mode=lockstep", *settings]))))
+    resolve(loads(to_toml(override(parse(TEXT), ["clock.mode=lockstep", *settings], []))))
 
 
 @pytest.mark.parametrize("name", MISTAKES)

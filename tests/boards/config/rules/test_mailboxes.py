@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import resolve
-from rack.boards.config.resolved import validated
+from rack.boards.config.files import Assembled
+from rack.boards.config.loader import validated
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError
 from tests.boards.host.test_board import HOSTED
@@ -15,7 +16,7 @@ from tests.boards.test_queues import QUEUES
 
 def mistake(text: str, *settings: str) -> str:
     with pytest.raises(ConfigError) as error:
-        resolve(validated(override(parse(text), settings)))
+        resolve(validated(Assembled(override(parse(text), settings, []))))
     (found,) = error.value.mistakes
     return str(found)
 

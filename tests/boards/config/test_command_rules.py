@@ -9,9 +9,8 @@ import pytest
 from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.boards.config import RackConfig, load
 from rack.boards.config.cell import built_cell
-from rack.boards.config.commands import asked
+from rack.boards.config.commands import asked, command_mistakes
 from rack.boards.config.published import publish
-from rack.boards.config.rules.commands import command_mistakes
 
 HOME = [0.0, 0.7, -2.4, 0.0, -1.4, 0.0]
 PLACE = {"position": [0.4, 0.1, 0.3]}
