@@ -21,7 +21,6 @@ from contextlib import suppress
 from importlib import import_module
 from multiprocessing.connection import Connection
 
-from rack.backplane.address_map import CLOCK
 from rack.backplane.copies import fill_memory
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import note_used_files
@@ -50,7 +49,7 @@ from rack.boards.crate.requests import (
     Show,
     Shown,
 )
-from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy, can_go_on
+from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
 from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import hog
 from rack.boards.run.board import enter, run_clock_board, run_task_board
@@ -142,7 +141,7 @@ class Crate:
                 self._kill(name)
             case Show(tick, name):
                 snapshot = self._shelf.nearest(tick)
-                text = "" if snapshot is None or not name else self._shelf.show(snapshot, name)
+                text = "" if snapshot is None or not name else snapshot.copies[name].show()
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
     def _fill_segment(self, before: int) -> int:
@@ -160,9 +159,9 @@ class Crate:
         """Fork a task or the clock, or let its copy go on."""
         self._wirings[name] = wiring
         copy = self._to_go_on.pop(name, None)
-        if copy is not None and can_go_on(copy, wiring):
+        if copy is not None and copy.can_be(wiring):
             try:
-                self._watch(name, self._shelf.go_on(copy, wiring, self._segment.fd))
+                self._watch(name, copy.go_on(wiring, self._segment.rack))
             except OSError:
                 self._fail_to_fork(name, "its copy in the snapshot is gone")
             return
@@ -177,8 +176,7 @@ class Crate:
 
     def _take_note(self) -> None:
         """Take the note of a board about its copy."""
-        names = {task.name for task in self._segment.layout.tasks} | {CLOCK}
-        self._shelf.take_note({name: self._wirings[name] for name in names & {*self._wirings}})
+        self._shelf.take_note(self._wirings)
         self._state_snapshots()
 
     def _state_snapshots(self) -> None:
@@ -362,6 +360,7 @@ class Crate:
         self._outputs.clear()
         self._resting.clear()
         self._to_go_on.clear()
+        self._wirings.clear()
         if hasattr(self, "_segment"):
             self._segment.close()
             del self._segment
