@@ -200,27 +200,6 @@ class AlarmEvents:
         self._geom = geom
         self._levels = levels
         self._live: dict[tuple[str, str], object] = {}  # by board and key: params set since
-        self._subjects: Mapping[About, Callable[[int, str], str]] = {
-            "nothing": lambda number, owner: "",
-            "task": lambda number, owner: self._task(number, CLOCK),
-            "mailbox": lambda number, owner: pick(self._layout.mailboxes, number, "mailbox").name,
-            "joint": lambda number, owner: joint_name(number, joints),
-            "geom": lambda number, owner: geom(number),
-            "name": lambda number, owner: pick(
-                levels[owner].names if owner in levels else (), number, "name"
-            ),
-            "brakes": lambda number, owner: _reason_to_brake(number),
-            "fault": lambda number, owner: subject_of(
-                pick(self._faults.entries, number, "fault"), self._layout, joints
-            ),
-            "command": lambda number, owner: level_of(
-                pick(self._operator.entries, number, "command"), self._layout
-            ),
-            "demand": lambda number, owner: (
-                ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
-            ),
-        }
-        """The name of what an alarm is about, from its number and the task that raised it."""
 
     def of(self, row: np.void, owner: str) -> Event:
         """Return the event of an alarm: a row of `rack.backplane.watch.alarms.RECORD` from the ring
@@ -236,34 +215,41 @@ class AlarmEvents:
         since = int(row["since"])
         kind = KIND_OF.get(alarm, "detection")
         code = alarm.name.lower()
-        subject = self._subjects[about](number, owner)
-        board = subject if about == "command" or alarm == Alarm.REJOINED else owner
+        fault = -1
         words: dict[str, object] = {}
         if about == "fault":
-            entry = self._faults.entries[number]
+            fault = number
+            entry = pick(self._faults.entries, number, "fault")
+            subject = subject_of(entry, self._layout, self._joints)
             board = board_of(entry, self._layout)
             code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
             words["what"] = describe_fault(entry, self._layout, self._joints, with_board=False)
             words["lasts"] = f", for {self._span(entry.ticks)}" if entry.ticks else ""
             words["times"] = counting(entry.count, "time")
         elif about == "command":
-            message = message_of(self._operator.entries[number], self._layout)
+            request = pick(self._operator.entries, number, "command")
+            subject = board = level_of(request, self._layout)
+            message = message_of(request, self._layout)
             words["what"] = describe(message)
-            words["before"] = ""
             if alarm == Alarm.COMMANDED:
                 since = -1
                 code = as_named(Operation, message.what).name.lower()
-                if message.what == Operation.SET:
-                    words["before"] = self._before(board, message)
+                is_set = message.what == Operation.SET
+                words["before"] = self._before(board, message) if is_set else ""
         elif about == "demand":
             demand = as_named(Demand, value)
+            subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
+            board = owner
             kind = "reaction" if demand else "recovery"
             why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
             words["what"] = DEMANDS[demand].format(why=why)
-        elif about == "mailbox":
-            words["writer"] = self._layout.mailboxes[number].writer
-        elif about == "geom":
-            words["writer"] = self._geom(as_whole(value))
+        else:
+            subject = self._subject(about, number, owner)
+            board = subject if alarm == Alarm.REJOINED else owner
+            if about == "mailbox":
+                words["writer"] = self._layout.mailboxes[number].writer
+            elif about == "geom":
+                words["writer"] = self._geom(as_whole(value))
         span = self._span(value)
         text = text.format(
             **words,
@@ -289,11 +275,32 @@ class AlarmEvents:
             board=board,
             text=text,
             code=code,
-            fault=number if about == "fault" else -1,
+            fault=fault,
             subject=subject,
             value=value,
             since=since,
         )
+
+    def _subject(self, about: About, number: int, owner: str) -> str:
+        """Return the name of what an alarm of a task is about. Raises `DamageError`."""
+        match about:
+            case "task":
+                return self._task(number, CLOCK)
+            case "mailbox":
+                return pick(self._layout.mailboxes, number, "mailbox").name
+            case "joint":
+                return joint_name(number, self._joints)
+            case "geom":
+                return self._geom(number)
+            case "name":
+                names = self._levels[owner].names if owner in self._levels else ()
+                return pick(names, number, "name")
+            case "brakes" if number > 0:
+                return as_named(Error, number).name.lower()
+            case "brakes":
+                return pick(ENGAGED_BY, -number, "reason to brake")
+            case _:
+                return ""
 
     def _before(self, board: str, command: OperatorCommand) -> str:
         """Return what a parameter was before a command that sets it."""
@@ -311,9 +318,3 @@ class AlarmEvents:
 
     def _span(self, ticks: float) -> str:
         return f"{counting(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"
-
-
-def _reason_to_brake(number: int) -> str:
-    if number > 0:
-        return as_named(Error, number).name.lower()
-    return pick(ENGAGED_BY, -number, "reason to brake")
