@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import gc
 import os
-import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from importlib import import_module
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
+from socket import socket
 
 from rack.backplane.copies import fill_memory
 from rack.backplane.lines import UtilityLines
@@ -51,18 +51,20 @@ from rack.boards.crate.requests import (
 )
 from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
 from rack.boards.errors import LONGEST_REASON, one_line
-from rack.boards.faults.tasks import hog
+from rack.boards.faults.tasks import act_on_core
 from rack.boards.run.board import enter, run_clock_board, run_task_board
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
 
+Source = Connection | socket | int
+"""What the crate waits for."""
 HOST_BOARD = "rack.boards.host.board"
 """What runs a host board's program, by name: a rack without host boards does not load it."""
 HOST_PROCESSES = 4
 """Processes beside those of the layout: Rack, crate, clock, recorder."""
-REST_MS = 10
+REST_S = 0.01
 """Time between two reads of what host boards print: one that prints without end waits, and delays
 no other."""
 ORPHANS_S = 1.0
@@ -77,7 +79,7 @@ class Crate:
     def __init__(self, line: Connection, attention: int) -> None:
         self._line = line
         self._attention = attention
-        self._segment: Segment  # from the Rack's request to open it on
+        self._opened: Segment | None = None  # that of the Rack, from its request on
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
         self._shelf = SnapshotShelf()
         self._wirings: dict[str, TaskWiring | ClockWiring] = {}
@@ -85,39 +87,40 @@ class Crate:
         self._preloaded: set[str] = set()
         self._outputs: dict[str, HostOutput] = {}
         self._resting: list[HostOutput] = []
-        self._poll = select.poll()
-        self._poll.register(line, select.POLLIN)
-        self._poll.register(self._shelf.line, select.POLLIN)
         # The line alone does not show that the launcher is gone: a process that it forked may hold
         # its end open.
         self._launcher = os.pidfd_open(os.getppid())
-        self._poll.register(self._launcher, select.POLLIN)
+
+    @property
+    def _segment(self) -> Segment:
+        assert self._opened is not None, "a rack is open"
+        return self._opened
 
     def run(self) -> None:
         """Serve the Rack until it is gone, then make sure that no board is left."""
         while True:
-            ready = self._poll.poll(REST_MS if self._resting else None)
-            while not ready and self._resting:
-                self._poll.register(self._resting.pop().reader, select.POLLIN)
-            printing = {output.reader: output for output in self._outputs.values()}
-            for fd, _ in ready:
-                if fd in self._boards:
-                    self._reap(fd)
-                elif fd == self._shelf.line.fileno():
-                    self._take_note()
-                elif fd in printing:
-                    printing[fd].pass_on()
-                    self._poll.unregister(fd)
-                    self._resting.append(printing[fd])
-                elif fd == self._launcher or (request := received(self._line)) is None:
+            printing = [output for output in self._outputs.values() if output not in self._resting]
+            readers = [output.reader for output in printing]
+            ready = self._reap_ended(
+                REST_S if self._resting else None, self._line, self._launcher, *readers
+            )
+            if not ready:
+                self._resting.clear()
+            for output in printing:
+                if output.reader in ready:
+                    output.pass_on()
+                    self._resting.append(output)
+            is_gone = self._launcher in ready
+            if is_gone or self._line in ready:
+                request = None if is_gone else received(self._line)
+                if request is None:
                     self._leave()
                     had_any = len(self._shelf) > 0
                     self._shelf.clear()
                     self._reap_copies(are_all=had_any)
                     return
-                elif isinstance(request, Leave):
+                if isinstance(request, Leave):
                     self._leave_for_another()
-                    break
                 else:
                     self._serve(request)
 
@@ -126,7 +129,7 @@ class Crate:
             case Preload() as wanted:
                 self._preload(wanted)
             case Open(rack, priority, before):
-                self._segment = Segment.attach(rack)
+                self._opened = Segment.attach(rack)
                 note_used_files()
                 set_priority(priority)
                 self._line.send(Opened(-1 if before is None else self._fill_segment(before)))
@@ -136,7 +139,7 @@ class Crate:
                 output = self._output(name).writer
                 self._fork(name, lambda segment: self._run_host_board(segment, host, output))
             case PowerOn(name, HogWiring(entry)):
-                self._fork(name, lambda segment: hog(segment, entry))
+                self._fork(name, lambda segment: act_on_core(segment, entry))
             case PowerOff(name):
                 self._kill(name)
             case Show(tick, name):
@@ -229,8 +232,7 @@ class Crate:
     def _output(self, name: str) -> HostOutput:
         """Return what a host board prints into, in all its processes."""
         if name not in self._outputs:
-            self._outputs[name] = output = HostOutput(name)
-            self._poll.register(output.reader, select.POLLIN)
+            self._outputs[name] = HostOutput(name)
         return self._outputs[name]
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
@@ -261,7 +263,6 @@ class Crate:
         """Watch a process that has become a board."""
         pidfd = os.pidfd_open(pid)
         self._boards[pidfd] = name, pid
-        self._poll.register(pidfd, select.POLLIN)
         # The Rack may have closed the line meanwhile: the crate must live to end its boards.
         with suppress(OSError):
             self._line.send(Forked(name, pid))
@@ -270,7 +271,6 @@ class Crate:
         seen_ns = time.monotonic_ns()
         name, pid = self._boards.pop(pidfd)
         tick = self._mark_lost(name)
-        self._poll.unregister(pidfd)
         os.close(pidfd)
         _, status = os.waitpid(pid, 0)
         if self._is_host(name):
@@ -328,23 +328,18 @@ class Crate:
     def _leave(self) -> None:
         """End after the Rack: boards notice that it is gone and end; those that take too long are
         killed."""
-        self._poll.unregister(self._line)
-        self._poll.unregister(self._launcher)
-        for output in self._outputs.values():
-            if output not in self._resting:
-                self._poll.unregister(output.reader)
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
                 # It may block for ever: only a signal gets it out of that.
                 signal.pidfd_send_signal(pidfd, signal.SIGTERM)
         while self._boards and (left := deadline - time.monotonic()) > 0:
-            self._reap_ended(int(left * 1000) + 1)
+            self._reap_ended(left)
         self._kill()
         while self._boards:
             self._reap_ended(None)
         # What boards wrote of their copies before they ended.
-        while hasattr(self, "_segment") and readable(self._shelf.line.fileno(), 0):
+        while readable(self._shelf.line.fileno(), 0):
             self._take_note()
         self._reap_copies()
 
@@ -363,21 +358,23 @@ class Crate:
         self._resting.clear()
         self._to_go_on.clear()
         self._wirings.clear()
-        if hasattr(self, "_segment"):
-            self._segment.close()
-            del self._segment
-        self._poll.register(self._line, select.POLLIN)
-        self._poll.register(self._launcher, select.POLLIN)
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
         # A Rack that is gone is noticed next.
         with suppress(OSError):
             self._line.send(Left())
 
-    def _reap_ended(self, timeout_ms: int | None) -> None:
-        for fd, _ in self._poll.poll(timeout_ms):
-            if fd in self._boards:
-                self._reap(fd)
-            else:
-                self._take_note()
+    def _reap_ended(self, timeout_s: float | None, *others: Source) -> Collection[object]:
+        """Reap boards that end, and take notes of others, until something happens; return what was
+        ready of these and of `others`."""
+        ready = wait([self._shelf.line, *self._boards, *others], timeout_s)
+        for pidfd in [*self._boards]:
+            if pidfd in ready:
+                self._reap(pidfd)
+        if self._shelf.line in ready:
+            self._take_note()
+        return ready
 
 
 def main() -> None:
