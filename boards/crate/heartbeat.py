@@ -62,9 +62,12 @@ class Heartbeat:
             if count != seen or is_excused:
                 self._seen[name] = count, now
                 self._reported.discard(name)
-            elif now - since > self._bounds[name] and name not in self._reported:
-                if name != CLOCK or self._clock_is_stuck():
-                    found.append(name)
+            elif (
+                now - since > self._bounds[name]
+                and name not in self._reported
+                and (name != CLOCK or self._clock_is_stuck())
+            ):
+                found.append(name)
         self._reported.update(found)
         return found
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout
@@ -23,17 +22,6 @@ from rack.boards.crate.requests import Ended, PowerOff, PowerOn
 from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.events import Journal
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
-
-
-class Restart(NamedTuple):
-    """A restart that the policy permits: the `number`-th of at most `most` within `within_s`, s."""
-
-    number: int
-    most: int
-    within_s: float
-
-    def __str__(self) -> str:
-        return f"restart {self.number} of at most {self.most} in {self.within_s:g} s"
 
 
 class Supervision:
@@ -52,16 +40,16 @@ class Supervision:
                 {task.board} if task.role == "planner" else set()
             )
 
-    def admit(self, task: str, tick: int) -> Restart | None:
-        """Count one more restart of a task, lost at `tick`; return None if no more are
-        permitted."""
+    def admit(self, task: str, tick: int) -> str:
+        """Count one more restart of a task, lost at `tick`; return which one it is, as text, empty
+        if no more are permitted."""
         most, within_s = self._policy(task)
         since = tick - within_s * 1e9 / self._layout.clock_ns
         recent = [at for at in self._restarts[task] if at > since]
         if len(recent) >= most:
-            return None
+            return ""
         self._restarts[task] = [*recent, tick]
-        return Restart(len(recent) + 1, most, within_s)
+        return f"restart {len(recent) + 1} of at most {most} in {within_s:g} s"
 
     def in_order(self, tasks: list[str]) -> list[str]:
         """Return the tasks in order of restart: the clock, then lower levels before higher,
@@ -146,7 +134,7 @@ class Recovery:
             text = self._reason(name) or text
         elif restart := self._supervision.admit(name, end.tick):
             self._waiting.append(name)
-            self._journal.add("reaction", name, str(restart), "restart")
+            self._journal.add("reaction", name, restart, "restart")
             return
         else:
             text = f"{text}; no restarts left"
