@@ -137,9 +137,8 @@ class Rack:
         # The crate imports while this process resolves the config: with two cores this saves 0.5 s.
         # A level's module may have ended it: then resolving says which.
         crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
-        is_copied = self._snapshots is not None
-        plan = resolve(self.config).for_run(self._repeats, self._entries, is_copied)
-        if is_copied and (why := self._why_without_snapshots(plan)):
+        plan = resolve(self.config).for_run(self._repeats, self._entries)
+        if self._snapshots is not None and (why := self._why_without_snapshots(plan)):
             raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
         plan.check_files()
         remove_dead(self.config.name)
@@ -210,7 +209,7 @@ class Rack:
             # Not in the clock's wiring: what goes on from a snapshot may end at another tick.
             stop = max(clock.stop_tick, self.begins_at) if clock.stop_tick else 0
             self.segment.words[System.STOP_TICK] = stop
-            clock = replace(clock, stop_tick=0, is_copied=self._snapshots is not None)
+            clock = replace(clock, stop_tick=0)
         if self._continues is None:
             supervisor.reset_latch()
         else:

@@ -29,7 +29,7 @@ from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
-from rack.boards.run.snapshots import TaskCopies
+from rack.boards.run.snapshots import TaskCopies, takes_snapshots
 from rack.boards.run.system_controller import run_clock
 from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
@@ -96,7 +96,7 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
     spec = segment.layout.task(wiring.task)
-    copier = Copier(segment, wiring.task, copies) if wiring.is_copied else None
+    copier = Copier(segment, wiring.task, copies) if takes_snapshots(segment) else None
     block = segment.block(wiring.task)
     kind: type[Executor] | type[Planner]
     kind = (
@@ -141,7 +141,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
     """Take the processor and run the system clock."""
-    copier = Copier(segment, CLOCK, copies) if wiring.is_copied else None
+    copier = Copier(segment, CLOCK, copies) if takes_snapshots(segment) else None
     take_core(wiring.core, wiring.priority, wiring.reservation)
     # Not touched: every board waits for the clock's start, and its lead over the grid has room for
     # a page fault.

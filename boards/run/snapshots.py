@@ -29,6 +29,14 @@ REFUSED = -1
 """Value of `Block.COPY` of a task that cannot be copied."""
 
 
+def takes_snapshots(segment: Segment) -> bool:
+    """Return whether the rack wants any."""
+    words = segment.words
+    return any(
+        words[word] for word in (System.SNAPSHOT_PART, System.SNAPSHOT_EVERY, System.SNAPSHOT_AT)
+    )
+
+
 class TaskCopies:
     """Forks a copy of one task, between two of its cycles, when the clock wants it."""
 
