@@ -133,7 +133,9 @@ class Segment:
             segment._life = life
             # Before it has a name: nobody ever finds the segment of a live rack without this lock.
             life.take()
-            segment._take_name()
+            # With a descriptor, which absolute paths do not need, the link leads to the file, not
+            # to its path in /proc.
+            os.link(f"/proc/self/fd/{fd}", shm_path(layout.rack), src_dir_fd=fd)
         except OSError as error:
             os.close(fd)
             life.close()
@@ -143,21 +145,16 @@ class Segment:
                     " clean'"
                 )
                 raise SegmentError(f"rack '{layout.rack}' {why}") from None
-            raise no_room(layout.rack, f"{size} bytes of shared memory", error) from None
-        return segment
-
-    def _take_name(self) -> None:
-        folder = os.open(SHM_FOLDER, os.O_PATH)
-        try:
-            # With a folder's descriptor the link leads to the path's target, not to the path.
-            os.link(
-                f"/proc/self/fd/{self.fd}",
-                shm_path(self.rack).name,
-                src_dir_fd=folder,
-                dst_dir_fd=folder,
+            found = os.statvfs(SHM_FOLDER)
+            whole, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
+            room = (
+                f"{SHM_FOLDER} has {whole} bytes, {free} of them free; in a container --shm-size"
+                " enlarges it"
             )
-        finally:
-            os.close(folder)
+            raise SegmentError(
+                f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}: {room}"
+            ) from None
+        return segment
 
     def _fill_head(self, texts: list[bytes]) -> None:
         address = self.map.size
@@ -374,16 +371,6 @@ def unlink(rack: str) -> None:
         raise SegmentError(
             f"rack '{rack}' belongs to another user: only that user may remove it"
         ) from None
-
-
-def no_room(rack: str, needed: str, error: OSError) -> SegmentError:
-    """Return the error of a rack whose shared memory cannot be obtained."""
-    found = os.statvfs(SHM_FOLDER)
-    size, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
-    room = (
-        f"{SHM_FOLDER} has {size} bytes, {free} of them free; in a container --shm-size enlarges it"
-    )
-    return SegmentError(f"rack '{rack}': {needed}: {error.strerror}: {room}")
 
 
 def shm_path(rack: str) -> Path:

@@ -136,8 +136,15 @@ class Crate:
             case PowerOn(name, TaskWiring() | ClockWiring() as wiring):
                 self._power_on(name, wiring)
             case PowerOn(name, HostWiring() as host):
-                output = self._output(name).writer
-                self._fork(name, lambda segment: self._run_host_board(segment, host, output))
+                # All processes of a host board print into one pipe.
+                if name not in self._outputs:
+                    self._outputs[name] = HostOutput(name)
+                lines = self._attention, self._outputs[name].writer
+                # Its process alone imports what that takes.
+                self._fork(
+                    name,
+                    lambda segment: import_module(HOST_BOARD).run_host_board(segment, host, *lines),
+                )
             case PowerOn(name, HogWiring(entry)):
                 self._fork(name, lambda segment: act_on_core(segment, entry))
             case PowerOff(name):
@@ -222,18 +229,6 @@ class Crate:
                 return False
             self._preloaded.add(reference)
         return True
-
-    def _run_host_board(self, segment: Segment, wiring: HostWiring, output: int) -> int:
-        """Run a host board in its process, which alone imports what that takes."""
-        board = import_module(HOST_BOARD)
-        status: int = board.run_host_board(segment, wiring, self._attention, output)
-        return status
-
-    def _output(self, name: str) -> HostOutput:
-        """Return what a host board prints into, in all its processes."""
-        if name not in self._outputs:
-            self._outputs[name] = HostOutput(name)
-        return self._outputs[name]
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
         crate = os.getpid()

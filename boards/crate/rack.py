@@ -138,8 +138,13 @@ class Rack:
         # A level's module may have ended it: then resolving says which.
         crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
         plan = resolve(self.config).for_run(self._repeats, self._entries)
-        if self._snapshots is not None and (why := self._why_without_snapshots(plan)):
-            raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
+        if self._snapshots is not None:
+            # In a replay what came from outside is in the wiring.
+            why = "" if plan.is_replay else outside(self.config)
+            if self.config.clock.mode != "lockstep":
+                why = "they are taken in lockstep; add --lockstep"
+            if why:
+                raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
         plan.check_files()
         remove_dead(self.config.name)
         segment = Segment.create(plan.layout, self.config.text(), plan.published.text())
@@ -170,13 +175,6 @@ class Rack:
         self._inject(plan, crate)
         for note in (*moved, *plan.notes(segment)):
             self._journal.add("ready", "", note)
-
-    def _why_without_snapshots(self, plan: Resolved) -> str:
-        """Return why this rack has none; empty: it has."""
-        if self.config.clock.mode != "lockstep":
-            return "they are taken in lockstep; add --lockstep"
-        # In a replay what came from outside is in the wiring.
-        return "" if plan.is_replay else outside(self.config)
 
     def _inject(self, plan: Resolved, crate: CrateLine) -> None:
         """Fill the tables with the config's faults and commands; start the faults that are
@@ -227,10 +225,9 @@ class Rack:
     def run(self, seconds: float | None = None) -> Outcome:
         """Run for `seconds` of simulated time, or until the task ends; return the outcome."""
         self.start(seconds)
-        while self.watch(LOOK_S):
-            continue
-        assert self.outcome is not None
-        return self.outcome
+        while (outcome := self.outcome) is None:
+            self.watch(LOOK_S)
+        return outcome
 
     def run_in_background(self, seconds: float | None = None) -> None:
         """Begin to run as `run` does, and return: a thread supervises the boards until the run is

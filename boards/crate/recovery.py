@@ -23,6 +23,9 @@ from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.events import Journal
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 
+UP = (TaskState.READY, TaskState.RUNNING)
+"""States of a board that has passed its self-test."""
+
 
 class Supervision:
     """The restart policy of a rack. It counts in ticks, so that in lockstep the same losses have
@@ -43,7 +46,13 @@ class Supervision:
     def admit(self, task: str, tick: int) -> str:
         """Count one more restart of a task, lost at `tick`; return which one it is, as text, empty
         if no more are permitted."""
-        most, within_s = self._policy(task)
+        common = self._config.supervision
+        most, within_s = common.restarts, common.within_s
+        if task != CLOCK:
+            board = self._config.table(self._layout.task(task))
+            most = most if board.restarts is None else board.restarts
+            own_s = board.restarts_within_s
+            within_s = within_s if own_s is None else own_s
         since = tick - within_s * 1e9 / self._layout.clock_ns
         recent = [at for at in self._restarts[task] if at > since]
         if len(recent) >= most:
@@ -61,15 +70,6 @@ class Supervision:
         """Say whether a task on which this one depends is still absent: any below it, or a
         planner's executor."""
         return not self._needs[task].isdisjoint(absent)
-
-    def _policy(self, task: str) -> tuple[int, float]:
-        common = self._config.supervision
-        if task == CLOCK:
-            return common.restarts, common.within_s
-        spec = self._layout.task(task)
-        board = self._config.table(spec)
-        most = common.restarts if board.restarts is None else board.restarts
-        return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
 
 
 class Recovery:
@@ -166,7 +166,11 @@ class Recovery:
     def advance(self) -> None:
         """Power on the boards that are due, and end host boards that a signal has stopped: nothing
         else shows that one hangs."""
-        self._starting = [name for name in self._starting if self._is_absent(name)]
+        self._starting = [
+            name
+            for name in self._starting
+            if name != CLOCK and self._segment.block(name)[Block.STATE] not in UP
+        ]
         absent = [*self._waiting, *self._starting]
         for board in self._supervision.in_order(self._waiting):
             if not self._supervision.must_wait(board, absent):
@@ -179,11 +183,6 @@ class Recovery:
                 self._stopped.add(name)
                 self.report_hanging(name, ": stopped by a signal")
                 self._crate.ask(PowerOff(name))
-
-    def _is_absent(self, board: str) -> bool:
-        if board == CLOCK:
-            return False
-        return self._segment.block(board)[Block.STATE] not in (TaskState.READY, TaskState.RUNNING)
 
     def _reason(self, board: str) -> str:
         """Return the reason that a board printed last; empty: none."""

@@ -96,10 +96,6 @@ class HeldSnapshot:
         if self.memory >= 0:
             os.close(self.memory)
 
-    def can_go_on(self) -> bool:
-        """Say whether every copy waits: nothing else ends the other end of its line."""
-        return all(copy.pid and not copy.line.poll() for copy in self.copies.values())
-
 
 class SnapshotShelf:
     """The snapshots of the racks of one crate. Boards write to `boards_line` of their copies."""
@@ -184,7 +180,8 @@ class SnapshotShelf:
         """Return the last whole snapshot at `tick` or before; None: there is none."""
         found = [one for one in self._held if one.tick <= tick]
         for snapshot in sorted(found, key=lambda one: one.tick, reverse=True):
-            if snapshot.can_go_on():
+            # Every copy waits: nothing else ends the other end of its line.
+            if all(copy.pid and not copy.line.poll() for copy in snapshot.copies.values()):
                 return snapshot
             self.drop(snapshot)
         return None

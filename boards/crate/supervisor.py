@@ -14,19 +14,18 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import digest
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
-from rack.backplane.words import Block, Run, System, TaskState
+from rack.backplane.words import Block, Run, System
 from rack.boards.config.resolved import Resolved
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.lateness import judge_lost_cycles
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.patience import Patience, RackAwaited
-from rack.boards.crate.recovery import Recovery, Supervision
+from rack.boards.crate.recovery import UP, Recovery, Supervision
 from rack.boards.crate.requests import Ended, Forked, ForkFailed
 from rack.boards.errors import UNKEPT, LaunchError
 from rack.boards.events import SUCCESSES, Cause, Ending, Journal, Outcome, brakings
 
-UP = (TaskState.READY, TaskState.RUNNING)
 MOST_TICKS = 1 << 48
 """No run has so many."""
 LAST_S = 0.2

@@ -20,7 +20,7 @@ from rack.backplane.process import (
     name_process,
     set_priority,
     take_core,
-    take_processor,
+    wake_up_exactly,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
@@ -118,7 +118,9 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
             # Still at ordinary priority: a board that is restarted must not delay another board's
             # cycle.
             touch_memory()
-        block[Block.PRIORITY] = take_processor(spec, wiring.reservation, lockstep)
+        block[Block.PRIORITY] = take_core(spec.core, spec.priority, wiring.reservation)
+        wake_up_exactly()
+        hold_memory(lockstep)
         block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
             level.open()

@@ -151,7 +151,10 @@ class PlannerLoop(Task):
         if not self.planner.wanted(tick):
             self._pass(tick)
             return
-        self._take_time_slice(tick)
+        # Claim the slice of a plan: the clock does not release this task until its end.
+        self.next_cycle.hold_until(tick + self.slice)
+        self.block[Block.DEADLINE] = tick + self.slice
+        self.stopwatch.notify_clock()
         self.plan(tick)
         with self._critical_section():
             # Stamped inside: before the section, and on leaving it, the executor may run first.
@@ -167,12 +170,6 @@ class PlannerLoop(Task):
         """Let the level plan."""
         self.planner.plan(tick)
         self.faults.burn(tick)
-
-    def _take_time_slice(self, tick: int) -> None:
-        """Claim the slice of a plan: the clock does not release this task until its end."""
-        self.next_cycle.hold_until(tick + self.slice)
-        self.block[Block.DEADLINE] = tick + self.slice
-        self.stopwatch.notify_clock()
 
     def _pass(self, tick: int) -> None:
         """Let a release pass without a plan; trace it if it came too late or others were

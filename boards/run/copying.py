@@ -148,7 +148,11 @@ class Copier:
         then on. End with the crate."""
         while True:
             for fd, offset in offsets.items():
-                _open_again(fd, offset)
+                # Open the file for this process alone, and read it up to `offset`.
+                again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
+                os.lseek(again, offset, os.SEEK_SET)
+                os.dup2(again, fd)
+                os.close(again)
             # A fork gets new ones from Python.
             random.setstate(seeds)
             try:
@@ -197,12 +201,3 @@ def _is_only_read(fd: int) -> bool:
     has_content = stat.S_ISREG(kind) or stat.S_ISDIR(kind)
     flags = fcntl(fd, F_GETFL)
     return stat.S_ISCHR(kind) or (has_content and flags & os.O_ACCMODE == os.O_RDONLY)
-
-
-def _open_again(fd: int, offset: int) -> None:
-    """Have an open file for this process alone, read up to `offset`."""
-    flags = os.O_RDONLY | os.O_CLOEXEC
-    again = os.open(f"/proc/self/fd/{fd}", flags)
-    os.lseek(again, offset, os.SEEK_SET)
-    os.dup2(again, fd)
-    os.close(again)

@@ -12,7 +12,7 @@ import time
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named
-from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
+from rack.backplane.clock.driver import ClockDriver, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
@@ -314,20 +314,15 @@ def run_clock(
         newest = words[System.TICK]
         alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
     end_of_run = EndOfRun(segment, wiring)
-    driver = driver_of_run(segment, wiring, end_of_run, alarms)
+    driver: ClockDriver
+    if wiring.lockstep:
+        layout = segment.layout
+        one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
+        one_at_a_time |= any(len(layout.pacers(host)) > 1 for host in layout.hosts)
+        driver = LockstepDriver(segment, end_of_run, one_at_a_time, wiring.history, alarms)
+        if copier is not None:
+            driver.snapshot = ClockCopies(segment, driver, copier)
+    else:
+        driver = RealtimeDriver(segment, end_of_run, alarms)
     driver.controller = SystemController(segment, wiring, driver, end_of_run)
-    if copier is not None and isinstance(driver, LockstepDriver):
-        driver.snapshot = ClockCopies(segment, driver, copier)
     driver.run()
-
-
-def driver_of_run(
-    segment: Segment, wiring: ClockWiring, ended: Ended, alarms: AlarmWriter
-) -> ClockDriver:
-    """Return the clock driver for the run's mode."""
-    if not wiring.lockstep:
-        return RealtimeDriver(segment, ended, alarms)
-    layout = segment.layout
-    one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
-    one_at_a_time |= any(len(layout.pacers(host)) > 1 for host in layout.hosts)
-    return LockstepDriver(segment, ended, one_at_a_time, wiring.history, alarms)
