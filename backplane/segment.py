@@ -238,7 +238,8 @@ class Segment:
                 f" {self.words[Head.SIZE]}"
             )
         try:
-            texts = [self._text(at) for at in TEXTS]
+            places = [self.words[at : at + 2] for at in TEXTS]
+            texts = [bytes(self.bytes[start : start + size]) for start, size in places]
             if crc32(b"".join(texts)) != self.words[Head.CHECK]:
                 raise ValueError("the texts in its head are damaged")
             layout, self.config, self.published = (text.decode() for text in texts)
@@ -250,10 +251,6 @@ class Segment:
             raise SegmentError(
                 f"rack '{self.rack}': layout unreadable, damaged or from another program: {error}"
             ) from None
-
-    def _text(self, at: int) -> bytes:
-        start = self.words[at]
-        return bytes(self.bytes[start : start + self.words[at + 1]])
 
     def view(self, address: int, size: int) -> memoryview:
         """Return the bytes at a bus address."""

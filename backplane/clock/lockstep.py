@@ -128,21 +128,18 @@ class LockstepDriver(ClockDriver):
             if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
         self.check(due, tick)
-        return self._wait_for_all(end)
-
-    def _wait_for_all(self, tick: int) -> bool:
-        """Wait until `tick` may begin; False when the launcher is gone."""
+        # Wait until the next tick may begin.
         order = self._last_first
         slowest = None
         for task in order:
-            if task.deadline > tick:
+            if task.deadline > end:
                 continue
-            if task.is_finished(tick):
+            if task.is_finished(end):
                 # Its report is taken even so: else the semaphore would overflow.
                 task.done.take()
             else:
                 slowest = task
-                if not self.await_state(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
+                if not self.await_state(task, lambda task=task: task.is_finished(end)):  # type: ignore[misc]
                     return False
         if slowest is not None and slowest is not order[0]:
             order.remove(slowest)

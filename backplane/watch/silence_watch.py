@@ -18,12 +18,12 @@ from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
+from rack.backplane.watch.message_watch import LONG_AGO
 from rack.backplane.words import Block, Box, is_on
 
 MUTE_CYCLES = 3
 """Age in cycles of the writer from which silence is investigated; two are normal."""
 STALE_CYCLES = 4
-LONG_AGO = -(1 << 62)
 
 
 class ReadingTask:

@@ -119,20 +119,14 @@ class Crate:
                     self._shelf.clear()
                     self._reap_copies(are_all=had_any)
                     return
-                if isinstance(request, Leave):
-                    self._leave_for_another()
-                else:
-                    self._serve(request)
+                self._serve(request)
 
     def _serve(self, request: object) -> None:
         match request:
             case Preload() as wanted:
                 self._preload(wanted)
-            case Open(rack, priority, before):
-                self._opened = Segment.attach(rack)
-                note_used_files()
-                set_priority(priority)
-                self._line.send(Opened(-1 if before is None else self._fill_segment(before)))
+            case Open() as wanted_rack:
+                self._open(wanted_rack)
             case PowerOn(name, TaskWiring() | ClockWiring() as wiring):
                 self._power_on(name, wiring)
             case PowerOn(name, HostWiring() as host):
@@ -149,21 +143,27 @@ class Crate:
                 self._fork(name, lambda segment: act_on_core(segment, entry))
             case PowerOff(name):
                 self._kill(name)
+            case Leave():
+                self._leave()
+                # A Rack that is gone is noticed next.
+                with suppress(OSError):
+                    self._line.send(Left())
             case Show(tick, name):
                 snapshot = self._shelf.nearest(tick)
                 text = "" if snapshot is None or not name else snapshot.copies[name].show()
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
-    def _fill_segment(self, before: int) -> int:
-        """Fill the segment from the last snapshot at that tick or before; return its tick, -1
-        without one."""
-        snapshot = self._shelf.nearest(before)
-        if snapshot is None:
-            return -1
-        fill_memory(self._segment, snapshot.memory, snapshot.tick)
-        self._to_go_on = {**snapshot.copies}
-        self._state_snapshots()
-        return snapshot.tick
+    def _open(self, wanted: Open) -> None:
+        """Attach to a segment; fill it if its rack goes on from a snapshot."""
+        self._opened = segment = Segment.attach(wanted.rack)
+        note_used_files()
+        set_priority(wanted.priority)
+        snapshot = None if wanted.before is None else self._shelf.nearest(wanted.before)
+        if snapshot is not None:
+            fill_memory(segment, snapshot.memory, snapshot.tick)
+            self._to_go_on = {**snapshot.copies}
+            self._state_snapshots()
+        self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
         """Fork a task or the clock, or let its copy go on."""
@@ -262,18 +262,6 @@ class Crate:
         with suppress(OSError):
             self._line.send(Forked(name, pid))
 
-    def _reap(self, pidfd: int) -> None:
-        seen_ns = time.monotonic_ns()
-        name, pid = self._boards.pop(pidfd)
-        tick = self._mark_lost(name)
-        os.close(pidfd)
-        _, status = os.waitpid(pid, 0)
-        if self._is_host(name):
-            self._end_orphans()
-            self._outputs[name].pass_on(is_over=True)
-        with suppress(OSError):
-            self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
-
     def _end_orphans(self) -> None:
         """End whatever a host board has started, in any session: with its end it has become a child
         of the crate."""
@@ -321,8 +309,8 @@ class Crate:
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
     def _leave(self) -> None:
-        """End after the Rack: boards notice that it is gone and end; those that take too long are
-        killed."""
+        """Leave a rack whose Rack is gone, or wants that: boards notice it and end; those that take
+        too long are killed."""
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
@@ -337,16 +325,6 @@ class Crate:
         while readable(self._shelf.line.fileno(), 0):
             self._take_note()
         self._reap_copies()
-
-    def _reap_copies(self, are_all: bool = False) -> None:
-        """Reap the copies that have ended since; wait for their end if `are_all` to end."""
-        with suppress(ChildProcessError):
-            while os.waitpid(-1, 0 if are_all else os.WNOHANG)[0]:
-                continue
-
-    def _leave_for_another(self) -> None:
-        """Leave this rack, and wait for the requests of another one."""
-        self._leave()
         for output in self._outputs.values():
             output.close()
         self._outputs.clear()
@@ -356,17 +334,28 @@ class Crate:
         if self._opened is not None:
             self._opened.close()
             self._opened = None
-        # A Rack that is gone is noticed next.
-        with suppress(OSError):
-            self._line.send(Left())
+
+    def _reap_copies(self, are_all: bool = False) -> None:
+        """Reap the copies that have ended since; wait for their end if `are_all` to end."""
+        with suppress(ChildProcessError):
+            while os.waitpid(-1, 0 if are_all else os.WNOHANG)[0]:
+                continue
 
     def _reap_ended(self, timeout_s: float | None, *others: Source) -> Collection[object]:
         """Reap boards that end, and take notes of others, until something happens; return what was
         ready of these and of `others`."""
         ready = wait([self._shelf.line, *self._boards, *others], timeout_s)
-        for pidfd in [*self._boards]:
-            if pidfd in ready:
-                self._reap(pidfd)
+        for pidfd in [pidfd for pidfd in self._boards if pidfd in ready]:
+            seen_ns = time.monotonic_ns()
+            name, pid = self._boards.pop(pidfd)
+            tick = self._mark_lost(name)
+            os.close(pidfd)
+            _, status = os.waitpid(pid, 0)
+            if self._is_host(name):
+                self._end_orphans()
+                self._outputs[name].pass_on(is_over=True)
+            with suppress(OSError):
+                self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
         if self._shelf.line in ready:
             self._take_note()
         return ready

@@ -62,7 +62,15 @@ def _probability(default: float, most: float) -> Parameter:
 
 
 def _size(meaning: str, visible: float, least: float, most: float) -> Parameter:
-    return Parameter("size", "rad", meaning, visible, least, most, drawn=draw.size_from(visible))
+    return Parameter(
+        "size",
+        "rad",
+        meaning,
+        visible,
+        least,
+        most,
+        drawn=draw.magnitude(visible, draw.BEYOND * visible),
+    )
 
 
 KINDS.add(

@@ -98,11 +98,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
     spec = segment.layout.task(wiring.task)
     copier = Copier(segment, wiring.task, copies) if takes_snapshots(segment) else None
     block = segment.block(wiring.task)
-    kind: type[Executor] | type[Planner]
-    kind = (
-        find_class(wiring.target, Executor)
-        if spec.role == "executor"
-        else find_class(wiring.target, Planner)
+    kind: type[Executor] | type[Planner] = find_class(
+        wiring.target, Executor if spec.role == "executor" else Planner
     )
     level = kind(wiring.context)
     if isinstance(level, Adapter):

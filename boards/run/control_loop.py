@@ -8,8 +8,6 @@ stopwatch keeps time stamps, trace and counts; faults take effect between cycles
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from time import monotonic_ns
 
 from rack.backplane.process import set_priority
@@ -156,11 +154,17 @@ class PlannerLoop(Task):
         self.block[Block.DEADLINE] = tick + self.slice
         self.stopwatch.notify_clock()
         self.plan(tick)
-        with self._critical_section():
+        if self._critical_priority:
+            # The executor's own: it cannot preempt the update of the plan.
+            set_priority(self._critical_priority)
+        try:
             # Stamped inside: before the section, and on leaving it, the executor may run first.
             watch.process_ns = monotonic_ns()
             in_time = self.write_plan(tick, watch.now(tick + self.slice))
             watch.end_ns = monotonic_ns()
+        finally:
+            if self._critical_priority:
+                set_priority(self._priority)
         self.block[Block.PLANS] += 1
         # A plan begun late gets its whole slice, and answers any release within it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
@@ -181,15 +185,3 @@ class PlannerLoop(Task):
             return
         self.stopwatch.process_ns = self.stopwatch.end_ns = monotonic_ns()
         self.stopwatch.finish(in_time, tick + self.slice, tick)
-
-    @contextmanager
-    def _critical_section(self) -> Iterator[None]:
-        """Take the executor's priority for the update of the plan, so that the executor cannot
-        preempt it."""
-        if self._critical_priority:
-            set_priority(self._critical_priority)
-        try:
-            yield
-        finally:
-            if self._critical_priority:
-                set_priority(self._priority)

@@ -99,7 +99,19 @@ class SystemController:
         # Read before they are acted on: a change in between is handled at the next tick.
         emergency = words[System.EMERGENCY_STOP]
         peer = words[System.PEER_STOP]
-        self._set_demand(lost, tick)
+        asked = [
+            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
+        ]
+        if emergency:
+            asked.append((Demand.BRAKE, -1))
+        if is_on(peer, tick):
+            asked.append((Demand.STOP, PEER))
+        demand, subject = max(asked, default=(Demand.NONE, -1))
+        if demand != self._demand:
+            self._driver.settle()
+            self._demand = demand
+            words[System.DEMAND] = demand
+            self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
         # The same holds for a switch that lies ahead, and for a loss that the crate is recording.
         is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
         self._settled = (*seen, emergency, peer) if is_settled else None
@@ -124,21 +136,6 @@ class SystemController:
             # Time for the arm to come to rest before the run ends.
             ends = tick + self._wiring.linger
             self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
-
-    def _set_demand(self, lost: list[ReleasedTask], tick: int) -> None:
-        asked = [
-            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
-        ]
-        if self._words[System.EMERGENCY_STOP]:
-            asked.append((Demand.BRAKE, -1))
-        if is_on(self._words[System.PEER_STOP], tick):
-            asked.append((Demand.STOP, PEER))
-        demand, subject = max(asked, default=(Demand.NONE, -1))
-        if demand != self._demand:
-            self._driver.settle()
-            self._demand = demand
-            self._words[System.DEMAND] = demand
-            self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
 
 
 class OperatorDesk:
