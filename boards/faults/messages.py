@@ -179,7 +179,13 @@ class FaultyWriter:
     def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Apply these faults from now on; those that continue keep their delayed
         messages."""
-        steps = {entry.index: self._steps.get(entry.index) or self._step(entry) for entry in faults}
+        steps = {}
+        for entry in faults:
+            kind = kind_of(entry).step
+            assert isinstance(kind, type), "it acts on messages"
+            assert issubclass(kind, MessageStep)
+            before = self._steps.get(entry.index)
+            steps[entry.index] = before or kind(entry, self._writer, self._index)
         for index, step in self._steps.items():
             if index not in steps:
                 self._late += step.held
@@ -189,12 +195,6 @@ class FaultyWriter:
             step.onward = onward
             onward = step.send
         self._first = onward
-
-    def _step(self, entry: FaultEntry) -> MessageStep:
-        step = kind_of(entry).step
-        assert isinstance(step, type), "it acts on messages"
-        assert issubclass(step, MessageStep)
-        return step(entry, self._writer, self._index)
 
     @property
     def is_over(self) -> bool:

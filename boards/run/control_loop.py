@@ -104,16 +104,12 @@ class VirtualControlLoop(Task):
         for complete_cycle in executor.complete_cycle:
             complete_cycle(self._arm_state)
         if executor.findings or executor.acted or self.faults.loads:
-            self._report(tick)
-
-    def _report(self, tick: int) -> None:
-        executor = self.executor
-        for finding in executor.findings:
-            self.alarms.ring(tick, *finding)
-        executor.findings.clear()
-        self.faults.count(executor.acted, tick)
-        executor.acted.clear()
-        self.faults.burn(tick)
+            for finding in executor.findings:
+                self.alarms.ring(tick, *finding)
+            executor.findings.clear()
+            self.faults.count(executor.acted, tick)
+            executor.acted.clear()
+            self.faults.burn(tick)
 
 
 class PlannerLoop(Task):
@@ -153,7 +149,8 @@ class PlannerLoop(Task):
         self.next_cycle.hold_until(tick + self.slice)
         self.block[Block.DEADLINE] = tick + self.slice
         self.stopwatch.notify_clock()
-        self.plan(tick)
+        self.planner.plan(tick)
+        self.faults.burn(tick)
         if self._critical_priority:
             # The executor's own: it cannot preempt the update of the plan.
             set_priority(self._critical_priority)
@@ -169,11 +166,6 @@ class PlannerLoop(Task):
         # A plan begun late gets its whole slice, and answers any release within it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
         watch.finish(in_time, tick + self.slice, done, Flag.PLANNED)
-
-    def plan(self, tick: int) -> None:
-        """Let the level plan."""
-        self.planner.plan(tick)
-        self.faults.burn(tick)
 
     def _pass(self, tick: int) -> None:
         """Let a release pass without a plan; trace it if it came too late or others were
