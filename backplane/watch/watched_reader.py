@@ -15,7 +15,7 @@ from rack.backplane.mailbox.queue import ALL, QueueReader
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
-from rack.backplane.watch.message_watch import MessageWatch, QueueWatch
+from rack.backplane.watch.message_watch import QueueWatch
 from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
 from rack.backplane.words import Block
 
@@ -89,10 +89,9 @@ class WatchedReader(Watched):
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
     ) -> None:
         super().__init__(segment, reader, alarms, task)
-        self._messages = MessageWatch(segment, reader, self._episodes)
-        self._silence = SilenceWatch(segment, reader, self._episodes, task)
-        self._late_from = self._messages.late_from
-        self._quiet = self._silence.quiet
+        self._watch = SilenceWatch(segment, reader, self._episodes, task)
+        self._late_from = self._watch.late_from
+        self._quiet = self._watch.quiet
         self._writer = segment.block(reader.spec.writer)
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
@@ -100,32 +99,32 @@ class WatchedReader(Watched):
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
         reader = self.reader
-        messages = self._messages
+        watch = self._watch
         reading = reader.read(tick)
         if self._has_trouble:
-            messages.judge(tick)
+            watch.judge(tick)
             self._report(tick)
-        elif reader.found != messages.seen:
+        elif reader.found != watch.seen:
             found = reader.found
             newest = reader.newest
             # The usual case of `judge`: the next message, good and in time.
             if (
-                0 < found == messages.seen + 1
-                and messages.newest < newest > reader.visible - self._late_from
+                0 < found == watch.seen + 1
+                and watch.newest < newest > reader.visible - self._late_from
             ):
-                messages.seen = found
-                messages.newest = newest
+                watch.seen = found
+                watch.newest = newest
             else:
-                messages.judge(tick)
+                watch.judge(tick)
         if (
             tick - reader.newest >= self._quiet or self._writer[Block.LOST]
-        ) and self._silence.is_lost(tick):
+        ) and self._watch.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 
     def is_writer_lost(self, tick: int) -> bool:
         """Say whether the writer is lost, without a read."""
-        return self._silence.is_writer_lost(tick)
+        return self._watch.is_writer_lost(tick)
 
 
 class SporadicReader(Watched):
