@@ -201,8 +201,20 @@ class Crate:
         sys.path[:] = wanted.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
         for reference in wanted.classes:
-            if reference not in self._preloaded and not self._is_preloaded(reference):
-                return
+            if reference in self._preloaded:
+                continue
+            self._line.send(Preloading(reference))
+            with suppress(LookupError):
+                # The launcher tries it, and outlives the crate.
+                kind = find_class(reference, object, is_tried=False)
+                try:
+                    if issubclass(kind, Executor | Planner):
+                        kind.preload()
+                except Exception as error:
+                    reason = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
+                    self._line.send(PreloadFailed(reference, reason))
+                    return
+                self._preloaded.add(reference)
         if wanted.cell is not None:
             # Compile the cell, once for all boards. A cell with mistakes is the Rack's to
             # report.
@@ -213,22 +225,6 @@ class Crate:
         compiled.on_compile = None
         gc.freeze()
         gc.enable()
-
-    def _is_preloaded(self, reference: str) -> bool:
-        """Import a class and preload it; return False if it failed to preload."""
-        self._line.send(Preloading(reference))
-        with suppress(LookupError):
-            # The launcher tries it, and outlives the crate.
-            kind = find_class(reference, object, is_tried=False)
-            try:
-                if issubclass(kind, Executor | Planner):
-                    kind.preload()
-            except Exception as error:
-                reason = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
-                self._line.send(PreloadFailed(reference, reason))
-                return False
-            self._preloaded.add(reference)
-        return True
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
         crate = os.getpid()

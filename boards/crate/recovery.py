@@ -35,7 +35,8 @@ class Supervision:
         self._config = config
         self._layout = layout
         self._restarts: dict[str, list[int]] = defaultdict(list)
-        self._needs: dict[str, set[str]] = {CLOCK: set(), **{h.name: set() for h in layout.hosts}}
+        # Of the clock and of host boards nothing.
+        self._needs: dict[str, set[str]] = defaultdict(set)
         for task in layout.tasks:
             below = config.all_below(task.board)
             needed = {other.name for other in layout.tasks if other.board in below}
