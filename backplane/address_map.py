@@ -52,51 +52,40 @@ class AddressMap:
         self.windows: list[Window] = []
         self.blocks: dict[str, int] = {}
         self.traces: dict[str, int] = {}
-        self.alarms: dict[str, int] = {}
         self.mailboxes: dict[str, int] = {}
-        self.faults = HEAD_SIZE
-        self.operator = HEAD_SIZE + FAULT_ENTRIES * FAULT_ENTRY_SIZE
-        self.alarms[CLOCK] = self.operator + OPERATOR_ENTRIES * operator_entry_size(layout)
-        end = pages(self._place_mailboxes({CLOCK}, layout, self.alarms[CLOCK] + ALARM_SIZE))
-        self.windows.append(Window(CLOCK, HEAD_SIZE, end - HEAD_SIZE))
-        address = end
+        self._end = HEAD_SIZE
+        self.faults = self._take(FAULT_ENTRIES * FAULT_ENTRY_SIZE)
+        self.operator = self._take(OPERATOR_ENTRIES * operator_entry_size(layout))
+        self.alarms = {CLOCK: self._take(ALARM_SIZE)}
+        self._end_window(CLOCK, {CLOCK}, layout)
         for board in dict.fromkeys(task.board for task in layout.processes):
-            address = self._place_board(board, layout, address)
-        self.wake: dict[str, int] = {}
-        self.done: dict[str, int] = {}
-        self.locks: dict[str, int] = {}
-        self.size = pages(self._place_semaphores(layout, address))
-
-    def _place_semaphores(self, layout: Layout, start: int) -> int:
-        """Place the semaphores after all windows, each in a cache line of its own."""
-        names = [task.name for task in layout.processes]
+            tasks = [task for task in layout.processes if task.board == board]
+            for task in tasks:
+                self.blocks[task.name] = self._take(BLOCK_SIZE)
+                self.traces[task.name] = self._take(trace_size(task))
+                self.alarms[task.name] = self._take(ALARM_SIZE)
+            self._end_window(board, {task.name for task in tasks}, layout)
+        # Semaphores follow all windows, each in a cache line of its own.
+        self.wake = {task.name: self._take(LINE) for task in layout.processes}
+        self.done = {task.name: self._take(LINE) for task in layout.processes}
         locked = [box.name for box in layout.mailboxes if box.protocol == "lock"]
-        address = start
-        for places, of in ((self.wake, names), (self.done, names), (self.locks, locked)):
-            for name in of:
-                places[name] = address
-                address += LINE
+        self.locks = {name: self._take(LINE) for name in locked}
+        self.size = pages(self._end)
+
+    def _take(self, size: int) -> int:
+        """Place `size` bytes in cache lines of their own; return their address."""
+        address = self._end
+        self._end = _up(address + size, LINE)
         return address
 
-    def _place_board(self, board: str, layout: Layout, start: int) -> int:
-        address = start
-        tasks = [task for task in layout.processes if task.board == board]
-        for task in tasks:
-            self.blocks[task.name] = address
-            self.traces[task.name] = address + BLOCK_SIZE
-            self.alarms[task.name] = _up(address + BLOCK_SIZE + trace_size(task), LINE)
-            address = self.alarms[task.name] + ALARM_SIZE
-        end = pages(self._place_mailboxes({task.name for task in tasks}, layout, address))
-        self.windows.append(Window(board, start, end - start))
-        return end
-
-    def _place_mailboxes(self, writers: set[str], layout: Layout, start: int) -> int:
-        address = start
+    def _end_window(self, board: str, writers: set[str], layout: Layout) -> None:
+        """Place the mailboxes of the tasks of a board, and end its window with a whole page."""
         for mailbox in layout.mailboxes:
             if mailbox.writer in writers:
-                self.mailboxes[mailbox.name] = address
-                address = _up(address + mailbox_size(mailbox), LINE)
-        return address
+                self.mailboxes[mailbox.name] = self._take(mailbox_size(mailbox))
+        start = self.windows[-1].address + self.windows[-1].size if self.windows else HEAD_SIZE
+        self._end = pages(self._end)
+        self.windows.append(Window(board, start, self._end - start))
 
 
 def pages(size: int) -> int:

@@ -15,26 +15,30 @@ from contextlib import suppress
 from pathlib import Path
 
 from rack.backplane import byte_lock
-from rack.backplane.segment import Segment
+from rack.backplane.segment import Segment, shm_path
 from rack.backplane.words import Block, Box, System, TaskState
 
 _libc = ctypes.CDLL(None, use_errno=True)
-_libc.mmap.argtypes = (
-    *(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int),
-    ctypes.c_long,
-)
+_int = ctypes.c_int
+_libc.mmap.argtypes = ctypes.c_void_p, ctypes.c_size_t, _int, _int, _int, ctypes.c_long
 _libc.mmap.restype = ctypes.c_void_p
 _MAP_FIXED = 0x10
 OF_LAUNCH = (
-    *(System.STATE, System.EPOCH_NS, System.PERIOD_NS, System.LOCKSTEP, System.STOP_REQUEST),
-    *(System.STOP_TICK, System.FOLLOWER_PID, System.TICK_NS, System.CLOCK_PID, System.HOLD_AT),
-    *(
-        System.HELD,
-        System.SNAPSHOT_AT,
-        System.SNAPSHOT_PART,
-        System.SNAPSHOT_EVERY,
-        System.SNAPSHOTS,
-    ),
+    System.STATE,
+    System.EPOCH_NS,
+    System.PERIOD_NS,
+    System.LOCKSTEP,
+    System.STOP_REQUEST,
+    System.STOP_TICK,
+    System.FOLLOWER_PID,
+    System.TICK_NS,
+    System.CLOCK_PID,
+    System.HOLD_AT,
+    System.HELD,
+    System.SNAPSHOT_AT,
+    System.SNAPSHOT_PART,
+    System.SNAPSHOT_EVERY,
+    System.SNAPSHOTS,
     System.SNAPSHOT_BYTES,
 )
 """Words that each launch has of its own."""
@@ -87,9 +91,11 @@ def leave(segment: Segment) -> None:
     os.close(nothing)
 
 
-def enter(segment: Segment, fd: int) -> None:
-    """Let the views of `segment` be of another one of the same layout, open as `fd`, which is
-    closed. No lock is taken there, and no mailbox claimed."""
+def enter(segment: Segment, rack: str) -> None:
+    """Let the views of `segment` be of that of another rack, of the same layout. No lock is taken
+    there, and no mailbox claimed."""
+    fd = os.open(shm_path(rack), os.O_RDWR)
+    segment.rack = rack
     os.dup2(fd, segment.fd)
     os.close(fd)
     _map(segment, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, segment.fd)

@@ -117,7 +117,15 @@ class FaultTable:
                 raise FaultTableError(
                     f"the fault table is full: {len(self.entries)} faults were injected in this run"
                 )
-            _fill(entry, injection)
+            for name in ("kind", "task", "mailbox", "tick", "ticks", "phase", "seed"):
+                setattr(entry, name, getattr(injection, name))
+            entry.until = NEVER
+            entry.when_box, entry.when_field, entry.when_value = injection.when or (-1, 0, 0)
+            entry.struck_tick = -1
+            for place, parameter in enumerate(injection.parameters):
+                entry.parameters[place] = parameter
+            # Last: from here the clock may begin it.
+            entry.stage = Stage.WAITING
             self._words[System.INJECTED] += 1
         return entry
 
@@ -138,15 +146,3 @@ class FaultTable:
     def staged(self, stages: Sequence[Stage]) -> list[FaultEntry]:
         """Return the entries in one of these stages."""
         return [e for e in self.entries if e.stage in stages]
-
-
-def _fill(entry: FaultEntry, injection: Injection) -> None:
-    for name in ("kind", "task", "mailbox", "tick", "ticks", "phase", "seed"):
-        setattr(entry, name, getattr(injection, name))
-    entry.until = NEVER
-    entry.when_box, entry.when_field, entry.when_value = injection.when or (-1, 0, 0)
-    entry.struck_tick = -1
-    for place, parameter in enumerate(injection.parameters):
-        entry.parameters[place] = parameter
-    # Last: from here the clock may begin it.
-    entry.stage = Stage.WAITING

@@ -154,7 +154,18 @@ class OperatorTable:
             lock = ByteLock(self._segment.fd, _CLAIMS + ticket)
             if client:
                 lock.take()
-            self._fill(entry, request, ticket, client)
+            entry.stage = RequestStage.FREE
+            entry.ticket = ticket
+            entry.client = client
+            entry.mailbox = request.mailbox
+            entry.tick = request.tick
+            entry.serial = 0
+            entry.given_tick = -1
+            entry.heard = -1
+            entry.message[: len(request.message)] = request.message
+            # From here the clock may issue it.
+            entry.stage = RequestStage.WAITING
+            self._words[System.REQUESTED] += 1
         return RequestClaim(entry, ticket, lock)
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
@@ -205,17 +216,3 @@ class OperatorTable:
             else:
                 waiting.remove(entry)
         return found
-
-    def _fill(self, entry: RequestEntry, request: Request, ticket: int, client: Client) -> None:
-        entry.stage = RequestStage.FREE
-        entry.ticket = ticket
-        entry.client = client
-        entry.mailbox = request.mailbox
-        entry.tick = request.tick
-        entry.serial = 0
-        entry.given_tick = -1
-        entry.heard = -1
-        entry.message[: len(request.message)] = request.message
-        # From here the clock may issue it.
-        entry.stage = RequestStage.WAITING
-        self._words[System.REQUESTED] += 1

@@ -17,8 +17,6 @@ from struct import Struct
 from time import process_time_ns
 from typing import NamedTuple
 
-from rack.backplane.layout import TaskSpec
-
 GONE = "ZX"
 """States of a process that has ended."""
 WAITING = "SD"
@@ -140,18 +138,10 @@ def _reserve(reservation: Reservation) -> bool:
     return number is not None and _libc.syscall(number, 0, wanted, 0) == 0
 
 
-def take_processor(
-    spec: TaskSpec, reservation: Reservation | None = None, lockstep: bool = False
-) -> int:
-    """Take core and scheduling as `take_core`, and hold the process's memory."""
-    obtained = take_core(spec.core, spec.priority, reservation)
-    # Ordinary processes wake up to 50 us late without this, to save power.
+def wake_up_exactly() -> None:
+    """Let the calling process, if it is an ordinary one, sleep as long as it wants and no longer:
+    to save power, the system wakes such processes up to 50 us late."""
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    # Here, not above: it needs numpy, for which `rack list` and the like should not wait.
-    from rack.backplane.memory import hold_memory
-
-    hold_memory(lockstep)
-    return obtained
 
 
 @contextmanager

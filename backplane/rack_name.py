@@ -1,22 +1,4 @@
 """Names of racks. A rack and its segment have the same name."""
 
-from __future__ import annotations
-
-import re
-import unicodedata
-from collections.abc import Container
-
 RACK_NAME = "[a-z0-9][a-z0-9_-]{0,39}"
 """Regular expression of a valid name."""
-
-
-def is_free_name(name: str, taken: Container[str]) -> bool:
-    """Return True if a name is valid and not taken."""
-    return re.fullmatch(RACK_NAME, name) is not None and name not in taken
-
-
-def derive_name(text: str, taken: Container[str]) -> str:
-    """Return the free name closest to a text, such as the name of a file."""
-    plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
-    name = re.sub("[^a-z0-9_-]+", "-", plain).lstrip("-_")[:40].rstrip("-_") or "arm"
-    return f"{name[:36]}-arm" if name in taken else name

@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args, get_type_hints
 from zlib import crc32
 
-import posix_ipc
-
 from rack.backplane.address_map import BLOCK_SIZE, HEAD_SIZE, MAILBOX_HEAD_SIZE, AddressMap, pages
 from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
@@ -135,7 +133,9 @@ class Segment:
             segment._life = life
             # Before it has a name: nobody ever finds the segment of a live rack without this lock.
             life.take()
-            segment._take_name()
+            # With a descriptor, which absolute paths do not need, the link leads to the file, not
+            # to its path in /proc.
+            os.link(f"/proc/self/fd/{fd}", shm_path(layout.rack), src_dir_fd=fd)
         except OSError as error:
             os.close(fd)
             life.close()
@@ -145,21 +145,16 @@ class Segment:
                     " clean'"
                 )
                 raise SegmentError(f"rack '{layout.rack}' {why}") from None
-            raise no_room(layout.rack, f"{size} bytes of shared memory", error) from None
-        return segment
-
-    def _take_name(self) -> None:
-        folder = os.open(SHM_FOLDER, os.O_PATH)
-        try:
-            # With a folder's descriptor the link leads to the path's target, not to the path.
-            os.link(
-                f"/proc/self/fd/{self.fd}",
-                shm_path(self.rack).name,
-                src_dir_fd=folder,
-                dst_dir_fd=folder,
+            found = os.statvfs(SHM_FOLDER)
+            whole, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
+            room = (
+                f"{SHM_FOLDER} has {whole} bytes, {free} of them free; in a container --shm-size"
+                " enlarges it"
             )
-        finally:
-            os.close(folder)
+            raise SegmentError(
+                f"rack '{layout.rack}': {size} bytes of shared memory: {error.strerror}: {room}"
+            ) from None
+        return segment
 
     def _fill_head(self, texts: list[bytes]) -> None:
         address = self.map.size
@@ -215,22 +210,19 @@ class Segment:
         if (kind := stranger(rack)) is not None:
             raise SegmentError(f"rack '{rack}': {shm_path(rack)} is a {kind}, not a segment")
         try:
-            shm = posix_ipc.SharedMemory(_shm_name(rack))
-        except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
-            why = (
-                "belongs to another user"
-                if isinstance(error, posix_ipc.PermissionsError)
-                else "does not exist"
-            )
+            fd = os.open(shm_path(rack), os.O_RDWR | os.O_NOFOLLOW)
+        except OSError as error:
+            is_foreign = isinstance(error, PermissionError)
+            why = "belongs to another user" if is_foreign else "does not exist"
             raise SegmentError(
                 f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}"
             ) from None
-        found = os.fstat(shm.fd)
+        found = os.fstat(fd)
         if os.getuid() not in (found.st_uid, 0) or found.st_size < HEAD_SIZE:
-            os.close(shm.fd)
+            os.close(fd)
             why = f"owner {found.st_uid}, {found.st_size} bytes: not a segment of this user's"
             raise SegmentError(f"rack '{rack}': {why}")
-        return cls(rack, mmap.mmap(shm.fd, found.st_size), shm.fd)
+        return cls(rack, mmap.mmap(fd, found.st_size), fd)
 
     def read_head(self) -> None:
         """Read the texts. Raises `SegmentError` when size or version is wrong, or a text is
@@ -246,7 +238,8 @@ class Segment:
                 f" {self.words[Head.SIZE]}"
             )
         try:
-            texts = [self._text(at) for at in TEXTS]
+            places = [self.words[at : at + 2] for at in TEXTS]
+            texts = [bytes(self.bytes[start : start + size]) for start, size in places]
             if crc32(b"".join(texts)) != self.words[Head.CHECK]:
                 raise ValueError("the texts in its head are damaged")
             layout, self.config, self.published = (text.decode() for text in texts)
@@ -258,10 +251,6 @@ class Segment:
             raise SegmentError(
                 f"rack '{self.rack}': layout unreadable, damaged or from another program: {error}"
             ) from None
-
-    def _text(self, at: int) -> bytes:
-        start = self.words[at]
-        return bytes(self.bytes[start : start + self.words[at + 1]])
 
     def view(self, address: int, size: int) -> memoryview:
         """Return the bytes at a bus address."""
@@ -374,23 +363,11 @@ def unlink(rack: str) -> None:
     Raises `SegmentError` when it is another user's.
     """
     try:
-        posix_ipc.unlink_shared_memory(_shm_name(rack))
-    except posix_ipc.ExistentialError:
-        return
-    except posix_ipc.PermissionsError:
+        shm_path(rack).unlink(missing_ok=True)
+    except PermissionError:
         raise SegmentError(
             f"rack '{rack}' belongs to another user: only that user may remove it"
         ) from None
-
-
-def no_room(rack: str, needed: str, error: OSError) -> SegmentError:
-    """Return the error of a rack whose shared memory cannot be obtained."""
-    found = os.statvfs(SHM_FOLDER)
-    size, free = (count * found.f_frsize for count in (found.f_blocks, found.f_bavail))
-    room = (
-        f"{SHM_FOLDER} has {size} bytes, {free} of them free; in a container --shm-size enlarges it"
-    )
-    return SegmentError(f"rack '{rack}': {needed}: {error.strerror}: {room}")
 
 
 def shm_path(rack: str) -> Path:
@@ -400,10 +377,6 @@ def shm_path(rack: str) -> Path:
 
 def _pid_namespace() -> int:
     return Path("/proc/self/ns/pid").stat().st_ino
-
-
-def _shm_name(rack: str) -> str:
-    return f"/{PREFIX}{rack}"
 
 
 def layout_of(plain: dict[str, Any]) -> Layout:

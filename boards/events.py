@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import AnyMessage, State, reason_of, state_name
@@ -15,7 +15,6 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
 if TYPE_CHECKING:
-    from rack.levels.algebra import Array
     from rack.levels.tables import GoalConfig
 
 OfRun = Literal[
@@ -311,7 +310,8 @@ class Ending:
                 box.message == "scene"
                 and (scene := open_observer(self._segment, box.name).peek()).is_there
             ):
-                return tuple(ends(goals, scene.message.position))
+                rows = scene.message.position
+                return tuple(ObjectEnd.of(goal, rows[row].tolist()) for row, goal in goals.items())
         return ()
 
     def cause(self) -> Cause:
@@ -349,16 +349,14 @@ class ObjectEnd:
     off_mm: float
     tolerance_mm: float
 
+    @classmethod
+    def of(cls, goal: GoalConfig, ended: Sequence[float]) -> Self:
+        """Return the end of the object that has a goal, m."""
+        off_mm = round(1e3 * math.dist(ended, goal.position), 3)
+        return cls(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)
+
     def __str__(self) -> str:
         return (
             f"object '{self.object}' ended {self.off_mm:.0f} mm from its goal (tolerance"
             f" {self.tolerance_mm:g} mm)"
         )
-
-
-def ends(goals: Mapping[int, GoalConfig], position: Array) -> Iterator[ObjectEnd]:
-    """Yield the end of every object that has a goal, by its row in `position`, (bodies, 3), m."""
-    for row, goal in goals.items():
-        ended = position[row].tolist()
-        off_mm = round(1e3 * math.dist(ended, goal.position), 3)
-        yield ObjectEnd(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)

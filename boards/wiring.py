@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from rack.backplane.layout import ExchangeSpec
 from rack.backplane.process import Reservation
@@ -72,7 +72,6 @@ class TaskWiring:
     messages the level sends itself. `fails_self_test`: a fault in the config. `entries`: for an
     adapter in a replay. `exchange`: the ports that are not simply read in every cycle; it makes the
     task write its mailbox `<board>.exchange`. `reservation`: asked for in place of a priority.
-    `is_copied`: the rack takes snapshots.
     """
 
     task: str
@@ -88,8 +87,6 @@ class TaskWiring:
     transfer: BusTimes
     exchange: Mapping[str, ExchangeSpec]
     reservation: Reservation | None
-    # Of one run, no part of how a rack is wired.
-    is_copied: bool = field(default=False, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -118,7 +115,7 @@ class ClockWiring:
     mailbox `ends_run` reports done or error, or if its writer, not lost, has written nothing for
     `silent`. In lockstep the clock is at most `history` ahead of a recorder, and a lost board
     rejoins `restart_ticks` after its loss. `on_loss`: the demand on the arm while a task is lost.
-    `keeps_awake`: no core sleeps while it is idle. `reservation`, `is_copied`: as of a task.
+    `keeps_awake`: no core sleeps while it is idle. `reservation`: as of a task.
     """
 
     lockstep: bool
@@ -134,4 +131,3 @@ class ClockWiring:
     restart_ticks: int
     on_loss: Mapping[str, Demand]
     reservation: Reservation | None
-    is_copied: bool = field(default=False, repr=False, compare=False)

@@ -47,7 +47,7 @@ def first(file: str, header: str, statement: str) -> tuple[str, str, str]:
 SLOTS, ARM = "backplane/mailbox/slots.py", "levels/arm/simulated.py"
 MAILBOX, WATCH = "backplane/mailbox/mailbox.py", "backplane/watch"
 MONITOR, RELEASED = "levels/servo/sensor_monitor.py", "backplane/clock/released_task.py"
-DAMAGED = "self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)"
+DAMAGED = "self._episodes.find(Alarm.DAMAGED, accesses, tick)"
 REPORT = "def _report(self, code: Alarm, tick: int, age: int) -> None:"
 HANGS = "def _hangs(self, task: ReleasedTask) -> bool:"
 GATE = "def refused(self, torque: Array) -> Finding | None:"
@@ -70,7 +70,7 @@ MUTANTS = (
             (SLOTS, "self.chain == xxh3(self.covered, self.words[_CHAIN])", "True"),
             (MAILBOX, "check != xxh3(self._covered, chain)", "False"),
             (f"{WATCH}/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
-            (f"{WATCH}/message_watch.py", DAMAGED, "pass"),
+            (f"{WATCH}/watched_reader.py", DAMAGED, "pass"),
         ),
     ),
     Mutant(

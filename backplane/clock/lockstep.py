@@ -37,16 +37,11 @@ LOOK_S = 0.001
 disturb the clock."""
 
 
-def _take_none(tick: int) -> int:
-    """Take no snapshot."""
-    return sys.maxsize
-
-
 class LockstepDriver(ClockDriver):
     """The driver of the clock in lockstep.
 
     `snapshot` is called before every tick, or batch, to take a snapshot when one is due; it returns
-    the next tick before which it must be called.
+    the next tick before which it must be called. At first it takes none.
 
     `one_at_a_time` releases the tasks of a tick one after the other, planners too, and waits for
     each. Protocols whose messages are visible at once need this to be repeatable; so does a task
@@ -65,7 +60,7 @@ class LockstepDriver(ClockDriver):
         self._one_at_a_time = one_at_a_time
         self._history_ticks = history_ticks
         self._last_first = list(reversed(self.tasks))
-        self.snapshot: Callable[[int], int] = _take_none
+        self.snapshot: Callable[[int], int] = lambda tick: sys.maxsize
         self._snapshot_at = 0
         self._next = self.first_tick
         self._last = self._next - 1
@@ -133,21 +128,18 @@ class LockstepDriver(ClockDriver):
             if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
         self.check(due, tick)
-        return self._wait_for_all(end)
-
-    def _wait_for_all(self, tick: int) -> bool:
-        """Wait until `tick` may begin; False when the launcher is gone."""
+        # Wait until the next tick may begin.
         order = self._last_first
         slowest = None
         for task in order:
-            if task.deadline > tick:
+            if task.deadline > end:
                 continue
-            if task.is_finished(tick):
+            if task.is_finished(end):
                 # Its report is taken even so: else the semaphore would overflow.
                 task.done.take()
             else:
                 slowest = task
-                if not self.await_state(task, lambda task=task: task.is_finished(tick)):  # type: ignore[misc]
+                if not self.await_state(task, lambda task=task: task.is_finished(end)):  # type: ignore[misc]
                     return False
         if slowest is not None and slowest is not order[0]:
             order.remove(slowest)

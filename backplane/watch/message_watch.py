@@ -24,26 +24,7 @@ LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
 
 
-class ReadFindings:
-    """Raises alarms for the damaged and forged messages that a reader itself has found."""
-
-    def __init__(self, reader: Reader, episodes: Episodes) -> None:
-        self._reader = reader
-        self._episodes = episodes
-        self._corrupt = self._forged = 0
-
-    def report(self, tick: int) -> None:
-        """Report the findings since the last call."""
-        found = self._reader.statistics
-        if found.corrupt != self._corrupt:
-            self._corrupt = found.corrupt
-            self._episodes.find(Alarm.DAMAGED, self._reader.accesses, tick)
-        if found.forged != self._forged:
-            self._forged = found.forged
-            self._episodes.find(Alarm.MASQUERADE, self._reader.accesses, tick, found.forger)
-
-
-class MessageWatch(ReadFindings):
+class MessageWatch:
     """Judges the messages of one mailbox for one reader; those before its first read are not
     judged.
 
@@ -52,7 +33,8 @@ class MessageWatch(ReadFindings):
     """
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
-        super().__init__(reader, episodes)
+        self._reader = reader
+        self._episodes = episodes
         self.seen = -1
         self._spec = reader.spec
         self._slots = reader.slots
@@ -74,7 +56,6 @@ class MessageWatch(ReadFindings):
                 self._begin(found)
             else:
                 self._walk(found, tick)
-        self.report(tick)
         if self._reader.statistics.held_up != self._held_up:
             self._held_up = self._reader.statistics.held_up
             self._find(Alarm.LOCKED, tick)
@@ -199,4 +180,3 @@ class QueueWatch(MessageWatch):
             lost = queue.statistics.lost - self._lost
             self._lost = queue.statistics.lost
             self._find(Alarm.GAP, tick, lost)
-        self.report(tick)

@@ -16,14 +16,13 @@ from rack.backplane.mailbox.mailbox import NOT_YET, Reader
 from rack.backplane.mailbox.slots import pid_of
 from rack.backplane.process import GONE, STOPPED, state_of
 from rack.backplane.segment import Segment
-from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
+from rack.backplane.watch.message_watch import LONG_AGO, MessageWatch
 from rack.backplane.words import Block, Box, is_on
 
 MUTE_CYCLES = 3
 """Age in cycles of the writer from which silence is investigated; two are normal."""
 STALE_CYCLES = 4
-LONG_AGO = -(1 << 62)
 
 
 class ReadingTask:
@@ -53,8 +52,8 @@ class ReadingTask:
         self._last = tick
 
 
-class SilenceWatch:
-    """Judges the silence of one mailbox for one reader.
+class SilenceWatch(MessageWatch):
+    """Judges the messages and the silence of one mailbox for one reader.
 
     Ask `is_lost` once the newest message is `quiet` ticks old.
     """
@@ -62,6 +61,7 @@ class SilenceWatch:
     def __init__(
         self, segment: Segment, reader: Reader, episodes: Episodes, task: ReadingTask
     ) -> None:
+        super().__init__(segment, reader, episodes)
         spec = reader.spec
         is_periodic = segment.layout.task(spec.writer).role == "executor"
         if spec.max_age:
@@ -70,11 +70,7 @@ class SilenceWatch:
             self.quiet = MUTE_CYCLES * spec.every if is_periodic else NOT_YET
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
-        self._reader = reader
-        self._episodes = episodes
         self._task = task
-        self._slots = reader.slots
-        self._cycles = CycleRecord(segment, spec.writer)
         self._block = segment.block(spec.writer)
         self._reported: dict[Alarm, int] = {}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
@@ -13,8 +14,8 @@ from rack.backplane.mailbox.protocols import open_reader
 from rack.backplane.mailbox.queue import ALL, QueueReader
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import AlarmWriter, Episodes
-from rack.backplane.watch.message_watch import MessageWatch, QueueWatch, ReadFindings
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
+from rack.backplane.watch.message_watch import QueueWatch
 from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
 from rack.backplane.words import Block
 
@@ -38,20 +39,21 @@ def watched(
     if spec.protocol == "queue":
         return WatchedQueue(segment, QueueReader(segment, name), alarms, task, room)
     reader = open_reader(segment, name, asynchronous, task.inbox)
-    if spec.writer == CLOCK:
-        findings = ReadFindings(reader, Episodes(segment, name, alarms))
-        return SporadicReader(reader, findings, task)
-    return WatchedReader(segment, reader, alarms, task)
+    kind = SporadicReader if spec.writer == CLOCK else WatchedReader
+    return kind(segment, reader, alarms, task)
 
 
 class Watched(ABC):
     """Base of the readers that watch a mailbox for a task, and raise the task's alarms about it."""
 
-    def __init__(self, reader: Reader, messages: ReadFindings, task: ReadingTask) -> None:
+    def __init__(
+        self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
+    ) -> None:
         self.reader = reader
-        self._messages = messages
+        self._episodes = Episodes(segment, reader.spec.name, alarms)
         self._task = task
-        self._bad_reads = 0
+        self._statistics = reader.statistics
+        self._reported = copy(reader.statistics)
 
     @abstractmethod
     def read(self, tick: int) -> Reading[AnyMessage]:
@@ -62,29 +64,34 @@ class Watched(ABC):
     def is_writer_lost(self, tick: int) -> bool:
         """Say whether the writer is lost, without a read."""
 
+    @property
     def _has_trouble(self) -> bool:
-        """Say whether the last read failed, or found a bad message; count it for the task."""
-        bad_reads = self.reader.statistics.bad_reads
-        if bad_reads == self._bad_reads:
-            return False
-        self._bad_reads = bad_reads
+        """Whether the last read failed, or found a bad message."""
+        return self._statistics.bad_reads != self._reported.bad_reads
+
+    def _report(self, tick: int) -> None:
+        """Count the last read, a bad one, for the task; raise alarms for a damaged or forged
+        message."""
+        found = self._statistics
+        accesses = self.reader.accesses
         self._task.troubles += 1
-        return True
+        if found.corrupt != self._reported.corrupt:
+            self._episodes.find(Alarm.DAMAGED, accesses, tick)
+        if found.forged != self._reported.forged:
+            self._episodes.find(Alarm.MASQUERADE, accesses, tick, found.forger)
+        self._reported = copy(found)
 
 
 class WatchedReader(Watched):
     """Reads a mailbox that is written by ticks. A clean read costs a few comparisons more."""
 
-    _messages: MessageWatch
-
     def __init__(
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
     ) -> None:
-        episodes = Episodes(segment, reader.spec.name, alarms)
-        super().__init__(reader, MessageWatch(segment, reader, episodes), task)
-        self._silence = SilenceWatch(segment, reader, episodes, task)
-        self._late_from = self._messages.late_from
-        self._quiet = self._silence.quiet
+        super().__init__(segment, reader, alarms, task)
+        self._watch = SilenceWatch(segment, reader, self._episodes, task)
+        self._late_from = self._watch.late_from
+        self._quiet = self._watch.quiet
         self._writer = segment.block(reader.spec.writer)
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
@@ -92,31 +99,32 @@ class WatchedReader(Watched):
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
         reader = self.reader
-        messages = self._messages
+        watch = self._watch
         reading = reader.read(tick)
-        if self._has_trouble():
-            messages.judge(tick)
-        elif reader.found != messages.seen:
+        if self._has_trouble:
+            watch.judge(tick)
+            self._report(tick)
+        elif reader.found != watch.seen:
             found = reader.found
             newest = reader.newest
             # The usual case of `judge`: the next message, good and in time.
             if (
-                0 < found == messages.seen + 1
-                and messages.newest < newest > reader.visible - self._late_from
+                0 < found == watch.seen + 1
+                and watch.newest < newest > reader.visible - self._late_from
             ):
-                messages.seen = found
-                messages.newest = newest
+                watch.seen = found
+                watch.newest = newest
             else:
-                messages.judge(tick)
+                watch.judge(tick)
         if (
             tick - reader.newest >= self._quiet or self._writer[Block.LOST]
-        ) and self._silence.is_lost(tick):
+        ) and self._watch.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 
     def is_writer_lost(self, tick: int) -> bool:
         """Say whether the writer is lost, without a read."""
-        return self._silence.is_writer_lost(tick)
+        return self._watch.is_writer_lost(tick)
 
 
 class SporadicReader(Watched):
@@ -133,8 +141,8 @@ class SporadicReader(Watched):
         it."""
         before = self.reader.serial
         reading = self.reader.read(tick)
-        if self._has_trouble():
-            self._messages.report(tick)
+        if self._has_trouble:
+            self._report(tick)
         return self.reader.with_earlier(reading, before)
 
     def is_writer_lost(self, tick: int) -> bool:
@@ -150,7 +158,6 @@ class WatchedQueue(Watched):
     """
 
     reader: QueueReader
-    _messages: QueueWatch
 
     def __init__(
         self,
@@ -160,8 +167,8 @@ class WatchedQueue(Watched):
         task: ReadingTask,
         room: Callable[[], int],
     ) -> None:
-        episodes = Episodes(segment, reader.spec.name, alarms)
-        super().__init__(reader, QueueWatch(segment, reader, episodes), task)
+        super().__init__(segment, reader, alarms, task)
+        self._messages = QueueWatch(segment, reader, self._episodes)
         self._room = room
         self._writer = segment.block(reader.spec.writer)
 
@@ -169,8 +176,10 @@ class WatchedQueue(Watched):
         """Take the messages visible at `tick`; the reading says whether their writer is lost."""
         reader = self.reader
         reading = reader.take(tick, self._room(), self._task.now())
-        if self._has_trouble() or reader.taken != self._messages.seen:
+        if self._has_trouble or reader.taken != self._messages.seen:
             self._messages.judge(tick)
+        if self._has_trouble:
+            self._report(tick)
         return reading._replace(is_lost=True) if self.is_writer_lost(tick) else reading
 
     def is_writer_lost(self, tick: int) -> bool:

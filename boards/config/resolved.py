@@ -98,21 +98,18 @@ class Resolved:
     published: PublishedRack
     goals: Mapping[int, GoalConfig]  # where objects end, by their rows in the scene
 
-    def for_run(
-        self, repeats: str, entries: Mapping[str, Entries] | None, is_copied: bool
-    ) -> Resolved:
+    def for_run(self, repeats: str, entries: Mapping[str, Entries] | None) -> Resolved:
         """Return the rack for one run.
 
         `repeats`: the name that its levels see, which may stand in their messages; empty: its own.
         `entries`: of a replay, which has no host boards and other racks, but what each adapter
-        wrote in the recorded run. `is_copied`: it takes snapshots.
+        wrote in the recorded run.
         """
         tasks = tuple(
             replace(
                 task,
                 context=replace(task.context, rack=repeats or self.config.name),
                 entries=None if entries is None else entries.get(task.task),
-                is_copied=is_copied,
             )
             for task in self.tasks
         )

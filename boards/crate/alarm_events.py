@@ -12,7 +12,7 @@ import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named, as_whole, pick
-from rack.backplane.fault_table import FaultEntry, FaultTable
+from rack.backplane.fault_table import FaultTable
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
@@ -30,11 +30,23 @@ from rack.levels.messages import Error
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.tables import read_setting
 
-About = Literal["task", "mailbox", "joint", "geom", "name", "brakes", "nothing"]
+About = Literal[
+    "task", "mailbox", "joint", "geom", "name", "brakes", "fault", "command", "demand", "nothing"
+]
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
 """Why brakes engaged, where no error says it: by the subject of their alarm, from 0 down."""
 EMERGENCY_STOP = "emergency stop"
 ANOTHER_RACK = "another rack"
+DEMANDS: Mapping[Demand, str] = {
+    Demand.NONE: "arm released: no stop is requested",
+    Demand.STOP: "the arm must ramp to rest, then brake: {why}",
+    Demand.BRAKE: "the arm must brake at once: {why}",
+}
+DEMANDED_BY: Mapping[str, str] = {
+    EMERGENCY_STOP: "the emergency stop is latched",
+    ANOTHER_RACK: "a rack that it works with is lost",
+}
+"""Why the arm must stop or brake, unless a board is lost."""
 
 KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
@@ -50,6 +62,8 @@ KIND_OF: Mapping[Alarm, EventKind] = {
     Alarm.LATCHED: "reaction",
     Alarm.QUEUE_FULL: "held",
     Alarm.INBOX_FULL: "held",
+    Alarm.COMMANDED: "command",
+    Alarm.OPERATOR_GONE: "command",
     Alarm.REMOTE_STOP: "command",
     **dict.fromkeys(MISSES, "miss"),
 }
@@ -105,9 +119,18 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
         Alarm.LATCHED: "fault of {subject} latched at {value:.4g}: brakes stay engaged",
     },
     "brakes": {
-        Alarm.BRAKES_CLOSED: "brakes engaged: {subject}",
+        Alarm.BRAKES_CLOSED: "brakes engaged: {subject}{lasted}",
         Alarm.BRAKES_OPENED: "brakes released after {span}",
     },
+    "fault": {
+        Alarm.FAULT_BEGINS: "{what} begins{lasts}",
+        Alarm.FAULT_ENDS: "{what} ends; acted {times}",
+    },
+    "command": {
+        Alarm.COMMANDED: "{what}{before} (command {value:.0f})",
+        Alarm.OPERATOR_GONE: "{what}: its operator is gone: hold (command {value:.0f})",
+    },
+    "demand": {Alarm.DEMAND: "{what}"},
     "geom": {Alarm.COLLISION: "unintended contact: '{subject}' touches '{writer}'"},
     "name": {
         Alarm.MODIFICATION: "control modification '{subject}' failed and was taken out",
@@ -186,95 +209,98 @@ class AlarmEvents:
         affected.
         """
         alarm = as_named(Alarm, row["code"])
-        number = int(row["subject"])
-        value = float(row["value"])
-        kind = KIND_OF.get(alarm, "detection")
-        code = alarm.name.lower()
-        board = owner
-        fault = -1
-        since = row["since"]
-        # Brakes that engaged while no board drove the arm are known when one does again.
-        tick = int(since if alarm == Alarm.BRAKES_CLOSED else row["tick"])
-        if kind == "fault":
-            entry = pick(self._faults.entries, number, "fault")
-            fault = number
-            subject = subject_of(entry, self._layout, self._joints)
-            board = board_of(entry, self._layout)
-            code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
-            what = describe_fault(entry, self._layout, self._joints, with_board=False)
-            text = f"{what} {code}{self._duration(entry, code)}"
-        elif alarm == Alarm.COMMANDED:
-            request = pick(self._operator.entries, number, "command")
-            subject = board = level_of(request, self._layout)
-            message = message_of(request, self._layout)
-            kind = "command"
-            since = -1
-            code = as_named(Operation, message.what).name.lower()
-            before = self._before(board, message) if message.what == Operation.SET else ""
-            text = f"{describe(message)}{before} (command {value:.0f})"
-        elif alarm == Alarm.OPERATOR_GONE:
-            request = pick(self._operator.entries, number, "command")
-            subject = board = level_of(request, self._layout)
-            kind = "command"
-            what = describe(message_of(request, self._layout))
-            text = f"{what}: its operator is gone: hold (command {value:.0f})"
-        elif alarm == Alarm.DEMAND:
-            demand = as_named(Demand, value)
-            subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
-            kind = "reaction" if demand else "recovery"
-            text = _demand(demand, subject)
-        else:
-            subject, text = self._described(alarm, row, owner)
-            text += f" for {self._span(value)}" if alarm == Alarm.BRAKES_CLOSED and value else ""
-            if tick < row["tick"]:
-                text += f", known at tick {row['tick']}"
-            board = subject if alarm == Alarm.REJOINED else owner
-        realtime_ns = int(row["time_ns"]) + time.time_ns() - time.monotonic_ns()
-        return Event(
-            realtime_ns,
-            tick,
-            kind,
-            board,
-            text,
-            code,
-            fault,
-            subject,
-            value,
-            int(since),
-        )
-
-    def _described(self, alarm: Alarm, row: np.void, owner: str) -> tuple[str, str]:
-        """Return the name of the subject of an alarm from `owner`, and its text."""
         about, text = next((kind, texts[alarm]) for kind, texts in TEXTS.items() if alarm in texts)
         number = int(row["subject"])
         value = float(row["value"])
-        layout = self._layout
-        subject = writer = ""
-        if about == "task":
-            subject = self._task(number, CLOCK)
-        elif about == "joint":
-            subject = joint_name(number, self._joints)
-        elif about == "name":
-            names = self._levels[owner].names if owner in self._levels else ()
-            subject = pick(names, number, "name")
-        elif about == "brakes":
-            subject = (
-                as_named(Error, number).name.lower()
-                if number > 0
-                else pick(ENGAGED_BY, -number, "reason to brake")
-            )
-        elif about == "geom":
-            subject = self._geom(number)
-            writer = self._geom(as_whole(value))
-        elif about == "mailbox":
-            box = pick(layout.mailboxes, number, "mailbox")
-            subject = box.name
-            writer = box.writer
-        counted = {f"{noun}s": counting(value, noun) for noun in ("release", "message", "tick")}
-        named = {"subject": subject, "writer": writer, "since": int(row["since"]), **counted}
-        return subject, text.format(
-            **named, value=value, span=self._span(value), late_ms=value * 1e-6
+        since = int(row["since"])
+        kind = KIND_OF.get(alarm, "detection")
+        code = alarm.name.lower()
+        fault = -1
+        words: dict[str, object] = {}
+        if about == "fault":
+            fault = number
+            entry = pick(self._faults.entries, number, "fault")
+            subject = subject_of(entry, self._layout, self._joints)
+            board = board_of(entry, self._layout)
+            code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
+            words["what"] = describe_fault(entry, self._layout, self._joints, with_board=False)
+            words["lasts"] = f", for {self._span(entry.ticks)}" if entry.ticks else ""
+            words["times"] = counting(entry.count, "time")
+        elif about == "command":
+            request = pick(self._operator.entries, number, "command")
+            subject = board = level_of(request, self._layout)
+            message = message_of(request, self._layout)
+            words["what"] = describe(message)
+            if alarm == Alarm.COMMANDED:
+                since = -1
+                code = as_named(Operation, message.what).name.lower()
+                is_set = message.what == Operation.SET
+                words["before"] = self._before(board, message) if is_set else ""
+        elif about == "demand":
+            demand = as_named(Demand, value)
+            subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
+            board = owner
+            kind = "reaction" if demand else "recovery"
+            why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
+            words["what"] = DEMANDS[demand].format(why=why)
+        else:
+            subject = self._subject(about, number, owner)
+            board = subject if alarm == Alarm.REJOINED else owner
+            if about == "mailbox":
+                words["writer"] = self._layout.mailboxes[number].writer
+            elif about == "geom":
+                words["writer"] = self._geom(as_whole(value))
+        span = self._span(value)
+        text = text.format(
+            **words,
+            subject=subject,
+            value=value,
+            since=since,
+            span=span,
+            lasted=f" for {span}" if value else "",
+            late_ms=value * 1e-6,
+            releases=counting(value, "release"),
+            messages=counting(value, "message"),
+            ticks=counting(value, "tick"),
         )
+        tick = found_at = int(row["tick"])
+        if alarm == Alarm.BRAKES_CLOSED and since < found_at:
+            # Brakes that engaged while no board drove the arm are known when one does again.
+            tick = since
+            text += f", known at tick {found_at}"
+        return Event(
+            time_ns=int(row["time_ns"]) + time.time_ns() - time.monotonic_ns(),
+            tick=tick,
+            kind=kind,
+            board=board,
+            text=text,
+            code=code,
+            fault=fault,
+            subject=subject,
+            value=value,
+            since=since,
+        )
+
+    def _subject(self, about: About, number: int, owner: str) -> str:
+        """Return the name of what an alarm of a task is about. Raises `DamageError`."""
+        match about:
+            case "task":
+                return self._task(number, CLOCK)
+            case "mailbox":
+                return pick(self._layout.mailboxes, number, "mailbox").name
+            case "joint":
+                return joint_name(number, self._joints)
+            case "geom":
+                return self._geom(number)
+            case "name":
+                names = self._levels[owner].names if owner in self._levels else ()
+                return pick(names, number, "name")
+            case "brakes" if number > 0:
+                return as_named(Error, number).name.lower()
+            case "brakes":
+                return pick(ENGAGED_BY, -number, "reason to brake")
+            case _:
+                return ""
 
     def _before(self, board: str, command: OperatorCommand) -> str:
         """Return what a parameter was before a command that sets it."""
@@ -287,28 +313,8 @@ class AlarmEvents:
         self._live[board, key] = value
         return f", before {before}"
 
-    def _duration(self, entry: FaultEntry, code: str) -> str:
-        """Return the duration of a fault that begins, or how often a fault that ends has acted."""
-        if code == "ends":
-            return f"; acted {counting(entry.count, 'time')}"
-        return f", for {self._span(entry.ticks)}" if entry.ticks else ""
-
     def _task(self, number: int, other: str) -> str:
         return pick(self._layout.processes, number, "task").name if number >= 0 else other
 
     def _span(self, ticks: float) -> str:
         return f"{counting(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"
-
-
-def _demand(demand: Demand, subject: str) -> str:
-    if demand == Demand.NONE:
-        return "arm released: no stop is requested"
-    named = {
-        EMERGENCY_STOP: "the emergency stop is latched",
-        ANOTHER_RACK: "a rack that it works with is lost",
-    }
-    why = named.get(subject, f"'{subject}' is lost")
-    return (
-        f"the arm must {'ramp to rest, then brake' if demand == Demand.STOP else 'brake at once'}:"
-        f" {why}"
-    )

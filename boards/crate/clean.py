@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
-from contextlib import suppress
+from contextlib import closing, suppress
 
 from rack.backplane.address_map import HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
@@ -21,9 +21,12 @@ def remove_dead(rack: str) -> bool:
     """
     if rack not in racks():
         return False
-    if _is_too_small(rack):
-        unlink(rack)
-        return True
+    with suppress(FileNotFoundError):
+        # A file without room for a head is in no process's use: launches link whole segments to
+        # their names.
+        if stranger(rack) is None and shm_path(rack).stat().st_size < HEAD_SIZE:
+            unlink(rack)
+            return True
     try:
         segment = Segment.open(rack)
     except SegmentError:
@@ -31,38 +34,19 @@ def remove_dead(rack: str) -> bool:
             raise
         # Another program has just removed it.
         return False
-    try:
-        return _remove(segment)
-    finally:
-        segment.close()
-
-
-def _is_too_small(rack: str) -> bool:
-    """Whether a file has no room for a head, so that no process can be using it: launches link
-    whole segments to their names."""
-    try:
-        return stranger(rack) is None and shm_path(rack).stat().st_size < HEAD_SIZE
-    except FileNotFoundError:
-        return False
-
-
-def _remove(segment: Segment) -> bool:
-    rack = segment.rack
-    if segment.launcher_is_alive:
-        raise RackInUseError(
-            f"rack '{rack}' is already running, launched by {segment.launcher_text}; stop it, or"
-            " choose another name"
-        )
-    removal = ByteLock(segment.fd, 8 * Head.MAGIC)
-    try:
+    with closing(segment):
+        if segment.launcher_is_alive:
+            raise RackInUseError(
+                f"rack '{rack}' is already running, launched by {segment.launcher_text}; stop it,"
+                " or choose another name"
+            )
         # If two programs find the same dead rack, only one removes it. Otherwise the slower one
         # would remove the rack that the faster one has meanwhile launched under the same name.
-        if not removal.take() or not segment.has_its_name:
-            return False
-        unlink(rack)
-        return True
-    finally:
-        removal.close()
+        with closing(ByteLock(segment.fd, 8 * Head.MAGIC)) as removal:
+            if not removal.take() or not segment.has_its_name:
+                return False
+            unlink(rack)
+            return True
 
 
 def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:

@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import gc
 import os
-import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from importlib import import_module
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
+from socket import socket
 
-from rack.backplane.address_map import CLOCK
 from rack.backplane.copies import fill_memory
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import note_used_files
@@ -50,20 +49,22 @@ from rack.boards.crate.requests import (
     Show,
     Shown,
 )
-from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy, can_go_on
+from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
 from rack.boards.errors import LONGEST_REASON, one_line
-from rack.boards.faults.tasks import hog
+from rack.boards.faults.tasks import act_on_core
 from rack.boards.run.board import enter, run_clock_board, run_task_board
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
 
+Source = Connection | socket | int
+"""What the crate waits for."""
 HOST_BOARD = "rack.boards.host.board"
 """What runs a host board's program, by name: a rack without host boards does not load it."""
 HOST_PROCESSES = 4
 """Processes beside those of the layout: Rack, crate, clock, recorder."""
-REST_MS = 10
+REST_S = 0.01
 """Time between two reads of what host boards print: one that prints without end waits, and delays
 no other."""
 ORPHANS_S = 1.0
@@ -78,7 +79,7 @@ class Crate:
     def __init__(self, line: Connection, attention: int) -> None:
         self._line = line
         self._attention = attention
-        self._segment: Segment  # from the Rack's request to open it on
+        self._opened: Segment | None = None  # that of the Rack, from its request on
         self._boards: dict[int, tuple[str, int]] = {}  # pidfd -> name, pid
         self._shelf = SnapshotShelf()
         self._wirings: dict[str, TaskWiring | ClockWiring] = {}
@@ -86,83 +87,91 @@ class Crate:
         self._preloaded: set[str] = set()
         self._outputs: dict[str, HostOutput] = {}
         self._resting: list[HostOutput] = []
-        self._poll = select.poll()
-        self._poll.register(line, select.POLLIN)
-        self._poll.register(self._shelf.line, select.POLLIN)
         # The line alone does not show that the launcher is gone: a process that it forked may hold
         # its end open.
         self._launcher = os.pidfd_open(os.getppid())
-        self._poll.register(self._launcher, select.POLLIN)
+
+    @property
+    def _segment(self) -> Segment:
+        assert self._opened is not None, "a rack is open"
+        return self._opened
 
     def run(self) -> None:
         """Serve the Rack until it is gone, then make sure that no board is left."""
         while True:
-            ready = self._poll.poll(REST_MS if self._resting else None)
-            while not ready and self._resting:
-                self._poll.register(self._resting.pop().reader, select.POLLIN)
-            printing = {output.reader: output for output in self._outputs.values()}
-            for fd, _ in ready:
-                if fd in self._boards:
-                    self._reap(fd)
-                elif fd == self._shelf.line.fileno():
-                    self._take_note()
-                elif fd in printing:
-                    printing[fd].pass_on()
-                    self._poll.unregister(fd)
-                    self._resting.append(printing[fd])
-                elif fd == self._launcher or (request := received(self._line)) is None:
+            printing = [output for output in self._outputs.values() if output not in self._resting]
+            readers = [output.reader for output in printing]
+            ready = self._reap_ended(
+                REST_S if self._resting else None, self._line, self._launcher, *readers
+            )
+            if not ready:
+                self._resting.clear()
+            for output in printing:
+                if output.reader in ready:
+                    output.pass_on()
+                    self._resting.append(output)
+            is_gone = self._launcher in ready
+            if is_gone or self._line in ready:
+                request = None if is_gone else received(self._line)
+                if request is None:
                     self._leave()
                     had_any = len(self._shelf) > 0
                     self._shelf.clear()
                     self._reap_copies(are_all=had_any)
                     return
-                elif isinstance(request, Leave):
-                    self._leave_for_another()
-                    break
-                else:
-                    self._serve(request)
+                self._serve(request)
 
     def _serve(self, request: object) -> None:
         match request:
             case Preload() as wanted:
                 self._preload(wanted)
-            case Open(rack, priority, before):
-                self._segment = Segment.attach(rack)
-                note_used_files()
-                set_priority(priority)
-                self._line.send(Opened(-1 if before is None else self._fill_segment(before)))
+            case Open() as wanted_rack:
+                self._open(wanted_rack)
             case PowerOn(name, TaskWiring() | ClockWiring() as wiring):
                 self._power_on(name, wiring)
             case PowerOn(name, HostWiring() as host):
-                output = self._output(name).writer
-                self._fork(name, lambda segment: self._run_host_board(segment, host, output))
+                # All processes of a host board print into one pipe.
+                if name not in self._outputs:
+                    self._outputs[name] = HostOutput(name)
+                lines = self._attention, self._outputs[name].writer
+                # Its process alone imports what that takes.
+                self._fork(
+                    name,
+                    lambda segment: import_module(HOST_BOARD).run_host_board(segment, host, *lines),
+                )
             case PowerOn(name, HogWiring(entry)):
-                self._fork(name, lambda segment: hog(segment, entry))
+                self._fork(name, lambda segment: act_on_core(segment, entry))
             case PowerOff(name):
                 self._kill(name)
+            case Leave():
+                self._leave()
+                # A Rack that is gone is noticed next.
+                with suppress(OSError):
+                    self._line.send(Left())
             case Show(tick, name):
                 snapshot = self._shelf.nearest(tick)
-                text = "" if snapshot is None or not name else self._shelf.show(snapshot, name)
+                text = "" if snapshot is None or not name else snapshot.copies[name].show()
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
-    def _fill_segment(self, before: int) -> int:
-        """Fill the segment from the last snapshot at that tick or before; return its tick, -1
-        without one."""
-        snapshot = self._shelf.nearest(before)
-        if snapshot is None:
-            return -1
-        fill_memory(self._segment, snapshot.memory, snapshot.tick)
-        self._to_go_on = {**snapshot.copies}
-        self._state_snapshots()
-        return snapshot.tick
+    def _open(self, wanted: Open) -> None:
+        """Attach to a segment; fill it if its rack goes on from a snapshot."""
+        self._opened = segment = Segment.attach(wanted.rack)
+        note_used_files()
+        set_priority(wanted.priority)
+        snapshot = None if wanted.before is None else self._shelf.nearest(wanted.before)
+        if snapshot is not None:
+            fill_memory(segment, snapshot.memory, snapshot.tick)
+            self._to_go_on = {**snapshot.copies}
+            self._state_snapshots()
+        self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
         """Fork a task or the clock, or let its copy go on."""
         self._wirings[name] = wiring
         copy = self._to_go_on.pop(name, None)
-        if copy is not None and can_go_on(copy, wiring):
+        if copy is not None and copy.can_be(wiring):
             try:
-                self._watch(name, self._shelf.go_on(copy, wiring, self._segment.fd))
+                self._watch(name, copy.go_on(wiring, self._segment.rack))
             except OSError:
                 self._fail_to_fork(name, "its copy in the snapshot is gone")
             return
@@ -177,8 +186,7 @@ class Crate:
 
     def _take_note(self) -> None:
         """Take the note of a board about its copy."""
-        names = {task.name for task in self._segment.layout.tasks} | {CLOCK}
-        self._shelf.take_note({name: self._wirings[name] for name in names & {*self._wirings}})
+        self._shelf.take_note(self._wirings)
         self._state_snapshots()
 
     def _state_snapshots(self) -> None:
@@ -193,8 +201,20 @@ class Crate:
         sys.path[:] = wanted.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
         for reference in wanted.classes:
-            if reference not in self._preloaded and not self._is_preloaded(reference):
-                return
+            if reference in self._preloaded:
+                continue
+            self._line.send(Preloading(reference))
+            with suppress(LookupError):
+                # The launcher tries it, and outlives the crate.
+                kind = find_class(reference, object, is_tried=False)
+                try:
+                    if issubclass(kind, Executor | Planner):
+                        kind.preload()
+                except Exception as error:
+                    reason = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
+                    self._line.send(PreloadFailed(reference, reason))
+                    return
+                self._preloaded.add(reference)
         if wanted.cell is not None:
             # Compile the cell, once for all boards. A cell with mistakes is the Rack's to
             # report.
@@ -205,35 +225,6 @@ class Crate:
         compiled.on_compile = None
         gc.freeze()
         gc.enable()
-
-    def _is_preloaded(self, reference: str) -> bool:
-        """Import a class and preload it; return False if it failed to preload."""
-        self._line.send(Preloading(reference))
-        with suppress(LookupError):
-            # The launcher tries it, and outlives the crate.
-            kind = find_class(reference, object, is_tried=False)
-            try:
-                if issubclass(kind, Executor | Planner):
-                    kind.preload()
-            except Exception as error:
-                reason = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
-                self._line.send(PreloadFailed(reference, reason))
-                return False
-            self._preloaded.add(reference)
-        return True
-
-    def _run_host_board(self, segment: Segment, wiring: HostWiring, output: int) -> int:
-        """Run a host board in its process, which alone imports what that takes."""
-        board = import_module(HOST_BOARD)
-        status: int = board.run_host_board(segment, wiring, self._attention, output)
-        return status
-
-    def _output(self, name: str) -> HostOutput:
-        """Return what a host board prints into, in all its processes."""
-        if name not in self._outputs:
-            self._outputs[name] = output = HostOutput(name)
-            self._poll.register(output.reader, select.POLLIN)
-        return self._outputs[name]
 
     def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
         crate = os.getpid()
@@ -263,23 +254,9 @@ class Crate:
         """Watch a process that has become a board."""
         pidfd = os.pidfd_open(pid)
         self._boards[pidfd] = name, pid
-        self._poll.register(pidfd, select.POLLIN)
         # The Rack may have closed the line meanwhile: the crate must live to end its boards.
         with suppress(OSError):
             self._line.send(Forked(name, pid))
-
-    def _reap(self, pidfd: int) -> None:
-        seen_ns = time.monotonic_ns()
-        name, pid = self._boards.pop(pidfd)
-        tick = self._mark_lost(name)
-        self._poll.unregister(pidfd)
-        os.close(pidfd)
-        _, status = os.waitpid(pid, 0)
-        if self._is_host(name):
-            self._end_orphans()
-            self._outputs[name].pass_on(is_over=True)
-        with suppress(OSError):
-            self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
 
     def _end_orphans(self) -> None:
         """End whatever a host board has started, in any session: with its end it has become a child
@@ -328,27 +305,31 @@ class Crate:
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
     def _leave(self) -> None:
-        """End after the Rack: boards notice that it is gone and end; those that take too long are
-        killed."""
-        self._poll.unregister(self._line)
-        self._poll.unregister(self._launcher)
-        for output in self._outputs.values():
-            if output not in self._resting:
-                self._poll.unregister(output.reader)
+        """Leave a rack whose Rack is gone, or wants that: boards notice it and end; those that take
+        too long are killed."""
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
                 # It may block for ever: only a signal gets it out of that.
                 signal.pidfd_send_signal(pidfd, signal.SIGTERM)
         while self._boards and (left := deadline - time.monotonic()) > 0:
-            self._reap_ended(int(left * 1000) + 1)
+            self._reap_ended(left)
         self._kill()
         while self._boards:
             self._reap_ended(None)
         # What boards wrote of their copies before they ended.
-        while hasattr(self, "_segment") and readable(self._shelf.line.fileno(), 0):
+        while readable(self._shelf.line.fileno(), 0):
             self._take_note()
         self._reap_copies()
+        for output in self._outputs.values():
+            output.close()
+        self._outputs.clear()
+        self._resting.clear()
+        self._to_go_on.clear()
+        self._wirings.clear()
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
 
     def _reap_copies(self, are_all: bool = False) -> None:
         """Reap the copies that have ended since; wait for their end if `are_all` to end."""
@@ -356,29 +337,24 @@ class Crate:
             while os.waitpid(-1, 0 if are_all else os.WNOHANG)[0]:
                 continue
 
-    def _leave_for_another(self) -> None:
-        """Leave this rack, and wait for the requests of another one."""
-        self._leave()
-        for output in self._outputs.values():
-            output.close()
-        self._outputs.clear()
-        self._resting.clear()
-        self._to_go_on.clear()
-        if hasattr(self, "_segment"):
-            self._segment.close()
-            del self._segment
-        self._poll.register(self._line, select.POLLIN)
-        self._poll.register(self._launcher, select.POLLIN)
-        # A Rack that is gone is noticed next.
-        with suppress(OSError):
-            self._line.send(Left())
-
-    def _reap_ended(self, timeout_ms: int | None) -> None:
-        for fd, _ in self._poll.poll(timeout_ms):
-            if fd in self._boards:
-                self._reap(fd)
-            else:
-                self._take_note()
+    def _reap_ended(self, timeout_s: float | None, *others: Source) -> Collection[object]:
+        """Reap boards that end, and take notes of others, until something happens; return what was
+        ready of these and of `others`."""
+        ready = wait([self._shelf.line, *self._boards, *others], timeout_s)
+        for pidfd in [pidfd for pidfd in self._boards if pidfd in ready]:
+            seen_ns = time.monotonic_ns()
+            name, pid = self._boards.pop(pidfd)
+            tick = self._mark_lost(name)
+            os.close(pidfd)
+            _, status = os.waitpid(pid, 0)
+            if self._is_host(name):
+                self._end_orphans()
+                self._outputs[name].pass_on(is_over=True)
+            with suppress(OSError):
+                self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
+        if self._shelf.line in ready:
+            self._take_note()
+        return ready
 
 
 def main() -> None:

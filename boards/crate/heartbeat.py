@@ -44,29 +44,30 @@ class Heartbeat:
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
+        progress = {}
         for name, block in self._blocks.items():
+            done = block[Block.DONE]
             # An idle task, whose newest release is done, is alive; a lost one is already known. One
             # may wait for as long as another rack wants.
-            idle = (
-                block[Block.DONE] == block[Block.RELEASED]
-                or block[Block.LOST]
-                or block[Block.AWAITS]
-            )
-            if block[Block.DONE] != self._seen[name][0] or idle:
-                self._seen[name] = block[Block.DONE], now
-                self._reported.discard(name)
-        awaits = any(block[Block.AWAITS] for block in self._blocks.values())
+            is_idle = done == block[Block.RELEASED] or block[Block.LOST] or block[Block.AWAITS]
+            progress[name] = done, is_idle
+        blocks = self._blocks.values()
+        awaits = any(block[Block.AWAITS] for block in blocks)
         # In lockstep several cycles may be one tick of the clock: it runs while they do.
-        ticks = self._words[System.TICK] + sum(b[Block.DONE] for b in self._blocks.values())
-        if ticks != self._seen[CLOCK][0] or self._words[System.HELD] or awaits:
-            self._seen[CLOCK] = ticks, now
-            self._reported.discard(CLOCK)
-        late = [
-            n
-            for n, (_, at) in self._seen.items()
-            if now - at > self._bounds[n] and n not in self._reported
-        ]
-        found = [name for name in late if name != CLOCK or self._clock_is_stuck()]
+        ticks = self._words[System.TICK] + sum(block[Block.DONE] for block in blocks)
+        progress[CLOCK] = ticks, self._words[System.HELD] or awaits
+        found = []
+        for name, (count, is_excused) in progress.items():
+            seen, since = self._seen[name]
+            if count != seen or is_excused:
+                self._seen[name] = count, now
+                self._reported.discard(name)
+            elif (
+                now - since > self._bounds[name]
+                and name not in self._reported
+                and (name != CLOCK or self._clock_is_stuck())
+            ):
+                found.append(name)
         self._reported.update(found)
         return found
 

@@ -72,9 +72,7 @@ def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
         first = max(first, reached)
         if first < end:
             reached = end
-            # Releases before a tick, rounded up.
-            before, within = (-(-max(0, tick - task.phase) // task.every) for tick in (first, end))
-            count += within - before
+            count += (task.grid.since(end) - task.grid.since(first)) // task.every
     return count
 
 

@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import gc
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -87,12 +86,19 @@ class OneProcess:
 
     def run_ticks(self, ticks: int) -> None:
         """Run for so many ticks."""
-        with _undisturbed():
+        # Collect no garbage meanwhile, as in a board.
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        try:
             for tick in range(self.tick, self.tick + ticks):
                 self.tick = tick + 1
                 for every, phase, cycle in self._cycles:
                     if tick % every == phase:
                         cycle(tick)
+        finally:
+            gc.enable()
+            gc.unfreeze()
 
     def newest(self, mailbox: str) -> AnyMessage:
         """Return a copy of the newest message that was visible in the last tick. Raises
@@ -220,16 +226,3 @@ class LoneTask:
     def _write(self, tick: int) -> None:
         for post in self._posts:
             post.write(tick, self.spec.every)
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Collect no garbage meanwhile, as in a board."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
-        gc.unfreeze()

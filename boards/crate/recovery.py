@@ -1,21 +1,21 @@
 """What follows when a process of a rack ends: it is recorded, and restarted or given up.
 
 The limit and the order of restarts, and the restarts themselves: of boards, on the clock's grid; of
-host boards, which are started with the run and in real time never waited for. The loss of a host
-board demands nothing of the arm. The clock admits its return, as it does that of other boards.
+host boards, which in real time are never waited for. The loss of a host board demands nothing of
+the arm. The clock admits its return, as it does that of other boards.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout
 from rack.backplane.process import STOPPED, how_ended, state_of
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
+from rack.boards.config.resolved import Resolved
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
@@ -23,16 +23,8 @@ from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.events import Journal
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 
-
-class Restart(NamedTuple):
-    """A restart that the policy permits: the `number`-th of at most `most` within `within_s`, s."""
-
-    number: int
-    most: int
-    within_s: float
-
-    def __str__(self) -> str:
-        return f"restart {self.number} of at most {self.most} in {self.within_s:g} s"
+UP = (TaskState.READY, TaskState.RUNNING)
+"""States of a board that has passed its self-test."""
 
 
 class Supervision:
@@ -43,7 +35,8 @@ class Supervision:
         self._config = config
         self._layout = layout
         self._restarts: dict[str, list[int]] = defaultdict(list)
-        self._needs: dict[str, set[str]] = {CLOCK: set()}
+        # Of the clock and of host boards nothing.
+        self._needs: dict[str, set[str]] = defaultdict(set)
         for task in layout.tasks:
             below = config.all_below(task.board)
             needed = {other.name for other in layout.tasks if other.board in below}
@@ -51,21 +44,27 @@ class Supervision:
                 {task.board} if task.role == "planner" else set()
             )
 
-    def admit(self, task: str, tick: int) -> Restart | None:
-        """Count one more restart of a task, lost at `tick`; return None if no more are
-        permitted."""
-        most, within_s = self._policy(task)
+    def admit(self, task: str, tick: int) -> str:
+        """Count one more restart of a task, lost at `tick`; return which one it is, as text, empty
+        if no more are permitted."""
+        common = self._config.supervision
+        most, within_s = common.restarts, common.within_s
+        if task != CLOCK:
+            board = self._config.table(self._layout.task(task))
+            most = most if board.restarts is None else board.restarts
+            own_s = board.restarts_within_s
+            within_s = within_s if own_s is None else own_s
         since = tick - within_s * 1e9 / self._layout.clock_ns
         recent = [at for at in self._restarts[task] if at > since]
         if len(recent) >= most:
-            return None
+            return ""
         self._restarts[task] = [*recent, tick]
-        return Restart(len(recent) + 1, most, within_s)
+        return f"restart {len(recent) + 1} of at most {most} in {within_s:g} s"
 
     def in_order(self, tasks: list[str]) -> list[str]:
         """Return the tasks in order of restart: the clock, then lower levels before higher,
         executor before planner."""
-        # What a task needs, needs less than it does.
+        # A task always needs more than any task that it needs, so sorting by count is enough.
         return sorted(tasks, key=lambda task: len(self._needs[task]))
 
     def must_wait(self, task: str, absent: list[str]) -> bool:
@@ -73,173 +72,79 @@ class Supervision:
         planner's executor."""
         return not self._needs[task].isdisjoint(absent)
 
-    def _policy(self, task: str) -> tuple[int, float]:
-        common = self._config.supervision
-        if task == CLOCK:
-            return common.restarts, common.within_s
-        spec = self._layout.task(task)
-        board = self._config.table(spec)
-        most = common.restarts if board.restarts is None else board.restarts
-        return most, common.within_s if board.restarts_within_s is None else board.restarts_within_s
-
 
 class Recovery:
-    """The lost boards of a run, from loss to return.
+    """The lost boards of a rack, from loss to return.
 
     A board is powered on again once everything on which it depends is present; it rejoins on the
     clock's grid.
+
+    Attributes:
+        wirings: The boards of the run, and its host boards that are not external, by name. Before
+            the run there are none, and no board is restarted.
+        faults: A line for each board that was given up.
+        given_up: Whether a board, or all of them with the crate, was given up.
+        is_beyond_help: Whether the run cannot go on.
     """
 
     def __init__(
-        self,
-        segment: Segment,
-        supervision: Supervision,
-        wirings: Mapping[str, TaskWiring | ClockWiring],
-        crate: CrateLine,
+        self, segment: Segment, supervision: Supervision, crate: CrateLine, journal: Journal
     ) -> None:
+        self.wirings: Mapping[str, TaskWiring | ClockWiring | HostWiring] = {}
+        self.faults: list[str] = []
+        self.given_up = False
+        self.is_beyond_help = False
         self._segment = segment
         self._supervision = supervision
-        self._wirings = wirings
         self._crate = crate
+        self._journal = journal
         self._waiting: list[str] = []
         self._starting: list[str] = []
-
-    def lose(self, board: str, tick: int, is_final: bool = False) -> Restart | None:
-        """Schedule the restart of a board whose process has ended; return None if it is given up,
-        as one `is_final`."""
-        self._starting = [name for name in self._starting if name != board]
-        restart = None if is_final else self._supervision.admit(board, tick)
-        if restart is not None:
-            self._waiting.append(board)
-        elif board != CLOCK:
-            # The clock reacts to this: it brakes the arm and ends the run.
-            self._segment.block(board)[Block.STATE] = TaskState.GIVEN_UP
-        return restart
-
-    def end_hanging(self, board: str) -> None:
-        """Kill a hanging board, which is then lost like any other; one that is being restarted is
-        left alone."""
-        if board not in (*self._waiting, *self._starting):
-            self._crate.ask(PowerOff(board))
-
-    def advance(self) -> list[str]:
-        """Power on the boards that are due; return them."""
-        self._starting = [name for name in self._starting if self._is_absent(name)]
-        absent = [*self._waiting, *self._starting]
-        in_order = self._supervision.in_order(self._waiting)
-        due = [board for board in in_order if not self._supervision.must_wait(board, absent)]
-        for board in due:
-            self._waiting.remove(board)
-            self._starting.append(board)
-            self._crate.ask(PowerOn(board, self._wirings[board]))
-        return due
-
-    def _is_absent(self, board: str) -> bool:
-        if board == CLOCK:
-            return False
-        return self._segment.block(board)[Block.STATE] not in (TaskState.READY, TaskState.RUNNING)
-
-
-class HostBoards:
-    """Starts and watches the host boards that are not external."""
-
-    def __init__(
-        self,
-        segment: Segment,
-        wirings: Sequence[HostWiring],
-        supervision: Supervision,
-        crate: CrateLine,
-        journal: Journal,
-    ) -> None:
-        self._segment = segment
-        self._supervision = supervision
-        self._crate = crate
-        self._journal = journal
-        self._wirings = {wiring.board: wiring for wiring in wirings if not wiring.is_external}
         self._stopped: set[str] = set()
 
-    def start(self) -> None:
-        """Start all of them."""
-        for name, wiring in self._wirings.items():
-            self._crate.ask(PowerOn(name, wiring))
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._wirings
-
-    def lose(self, end: Ended, why: str) -> bool:
-        """Record the end of a host board, and restart it unless its program is done; return False
-        if it is given up."""
-        block = self._segment.block(end.name)
-        self._stopped.discard(end.name)
-        if block[Block.STATE] == TaskState.ENDED:
-            self._journal.add(
-                "done", end.name, f"host board '{end.name}': its program is done", "done"
-            )
-            return True
-        text = f"host board '{end.name}' ended: {why}"
-        self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
-        restart = self._supervision.admit(end.name, end.tick)
-        if restart is None:
-            block[Block.STATE] = TaskState.GIVEN_UP
-            self._journal.add("reaction", end.name, f"gave up on '{end.name}'", "given_up")
-            return False
-        self._crate.ask(PowerOn(end.name, self._wirings[end.name]))
-        self._journal.add("reaction", end.name, str(restart), "restart")
-        return True
-
-    def look(self) -> None:
-        """End host boards that a signal has stopped: nothing else shows that one hangs."""
-        for name in self._wirings:
-            block = self._segment.block(name)
-            if name not in self._stopped and state_of(block[Block.PID]) in STOPPED:
-                self._stopped.add(name)
-                text = f"'{name}' is not responding: stopped by a signal"
-                self._journal.add("detection", "rack", text, "hang", subject=name)
-                self._crate.ask(PowerOff(name))
-
-
-class LostBoards:
-    """The boards that a rack has lost, and what became of them."""
-
-    def __init__(self, journal: Journal) -> None:
-        self.faults: list[str] = []  # a line for each that was given up
-        self.given_up = False  # a board, or all of them with the crate
-        self.is_beyond_help = False  # the run cannot go on
-        self._journal = journal
-        self._recovery: Recovery | None = None  # None: the run has not begun
-        self._hosts: HostBoards | None = None
-
-    def begin(self, recovery: Recovery, hosts: HostBoards) -> None:
-        """Restart boards from now on."""
-        self._recovery = recovery
-        self._hosts = hosts
+    def start(self, clock: ClockWiring, plan: Resolved) -> None:
+        """Power on the clock and the host boards; restart boards from now on."""
+        self.wirings = {
+            CLOCK: clock,
+            **{host.board: host for host in plan.hosts if not host.is_external},
+            **{task.task: task for task in plan.tasks},
+        }
+        for name, wiring in self.wirings.items():
+            if not isinstance(wiring, TaskWiring):
+                self._crate.ask(PowerOn(name, wiring))
 
     def lose(self, end: Ended, is_over: bool, record_printed: Callable[[], None]) -> None:
         """Record the end of a board, and restart it or give it up; `is_over`: so is the run.
 
         `record_printed` records what boards have printed.
         """
-        if self._hosts is not None and end.name in self._hosts:
-            if not self._hosts.lose(end, how_ended(end.status)):
-                self.faults.append(
-                    f"host board '{end.name}' ended: {how_ended(end.status)}; no restarts left"
-                )
+        name = end.name
+        is_host = isinstance(self.wirings.get(name), HostWiring)
+        self._starting = [other for other in self._starting if other != name]
+        self._stopped.discard(name)
+        if is_host and self._segment.block(name)[Block.STATE] == TaskState.ENDED:
+            self._journal.add("done", name, f"host board '{name}': its program is done", "done")
             return
-        text = f"board '{end.name}' ended: {how_ended(end.status)}"
-        self._journal.add("died", end.name, text, "died", end.seen_ns, end.tick)
-        if self._recovery is None or is_over:
-            self._give_up(end.name, text)
+        text = f"{'host ' * is_host}board '{name}' ended: {how_ended(end.status)}"
+        self._journal.add("died", name, text, "died", end.seen_ns, end.tick)
+        if not self.wirings or (is_over and not is_host):
+            self._give_up(name, text)
             return
-        is_final = end.status == CANNOT_GO_ON
-        if is_final:
+        if end.status == CANNOT_GO_ON and not is_host:
             record_printed()
-            text = self._reason(end.name) or text
-        restart = self._recovery.lose(end.name, end.tick, is_final)
-        if restart is None:
-            self.is_beyond_help = end.name == CLOCK
-            self._give_up(end.name, text if is_final else f"{text}; no restarts left")
+            text = self._reason(name) or text
+        elif restart := self._supervision.admit(name, end.tick):
+            self._waiting.append(name)
+            self._journal.add("reaction", name, restart, "restart")
+            return
         else:
-            self._journal.add("reaction", end.name, str(restart), "restart")
+            text = f"{text}; no restarts left"
+        if name == CLOCK:
+            self.is_beyond_help = True
+        else:
+            # The clock reacts to this: it brakes the arm and ends the run.
+            self._segment.block(name)[Block.STATE] = TaskState.GIVEN_UP
+        self._give_up(name, text, is_host)
 
     def lose_crate(self) -> None:
         """Record the end of the crate."""
@@ -248,12 +153,44 @@ class LostBoards:
         self._journal.add("died", "crate", text, "died")
         self._give_up("crate", text)
 
+    def report_hanging(self, board: str, why: str = "") -> None:
+        """Record that a board hangs."""
+        text = f"'{board}' is not responding{why}"
+        self._journal.add("detection", "rack", text, "hang", subject=board)
+
+    def end_hanging(self, board: str) -> None:
+        """Kill a hanging board, which is then lost like any other; one that is being restarted is
+        left alone."""
+        if board not in (*self._waiting, *self._starting):
+            self._crate.ask(PowerOff(board))
+
+    def advance(self) -> None:
+        """Power on the boards that are due, and end host boards that a signal has stopped: nothing
+        else shows that one hangs."""
+        self._starting = [
+            name
+            for name in self._starting
+            if name != CLOCK and self._segment.block(name)[Block.STATE] not in UP
+        ]
+        absent = [*self._waiting, *self._starting]
+        for board in self._supervision.in_order(self._waiting):
+            if not self._supervision.must_wait(board, absent):
+                self._waiting.remove(board)
+                self._starting.append(board)
+                self._crate.ask(PowerOn(board, self.wirings[board]))
+        hosts = {name for name, wiring in self.wirings.items() if isinstance(wiring, HostWiring)}
+        for name in hosts - self._stopped:
+            if state_of(self._segment.block(name)[Block.PID]) in STOPPED:
+                self._stopped.add(name)
+                self.report_hanging(name, ": stopped by a signal")
+                self._crate.ask(PowerOff(name))
+
     def _reason(self, board: str) -> str:
         """Return the reason that a board printed last; empty: none."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 
-    def _give_up(self, board: str, text: str) -> None:
+    def _give_up(self, board: str, text: str, is_host: bool = False) -> None:
         self.faults.append(text)
-        self.given_up = True
+        self.given_up |= not is_host
         self._journal.add("reaction", board, f"gave up on '{board}'", "given_up")

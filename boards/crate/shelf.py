@@ -3,25 +3,22 @@ the segment.
 
 They are bounded in number and in memory, and thinned out with age: of the older half, the one goes
 that leaves the smallest gap. A snapshot of which a copy is lost goes whole. All end with the crate:
-it holds the only other end of each copy's socket.
+it holds the only other end of each copy's line.
 """
 
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import signal
-from collections.abc import Iterable, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
-from socket import AF_UNIX, SOCK_SEQPACKET, socket, socketpair
-from tempfile import TemporaryFile
+from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 
-from rack.backplane.process import readable
-from rack.backplane.segment import SHM_FOLDER
-from rack.boards.run.copying import CopyNote, CopyRequest, receive, send
+from rack.boards.run.copying import GoOn, receive_note
 from rack.boards.wiring import ClockWiring, TaskWiring
 
 MOST_SNAPSHOTS = 32
@@ -37,21 +34,51 @@ class WaitingCopy:
     """A copy of one process. `pid`: 0 while its successor is not known."""
 
     wiring: Wiring
-    control: socket
+    line: Connection
     pid: int
+
+    def can_be(self, wiring: Wiring) -> bool:
+        """Say whether it can be the board of a wiring: it is that of its own, but for the settings
+        of its level."""
+        before = self.wiring
+        if isinstance(before, TaskWiring) and isinstance(wiring, TaskWiring):
+            return replace(before, context=wiring.context) == wiring
+        return before == wiring
+
+    def go_on(self, wiring: Wiring, rack: str) -> int:
+        """Let it go on in the segment of a rack, as a child of this process, with the context in
+        `wiring`; return its process. Its successor's note follows. Raises `OSError` if it is
+        gone."""
+        context = None
+        if isinstance(wiring, TaskWiring) and wiring != self.wiring:
+            context = wiring.context
+        self.line.send(GoOn(os.getpid(), rack, context))
+        pid = self.pid
+        self.pid = 0
+        return pid
+
+    def show(self) -> str:
+        """Return the attributes of its level, as JSON; empty if it is gone."""
+        with suppress(EOFError, OSError):
+            self.line.send(None)
+            if self.line.poll(SHOW_S):
+                return self.line.recv_bytes().decode()
+        return ""
 
 
 @dataclass
 class HeldSnapshot:
     """The copies of all processes of a rack before `tick`, by name, and its memory, a file.
 
-    `private_bytes`: the memory that it has for itself, when it was last measured.
+    `private_bytes`: the memory that it has for itself, when it was last measured. `is_whole`: it
+    has all of them.
     """
 
     tick: int
     copies: dict[str, WaitingCopy] = field(default_factory=dict)
     memory: int = -1
     private_bytes: int = 0
+    is_whole: bool = False
 
     def measure(self) -> None:
         """Measure the memory that it has for itself."""
@@ -65,18 +92,9 @@ class HeldSnapshot:
     def close(self) -> None:
         """Let go of it in this process."""
         for copy in self.copies.values():
-            copy.control.close()
+            copy.line.close()
         if self.memory >= 0:
             os.close(self.memory)
-            self.memory = -1
-
-    def end(self) -> None:
-        """End its processes."""
-        for copy in self.copies.values():
-            if copy.pid:
-                with suppress(ProcessLookupError):
-                    os.kill(copy.pid, signal.SIGKILL)
-        self.close()
 
 
 class SnapshotShelf:
@@ -84,62 +102,66 @@ class SnapshotShelf:
 
     def __init__(self) -> None:
         self.line, self.boards_line = socketpair(AF_UNIX, SOCK_SEQPACKET)
-        self._held: list[HeldSnapshot] = []
-        self._taking: HeldSnapshot | None = None
+        # In the order in which they were taken: the last one may not be whole yet.
+        self._snapshots: list[HeldSnapshot] = []
         sizes = re.findall(r"MemTotal: +(\d+)", Path("/proc/meminfo").read_text())
         self._most_bytes = sum(int(kib) << 10 for kib in sizes) // MEMORY_PART
 
+    @property
+    def _held(self) -> list[HeldSnapshot]:
+        return [snapshot for snapshot in self._snapshots if snapshot.is_whole]
+
     def take_note(self, wirings: Mapping[str, Wiring]) -> None:
         """Take the next note of a board. `wirings`: those of all processes of a snapshot."""
-        found = receive(self.line)
-        if found is None:
-            return
-        note, files = CopyNote(**found[0]), found[1]
+        note, files = receive_note(self.line)
         if not files:
             for snapshot in self._held:
                 if snapshot.tick == note.tick:
                     snapshot.copies[note.name].pid = note.pid
             return
-        if self._taking is None or self._taking.tick != note.tick:
-            self._drop_unfinished()
-            self._taking = HeldSnapshot(note.tick)
-        control, *memory = files
-        self._taking.copies[note.name] = WaitingCopy(
-            wirings[note.name], socket(fileno=control), note.pid
-        )
+        unfinished = next((one for one in self._snapshots if not one.is_whole), None)
+        if unfinished is not None and unfinished.tick != note.tick:
+            self.drop(unfinished)
+            unfinished = None
+        if unfinished is None:
+            unfinished = HeldSnapshot(note.tick)
+            self._snapshots.append(unfinished)
+        line, *memory = files
+        unfinished.copies[note.name] = WaitingCopy(wirings[note.name], Connection(line), note.pid)
         for fd in memory:
-            self._taking.memory = fd
-        if self._taking.memory >= 0 and self._taking.copies.keys() == wirings.keys():
-            self._hold(self._taking)
-            self._taking = None
+            unfinished.memory = fd
+        if unfinished.memory >= 0 and unfinished.copies.keys() == wirings.keys():
+            self._snapshots.remove(unfinished)
+            self._hold(unfinished)
 
     def _hold(self, snapshot: HeldSnapshot) -> None:
         for before in self._held:
             if before.tick == snapshot.tick:
                 self.drop(before)
-                break
         for before in self._held[-1:]:
             # It has got the memory that changes while a rack goes on.
             before.measure()
-        self._held.append(snapshot)
+        self._snapshots.append(snapshot)
+        snapshot.is_whole = True
         snapshot.private_bytes = os.fstat(snapshot.memory).st_size
-        while len(self._held) > MOST_SNAPSHOTS or (
-            len(self._held) > 2 and self.private_bytes > self._most_bytes
+        while len(self) > MOST_SNAPSHOTS or (
+            len(self) > 2 and self.private_bytes > self._most_bytes
         ):
             self.drop(self._most_dispensable())
 
     def _most_dispensable(self) -> HeldSnapshot:
         """Return the snapshot of the older half, in the order in which they were taken, that leaves
         the smallest gap between its neighbours; never the newest, or the one of the first tick."""
-        ticks = sorted(snapshot.tick for snapshot in self._held)
-        older = self._held[: max(2, len(self._held) // 2)]
-        candidates = [one for one in older if one.tick != ticks[0] and one is not self._held[-1]]
+        held = self._held
+        ticks = sorted(snapshot.tick for snapshot in held)
+        older = held[: max(2, len(held) // 2)]
+        candidates = [one for one in older if one.tick != ticks[0] and one is not held[-1]]
 
         def gap(snapshot: HeldSnapshot) -> int:
             at = ticks.index(snapshot.tick)
             return ticks[min(at + 1, len(ticks) - 1)] - ticks[at - 1]
 
-        return min(candidates, key=gap, default=self._held[0])
+        return min(candidates, key=gap, default=held[0])
 
     def __len__(self) -> int:
         return len(self._held)
@@ -152,81 +174,34 @@ class SnapshotShelf:
     @property
     def pids(self) -> set[int]:
         """The processes of all copies that are known."""
-        held = [*self._held, *([] if self._taking is None else [self._taking])]
-        return {copy.pid for snapshot in held for copy in snapshot.copies.values()} - {0}
+        return {copy.pid for one in self._snapshots for copy in one.copies.values()} - {0}
 
     def nearest(self, tick: int) -> HeldSnapshot | None:
         """Return the last whole snapshot at `tick` or before; None: there is none."""
         found = [one for one in self._held if one.tick <= tick]
         for snapshot in sorted(found, key=lambda one: one.tick, reverse=True):
-            if all(copy.pid and _is_there(copy) for copy in snapshot.copies.values()):
+            # Every copy waits: nothing else ends the other end of its line.
+            if all(copy.pid and not copy.line.poll() for copy in snapshot.copies.values()):
                 return snapshot
             self.drop(snapshot)
         return None
 
-    def go_on(self, copy: WaitingCopy, wiring: Wiring, segment: int) -> int:
-        """Let a copy go on in a segment, open as `segment`, as a child of this process, with the
-        context in `wiring`; return its process. Its successor's note follows. Raises `OSError` if
-        it is gone."""
-        pid = copy.pid
-        copy.pid = 0
-        with ExitStack() as stack:
-            contexts = []
-            if copy.wiring != wiring and isinstance(wiring, TaskWiring):
-                file = stack.enter_context(TemporaryFile(dir=SHM_FOLDER))
-                file.write(pickle.dumps(wiring.context))
-                file.seek(0)
-                contexts.append(file.fileno())
-            request = CopyRequest(os.getpid(), has_context=bool(contexts))
-            send(copy.control, request, segment, *contexts)
-        return pid
-
-    def show(self, snapshot: HeldSnapshot, name: str) -> str:
-        """Return the attributes of a level in a snapshot, as JSON; empty if its copy is gone."""
-        control = snapshot.copies[name].control
-        file = os.memfd_create("attributes", os.MFD_CLOEXEC)
-        try:
-            send(control, CopyRequest(), file)
-            is_written = readable(control.fileno(), SHOW_S) and control.recv(1)
-            return os.pread(file, os.fstat(file).st_size, 0).decode() if is_written else ""
-        except OSError:
-            return ""
-        finally:
-            os.close(file)
-
     def drop(self, snapshot: HeldSnapshot) -> None:
-        """End a snapshot."""
-        snapshot.end()
-        self._held.remove(snapshot)
+        """End a snapshot and its processes."""
+        for copy in snapshot.copies.values():
+            if copy.pid:
+                with suppress(ProcessLookupError):
+                    os.kill(copy.pid, signal.SIGKILL)
+        snapshot.close()
+        self._snapshots.remove(snapshot)
 
     def clear(self) -> None:
         """End all snapshots."""
-        self._drop_unfinished()
-        for snapshot in [*self._held]:
+        for snapshot in [*self._snapshots]:
             self.drop(snapshot)
 
     def close_inherited(self) -> None:
         """Let go of all in a process forked from the crate."""
         self.line.close()
-        unfinished: Iterable[HeldSnapshot] = [] if self._taking is None else [self._taking]
-        for snapshot in (*self._held, *unfinished):
+        for snapshot in self._snapshots:
             snapshot.close()
-
-    def _drop_unfinished(self) -> None:
-        if self._taking is not None:
-            self._taking.end()
-            self._taking = None
-
-
-def can_go_on(copy: WaitingCopy, wiring: Wiring) -> bool:
-    """Say whether a copy can be the board of a wiring: it is that of its own, but for the settings
-    of its level."""
-    before = copy.wiring
-    if isinstance(before, TaskWiring) and isinstance(wiring, TaskWiring):
-        return replace(before, context=wiring.context) == wiring
-    return before == wiring
-
-
-def _is_there(copy: WaitingCopy) -> bool:
-    """Say whether a copy waits: nothing else ends the other end of its socket."""
-    return not readable(copy.control.fileno(), 0)

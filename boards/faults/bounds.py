@@ -131,6 +131,12 @@ class Bound:
         return Bound(f"{self.text} + {other.text}", ticks)
 
 
+def counting(number: float, noun: str) -> str:
+    """Return a number with its noun, as in "1 tick" or "3 ticks"."""
+    text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
+    return f"1 {noun}" if text == "1" else f"{text} {noun}s"
+
+
 def cycles(count: int) -> Bound:
     """Return a bound of `count` cycles of the task; 0: the cycle in which the fault strikes. A host
     board has none."""
@@ -162,52 +168,36 @@ def writes(count: int) -> Bound:
     return Bound(counting(count, "write"), lambda case: count * case.write)
 
 
-def missing_writes(count: int) -> Bound:
-    """Return a bound of `count` periods without a message; none for a planner, which writes at no
-    fixed period."""
-
-    def ticks(case: BoundCase) -> int | None:
-        return None if case.role == "planner" else count * case.write
-
-    return Bound(counting(count, "write"), ticks)
-
-
-def delayed(parameter: str) -> Bound:
-    """Return a bound of as many periods of the writer as the parameter says."""
-    return Bound("the delay", lambda case: int(case.parameters[parameter]) * case.write)
-
-
-def skipped(parameter: str) -> Bound:
-    """Return the bound of a skip of as many ticks as the parameter says.
-
-    The fastest boards find it in their next cycle; a release that was skipped comes in the first
-    tick that is not.
-    """
-    return Bound(
-        "the next cycle of the fastest boards",
-        lambda case: max(
-            int(case.parameters[parameter]), min(task.every for task in case.layout.tasks) - 1
-        ),
-    )
-
-
-def by_rack_or(count: int) -> Bound:
-    """Return the bound of a death: seen by the Rack, or by a reader whose message is then `count`
-    cycles old."""
-
-    def ticks(case: BoundCase) -> int:
-        if case.reader is None:
-            return ceil(RACK_NS / case.layout.clock_ns)
-        return count * case.cycle + case.read
-
-    return Bound(f"{RACK_NS * 1e-6:g} ms (Rack), {count} cycles + 1 read (reader)", ticks)
-
-
 READ = Bound("1 read", lambda case: case.read)
 DELIVERY = Bound(
     "1 delivery", lambda case: max(mailbox.delay for mailbox in case.mailboxes) + case.read
 )
 """From the writer's release until its message has been read."""
+MISSING_WRITES = 2
+"""Periods without a message after which a mailbox is stale."""
+MUTE = Bound(
+    counting(MISSING_WRITES, "write"),
+    lambda case: None if case.role == "planner" else MISSING_WRITES * case.write,
+)
+"""A planner writes at no fixed period: there is no bound."""
+DELAY = Bound("the delay", lambda case: int(case.parameters["by"]) * case.write)
+SKIP = Bound(
+    "the next cycle of the fastest boards",
+    lambda case: max(
+        int(case.parameters["ticks"]), min(task.every for task in case.layout.tasks) - 1
+    ),
+)
+"""A release that was skipped comes in the first tick that is not."""
+DEATH_CYCLES = 4
+DEATH = Bound(
+    f"{RACK_NS * 1e-6:g} ms (Rack), {DEATH_CYCLES} cycles + 1 read (reader)",
+    lambda case: (
+        ceil(RACK_NS / case.layout.clock_ns)
+        if case.reader is None
+        else DEATH_CYCLES * case.cycle + case.read
+    ),
+)
+"""Seen by the Rack, or by a reader whose message is then so many cycles old."""
 SLICE = Bound("1 time slice", lambda case: case.cycle)
 RELEASE = Bound("1 cycle", lambda case: case.layout.task(case.board).every)
 """From one release of the task to the next; a planner has several in its time slice."""
@@ -216,9 +206,3 @@ LOCK_WAIT = Bound(
 )
 BY_SIZE = Bound("depends on size")
 NOT_ARMED = Bound("the launch fails")
-
-
-def counting(number: float, noun: str) -> str:
-    """Return a number with its noun, as in "1 tick" or "3 ticks"."""
-    text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
-    return f"1 {noun}" if text == "1" else f"{text} {noun}s"

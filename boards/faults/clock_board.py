@@ -35,43 +35,11 @@ LEAST_LATE = 0.6
 """Smallest delay of a tick, in ticks; boards call a tick late from 0.5 on."""
 
 
-class StruckRack:
-    """The rack as seen by the steps of the clock's board.
-
-    In lockstep a process is struck between two cycles, once it has finished its release, and the
-    run continues once its end is known. So a run with faults is repeatable.
-    """
-
-    def __init__(self, segment: Segment, driver: ClockDriver) -> None:
-        self.segment = segment
-        self.driver = driver
-        self.clock = SystemClock(segment)
-
-    def target(self, entry: FaultEntry) -> ReleasedTask | None:
-        """Return the task, or host board, that a fault strikes; None: the clock."""
-        return next((task for task in self.driver.processes if task.index == entry.task), None)
-
-    def send(
-        self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals
-    ) -> bool:
-        """Send a signal to a task's process; return False if there is no such process."""
-        pid = task.block[Block.PID]
-        # A host board whose program is done, or given up, or which a replay does without, has no
-        # process; the crate may not have seen yet that one has ended.
-        if task.is_lost or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
-            return False
-        entry.acted(tick)
-        try:
-            os.kill(pid, number)
-        except ProcessLookupError:
-            return False
-        return True
+Strike = Callable[["FaultStage", FaultEntry, int], None]
+"""What is done to a rack for an entry of the fault table, at a tick."""
 
 
-Strike = Callable[[StruckRack, FaultEntry, int], None]
-
-
-def _nothing(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _nothing(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Do nothing."""
 
 
@@ -85,10 +53,10 @@ class ClockStep:
     begin: Strike = _nothing
     during: Strike = _nothing
     end: Strike = _nothing
-    is_void: Callable[[StruckRack, FaultEntry], bool] = lambda rack, entry: False
+    is_void: Callable[[FaultStage, FaultEntry], bool] = lambda rack, entry: False
 
 
-def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _kill(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     task = rack.target(entry)
     if task is None:
         # The clock kills itself: its successor finds the entry struck.
@@ -103,7 +71,7 @@ def _kill(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         rack.driver.await_state(task, lambda: task.is_lost and words[System.LOSSES] != before)
 
 
-def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _hang(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     task = rack.target(entry)
     if task is not None and rack.send(entry, tick, task, signal.SIGSTOP):
         task.is_stopped = True
@@ -112,7 +80,7 @@ def _hang(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
             rack.driver.await_state(task, lambda: task.is_lost)
 
 
-def _continue(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _continue(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     task = rack.target(entry)
     if task is not None and task.is_stopped and not task.is_lost:
         with suppress(ProcessLookupError):
@@ -121,28 +89,28 @@ def _continue(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
         rack.driver.settle()
 
 
-def _is_lost(rack: StruckRack, entry: FaultEntry) -> bool:
+def _is_lost(rack: FaultStage, entry: FaultEntry) -> bool:
     task = rack.target(entry)
     return task is not None and task.is_lost
 
 
-def _masquerade(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _masquerade(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     entry.acted(tick)
     forge(rack.segment, rack.segment.layout.mailboxes[entry.mailbox].name, tick)
 
 
-def _stop_clock(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _stop_clock(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     entry.acted(tick)
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def _skip(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _skip(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     entry.acted(tick)
     rack.driver.skip = int(entry.parameters[0])
     rack.driver.count_skipped(tick, rack.driver.skip)
 
 
-def _delay(rack: StruckRack, entry: FaultEntry, tick: int) -> None:
+def _delay(rack: FaultStage, entry: FaultEntry, tick: int) -> None:
     entry.acted(tick)
     part = random.Random(entry.seed + tick).uniform(LEAST_LATE, entry.parameters[0])
     until = rack.clock.time_of(tick) + int(part * rack.clock.period_ns)
@@ -179,16 +147,21 @@ class FaultStage:
     """Begins and ends faults at ticks, before any task of the tick is released; sees messages flow
     again after them.
 
-    In real time a fault with a phase strikes within its tick, after the releases. There is nothing
-    to do before `next_tick` unless more than the first `injected` faults have come.
+    In lockstep a process is struck between two cycles, once it has finished its release, and the
+    run continues once its end is known. So a run with faults is repeatable. In real time a fault
+    with a phase strikes within its tick, after the releases.
+
+    Attributes:
+        injected: Number of faults that have come.
+        next_tick: Until then there is nothing to do, unless more faults come.
     """
 
     def __init__(self, segment: Segment, driver: ClockDriver) -> None:
-        self._segment = segment
+        self.segment = segment
+        self.driver = driver
+        self.clock = SystemClock(segment)
         self._words = segment.words
-        self._rack = StruckRack(segment, driver)
         self._table = FaultTable(segment)
-        self._alarms = driver.alarms
         self._observer = cache(
             lambda box: open_observer(segment, segment.layout.mailboxes[box].name)
         )
@@ -202,40 +175,58 @@ class FaultStage:
                 self._await_messages(entry)
         self._phased: list[FaultEntry] = []
 
+    def target(self, entry: FaultEntry) -> ReleasedTask | None:
+        """Return the task, or host board, that a fault strikes; None: the clock."""
+        return next((task for task in self.driver.processes if task.index == entry.task), None)
+
+    def send(
+        self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals
+    ) -> bool:
+        """Send a signal to a task's process; return False if there is no such process."""
+        pid = task.block[Block.PID]
+        # A host board whose program is done, or given up, or which a replay does without, has no
+        # process; the crate may not have seen yet that one has ended.
+        if task.is_lost or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
+            return False
+        entry.acted(tick)
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            return False
+        return True
+
     def advance(self, tick: int) -> None:
         """Begin the faults due at `tick`, and end those that are over."""
         self.injected = self._words[System.INJECTED]
         faults = self._table.staged(OPEN)
-        over = [
-            entry for entry in faults if entry.stage == Stage.ACTIVE and self._is_over(entry, tick)
-        ]
-        due = [
-            entry for entry in faults if entry.stage == Stage.WAITING and self._is_due(entry, tick)
-        ]
+        active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
+        waiting = [entry for entry in faults if entry.stage == Stage.WAITING]
+        over = [entry for entry in active if self._is_over(entry, tick)]
+        due = [entry for entry in waiting if self._is_due(entry, tick)]
         if over or due:
             # A running cycle finishes with the faults with which it began.
-            self._rack.driver.settle()
+            self.driver.settle()
         for entry in over:
             entry.stage = Stage.OVER
             # Some end early: they strike once, or have lost their object.
             entry.until = min(entry.until, tick)
             self._words[System.FAULTS] += 1
-            _step(entry).end(self._rack, entry, tick)
-            self._alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry.count)
+            _step(entry).end(self, entry, tick)
+            self.driver.alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry.count)
             self._await_messages(entry)
         for entry in due:
             self._begin(entry, tick)
         active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
         for entry in active:
-            _step(entry).during(self._rack, entry, tick)
-        self._rack.driver.is_flooded = any(kind_of(entry).step is Babble for entry in active)
+            _step(entry).during(self, entry, tick)
+        self.driver.is_flooded = any(kind_of(entry).step is Babble for entry in active)
         for box, since in list(self._awaited.items()):
             observer = self._observer(box)
             if observer.read(tick - 1).is_there and observer.newest >= since:
                 del self._awaited[box]
-                self._alarms.ring(tick, Alarm.FLOWS, box, tick - since, since)
+                self.driver.alarms.ring(tick, Alarm.FLOWS, box, tick - since, since)
         # While rings are flooded, ticks must come one at a time: the recorder keeps up with each.
-        must_look = self._awaited or self._rack.driver.is_flooded
+        must_look = self._awaited or self.driver.is_flooded
         changes = [tick + 1] if must_look else [_next_change(entry, tick) for entry in faults]
         self.next_tick = min(changes, default=NEVER)
 
@@ -244,17 +235,17 @@ class FaultStage:
         releases."""
         if not self._phased:
             return
-        clock = self._rack.clock
+        clock = self.clock
         for entry in sorted(self._phased, key=lambda e: e.phase):
             at = clock.time_of(tick) + entry.phase * clock.period_ns // PHASES
             time.sleep(max(0, at - time.monotonic_ns()) * 1e-9)
-            _step(entry).begin(self._rack, entry, tick)
+            _step(entry).begin(self, entry, tick)
         self._phased.clear()
 
     def _is_over(self, entry: FaultEntry, tick: int) -> bool:
         kind = kind_of(entry)
         has_acted = kind.once and kind.is_of_task and entry.count > 0
-        return entry.until <= tick or has_acted or _step(entry).is_void(self._rack, entry)
+        return entry.until <= tick or has_acted or _step(entry).is_void(self, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
         """Say whether a fault begins. Its condition is read in every tick, so that no message is
@@ -280,14 +271,14 @@ class FaultStage:
         entry.until = tick + lasts if lasts else NEVER
         entry.stage = Stage.ACTIVE
         self._words[System.FAULTS] += 1
-        self._alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)
-        if entry.phase and not self._rack.clock.is_lockstep:
+        self.driver.alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)
+        if entry.phase and not self.clock.is_lockstep:
             self._phased.append(entry)
         else:
-            _step(entry).begin(self._rack, entry, tick)
+            _step(entry).begin(self, entry, tick)
 
     def _await_messages(self, entry: FaultEntry) -> None:
-        layout = self._segment.layout
+        layout = self.segment.layout
         if kind_of(entry).takes_mailbox:
             for box in struck_mailboxes(layout, entry.mailbox, board_of(entry, layout)):
                 self._awaited[layout.mailboxes.index(box)] = entry.until

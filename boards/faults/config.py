@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from rack.backplane.checked import pick
-from rack.backplane.layout import FieldSpec, Layout
+from rack.backplane.layout import Layout
 from rack.levels.tables import Finite, Moment, Table, Tick
 
 CONDITION = re.compile(r"\s*([a-z]\w*\.[a-z]\w*)\.([a-z]\w*)\s*==\s*([+-]?\w+)\s*")
@@ -92,7 +93,16 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
             f" {', '.join(fields) or 'none'}"
         )
     field = fields[found[2]]
-    return mailboxes[mailbox.name], mailbox.fields.index(field), _value(found[3], field)
+    value = dict(field.values).get(found[3].lower())
+    if value is None:
+        permitted = np.iinfo(field.kind)
+        with suppress(ValueError):
+            value = int(found[3])
+        if value is None or not permitted.min <= value <= permitted.max:
+            names = ", ".join(dict(field.values))
+            known = names or f"a number from {permitted.min} to {permitted.max}"
+            raise LookupError(f"'{found[3]}' is not a value of '{field.name}'; permitted: {known}")
+    return mailboxes[mailbox.name], mailbox.fields.index(field), value
 
 
 def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
@@ -101,18 +111,3 @@ def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
     field = pick(mailbox.fields, when[1], "field")
     names = {number: name for name, number in field.values}
     return f"{mailbox.name}.{field.name} == {names.get(when[2], when[2])}"
-
-
-def _value(text: str, field: FieldSpec) -> int:
-    names = dict(field.values)
-    if text.lower() in names:
-        return names[text.lower()]
-    permitted = np.iinfo(field.kind)
-    try:
-        value = int(text)
-    except ValueError:
-        value = None
-    if value is None or not permitted.min <= value <= permitted.max:
-        known = ", ".join(names) or f"a number from {permitted.min} to {permitted.max}"
-        raise LookupError(f"'{text}' is not a value of '{field.name}'; permitted: {known}")
-    return value

@@ -48,11 +48,6 @@ def magnitude(least: float, most: float) -> Draw:
     return lambda d: _short(math.exp(d.rng.uniform(math.log(least), math.log(most))))
 
 
-def size_from(visible: float) -> Draw:
-    """Draw a size that must be detected: `visible` or larger."""
-    return magnitude(visible, BEYOND * visible)
-
-
 def joint(d: Drawing) -> int:
     """Draw a joint; in one case of ten -1, all joints."""
     return d.rng.randrange(d.joints) if d.rng.random() < 0.9 else -1

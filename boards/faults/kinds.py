@@ -62,7 +62,15 @@ def _probability(default: float, most: float) -> Parameter:
 
 
 def _size(meaning: str, visible: float, least: float, most: float) -> Parameter:
-    return Parameter("size", "rad", meaning, visible, least, most, drawn=draw.size_from(visible))
+    return Parameter(
+        "size",
+        "rad",
+        meaning,
+        visible,
+        least,
+        most,
+        drawn=draw.magnitude(visible, draw.BEYOND * visible),
+    )
 
 
 KINDS.add(
@@ -73,7 +81,7 @@ KINDS.add(
         step=clock_board.KILL,
         tasks=("executor", "planner", "clock", "host"),
         detected_as=(DIED,),
-        bound=bounds.by_rack_or(4),
+        bound=bounds.DEATH,
         consequence=DEATH,
         once=True,
         within_tick=True,
@@ -151,7 +159,7 @@ KINDS.add(
         not_queued="a queue is written on demand: its silence proves nothing",
         # A message is stale after two periods, but that proves nothing until its writer has
         # finished another release.
-        bound=bounds.missing_writes(2) + bounds.READ,
+        bound=bounds.MUTE + bounds.READ,
         lasts=draw.silence(1.2, 2.0),
     ),
     _message(
@@ -183,7 +191,7 @@ KINDS.add(
         ),
         # Until the first delayed message arrives, the mailbox is silent.
         detected_as=(Alarm.HELD_BACK, Alarm.MUTE),
-        bound=bounds.delayed("by") + bounds.DELIVERY,
+        bound=bounds.DELAY + bounds.DELIVERY,
         # Afterwards the first punctual messages overtake the last delayed ones.
         consequence=Consequence(own=(Alarm.DISORDER,)),
         lasts=draw.messages(9, 13),
@@ -309,7 +317,7 @@ KINDS.add(
             ),
         ),
         detected_as=(Alarm.CLOCK_SKIPPED,),
-        bound=bounds.skipped("ticks"),
+        bound=bounds.SKIP,
         once=True,
     ),
     _clock(

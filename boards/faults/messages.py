@@ -25,31 +25,17 @@ from rack.boards.faults.kind import kind_of
 
 class Outgoing(NamedTuple):
     """A message in transit: written in the cycle of tick `at`, made in that of `released`;
-    `damage`: bits to flip."""
+    `damage`: bits to flip. `content`: of one that was delayed; None: that of the writer's own."""
 
     at: int
     released: int
     visible_at: int
     basis: int
     damage: tuple[int, ...] = ()
+    content: bytes | None = None
 
 
 Send = Callable[[Outgoing], None]
-
-
-class Held(NamedTuple):
-    """A delayed message with its content."""
-
-    message: Outgoing
-    content: bytes
-
-    def send(self, writer: Writer, at: int, visible_at: int, onward: Send) -> None:
-        """Pass it on in the cycle of tick `at`; the writer's own message keeps the level's
-        content."""
-        present = bytes(writer.message.raw)
-        writer.message.raw[:] = self.content
-        onward(self.message._replace(at=at, visible_at=visible_at))
-        writer.message.raw[:] = present
 
 
 class MessageStep:
@@ -60,7 +46,7 @@ class MessageStep:
         self.entry = entry
         self.writer = writer
         self.onward: Send
-        self.held: list[Held] = []
+        self.held: list[Outgoing] = []
         self._seed = f"{entry.seed} {index}"
 
     def send(self, message: Outgoing) -> None:
@@ -80,7 +66,8 @@ class MessageStep:
 
     def hold(self, message: Outgoing) -> None:
         """Delay a message: keep it with its content."""
-        self.held.append(Held(message, bytes(self.writer.message.raw)))
+        content = message.content or bytes(self.writer.message.raw)
+        self.held.append(message._replace(content=content))
 
 
 class Mute(MessageStep):
@@ -114,10 +101,10 @@ class Delay(MessageStep):
     def flush(self, tick: int, visible_at: int) -> None:
         """Pass on the messages whose delay is over."""
         span = round(self.entry.parameters[0]) * self.writer.spec.every
-        due = [held for held in self.held if held.message.at + span <= tick]
+        due = [held for held in self.held if held.at + span <= tick]
         self.held = self.held[len(due) :]
         for held in due:
-            held.send(self.writer, tick, visible_at, self.onward)
+            self.onward(held._replace(at=tick, visible_at=visible_at))
 
 
 class Reorder(MessageStep):
@@ -127,7 +114,8 @@ class Reorder(MessageStep):
         """Pass on a message and then the delayed one, or delay it."""
         if self.held:
             self.onward(message)
-            self.held.pop().send(self.writer, message.at, message.visible_at, self.onward)
+            held = self.held.pop()
+            self.onward(held._replace(at=message.at, visible_at=message.visible_at))
         elif self.chance(message).random() < self.entry.parameters[0]:
             self.acts(message)
             self.hold(message)
@@ -185,13 +173,19 @@ class FaultyWriter:
         self._index = index
         self._steps: dict[int, MessageStep] = {}
         self._first = self._publish
-        self._late: list[Held] = []
+        self._late: list[Outgoing] = []
         self._written = True
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Apply these faults from now on; those that continue keep their delayed
         messages."""
-        steps = {entry.index: self._steps.get(entry.index) or self._step(entry) for entry in faults}
+        steps = {}
+        for entry in faults:
+            kind = kind_of(entry).step
+            assert isinstance(kind, type), "it acts on messages"
+            assert issubclass(kind, MessageStep)
+            before = self._steps.get(entry.index)
+            steps[entry.index] = before or kind(entry, self._writer, self._index)
         for index, step in self._steps.items():
             if index not in steps:
                 self._late += step.held
@@ -201,12 +195,6 @@ class FaultyWriter:
             step.onward = onward
             onward = step.send
         self._first = onward
-
-    def _step(self, entry: FaultEntry) -> MessageStep:
-        step = kind_of(entry).step
-        assert isinstance(step, type), "it acts on messages"
-        assert issubclass(step, MessageStep)
-        return step(entry, self._writer, self._index)
 
     @property
     def is_over(self) -> bool:
@@ -219,13 +207,11 @@ class FaultyWriter:
         A delayed message becomes visible together with that of the cycle in which it is written, so
         that reads depend on ticks alone, even with faults.
         """
-        if basis is None:
-            basis = tick
         self.flush(tick, now)
         self._written = True
         visible_at = self._writer.visible_at(tick, now)
         for _ in self._writer.outgoing():
-            self._first(Outgoing(tick, tick, visible_at, basis))
+            self._first(Outgoing(tick, tick, visible_at, tick if basis is None else basis))
         self._show()
         return self._written and self._writer.is_in_time(tick, now)
 
@@ -235,7 +221,7 @@ class FaultyWriter:
         late = self._late
         self._late = []
         for held in late:
-            held.send(self._writer, tick, visible_at, self._publish)
+            self._publish(held._replace(at=tick, visible_at=visible_at))
         for step in self._steps.values():
             step.flush(tick, visible_at)
         self._show()
@@ -245,10 +231,15 @@ class FaultyWriter:
         self._writer.show()
 
     def _publish(self, message: Outgoing) -> None:
+        raw = self._writer.message.raw
+        # The writer's own message keeps the level's content.
+        present = bytes(raw)
+        raw[:] = message.content or present
         if not self._writer.publish(
             message.released, message.visible_at, message.basis, message.damage
         ):
             self._written = False
+        raw[:] = present
 
 
 def forge(segment: Segment, mailbox: str, tick: int) -> None:

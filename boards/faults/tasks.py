@@ -148,15 +148,11 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def act_on_core(segment: Segment, entry: FaultEntry) -> None:
-    """Run the step of a fault that takes the task's core, from this process."""
+def act_on_core(segment: Segment, index: int) -> int:
+    """Act the fault at `index` of the fault table, which takes a task's core, in a process forked
+    by the crate; return the exit status."""
+    entry = FaultTable(segment).entries[index]
     step = kind_of(entry).step
     assert callable(step), "a fault of a core has a function"
     step(segment, entry)
-
-
-def hog(segment: Segment, index: int) -> int:
-    """Act the fault at `index` of the fault table, in a process forked by the crate; return the
-    exit status."""
-    act_on_core(segment, FaultTable(segment).entries[index])
     return 0

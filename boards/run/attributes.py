@@ -4,7 +4,7 @@ changed since the level was built. Programs, configs and views of shared memory 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from math import isfinite
 from typing import Any
@@ -41,21 +41,24 @@ class AttributeView:
         """Return its attributes by name, as JSON holds them: numbers, texts, lists, and objects as
         dictionaries of theirs."""
         now = _Reading().attributes(self._level, DEPTH)
-        shown = {
-            name: _changed(value, self._built.get(name))
+        return _present(
+            (name, _changed(value, self._built.get(name)))
             if isinstance(value, ObjectAttributes)
-            else value
+            else (name, value)
             for name, value in now.items()
-        }
-        return {name: value for name, value in shown.items() if value is not _NOTHING}
+        )
 
 
 def _changed(now: Any, built: Any) -> Any:
     """Return what is news in an object's attributes."""
     if not isinstance(now, ObjectAttributes) or not isinstance(built, ObjectAttributes):
         return _NOTHING if now == built else now
-    found = {name: _changed(value, built.get(name, _NOTHING)) for name, value in now.items()}
-    return {name: value for name, value in found.items() if value is not _NOTHING} or _NOTHING
+    changes = ((name, _changed(value, built.get(name, _NOTHING))) for name, value in now.items())
+    return _present(changes) or _NOTHING
+
+
+def _present(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: value for name, value in items if value is not _NOTHING}
 
 
 class _Reading:
@@ -67,11 +70,10 @@ class _Reading:
     def attributes(self, thing: object, depth: int) -> ObjectAttributes:
         """Return the attributes of an object as plain data."""
         self._seen.add(id(thing))
-        names = attribute_names(thing)
-        plain = {name: self._plain(getattr(thing, name), depth) for name in names}
-        return ObjectAttributes(
-            (name, value) for name, value in plain.items() if value is not _NOTHING
-        )
+        plain = [
+            (name, self._plain(getattr(thing, name), depth)) for name in attribute_names(thing)
+        ]
+        return ObjectAttributes(_present(plain))
 
     def _plain(self, thing: Any, depth: int) -> Any:
         match thing:
@@ -110,8 +112,7 @@ class _Reading:
         if len(thing) > MOST:
             return f"{len(thing)} items"
         if isinstance(thing, Mapping):
-            found = {str(key): self._plain(value, depth) for key, value in thing.items()}
-            return {key: value for key, value in found.items() if value is not _NOTHING}
+            return _present((str(key), self._plain(value, depth)) for key, value in thing.items())
         plain = [self._plain(item, depth) for item in thing]
         return [
             f"a {type(item).__name__}" if shown is _NOTHING else shown

@@ -20,7 +20,7 @@ from rack.backplane.process import (
     name_process,
     set_priority,
     take_core,
-    take_processor,
+    wake_up_exactly,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
@@ -29,7 +29,7 @@ from rack.boards.errors import CANNOT_GO_ON
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
-from rack.boards.run.snapshots import TaskCopies
+from rack.boards.run.snapshots import TaskCopies, takes_snapshots
 from rack.boards.run.system_controller import run_clock
 from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
@@ -96,13 +96,10 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
     spec = segment.layout.task(wiring.task)
-    copier = Copier(segment, wiring.task, copies) if wiring.is_copied else None
+    copier = Copier(segment, wiring.task, copies) if takes_snapshots(segment) else None
     block = segment.block(wiring.task)
-    kind: type[Executor] | type[Planner]
-    kind = (
-        find_class(wiring.target, Executor)
-        if spec.role == "executor"
-        else find_class(wiring.target, Planner)
+    kind: type[Executor] | type[Planner] = find_class(
+        wiring.target, Executor if spec.role == "executor" else Planner
     )
     level = kind(wiring.context)
     if isinstance(level, Adapter):
@@ -118,7 +115,9 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
             # Still at ordinary priority: a board that is restarted must not delay another board's
             # cycle.
             touch_memory()
-        block[Block.PRIORITY] = take_processor(spec, wiring.reservation, lockstep)
+        block[Block.PRIORITY] = take_core(spec.core, spec.priority, wiring.reservation)
+        wake_up_exactly()
+        hold_memory(lockstep)
         block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
             level.open()
@@ -141,7 +140,7 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
     """Take the processor and run the system clock."""
-    copier = Copier(segment, CLOCK, copies) if wiring.is_copied else None
+    copier = Copier(segment, CLOCK, copies) if takes_snapshots(segment) else None
     take_core(wiring.core, wiring.priority, wiring.reservation)
     # Not touched: every board waits for the clock's start, and its lead over the grid has room for
     # a page fault.

@@ -8,8 +8,6 @@ stopwatch keeps time stamps, trace and counts; faults take effect between cycles
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from time import monotonic_ns
 
 from rack.backplane.process import set_priority
@@ -106,16 +104,12 @@ class VirtualControlLoop(Task):
         for complete_cycle in executor.complete_cycle:
             complete_cycle(self._arm_state)
         if executor.findings or executor.acted or self.faults.loads:
-            self._report(tick)
-
-    def _report(self, tick: int) -> None:
-        executor = self.executor
-        for finding in executor.findings:
-            self.alarms.ring(tick, *finding)
-        executor.findings.clear()
-        self.faults.count(executor.acted, tick)
-        executor.acted.clear()
-        self.faults.burn(tick)
+            for finding in executor.findings:
+                self.alarms.ring(tick, *finding)
+            executor.findings.clear()
+            self.faults.count(executor.acted, tick)
+            executor.acted.clear()
+            self.faults.burn(tick)
 
 
 class PlannerLoop(Task):
@@ -151,28 +145,27 @@ class PlannerLoop(Task):
         if not self.planner.wanted(tick):
             self._pass(tick)
             return
-        self._take_time_slice(tick)
-        self.plan(tick)
-        with self._critical_section():
+        # Claim the slice of a plan: the clock does not release this task until its end.
+        self.next_cycle.hold_until(tick + self.slice)
+        self.block[Block.DEADLINE] = tick + self.slice
+        self.stopwatch.notify_clock()
+        self.planner.plan(tick)
+        self.faults.burn(tick)
+        if self._critical_priority:
+            # The executor's own: it cannot preempt the update of the plan.
+            set_priority(self._critical_priority)
+        try:
             # Stamped inside: before the section, and on leaving it, the executor may run first.
             watch.process_ns = monotonic_ns()
             in_time = self.write_plan(tick, watch.now(tick + self.slice))
             watch.end_ns = monotonic_ns()
+        finally:
+            if self._critical_priority:
+                set_priority(self._priority)
         self.block[Block.PLANS] += 1
         # A plan begun late gets its whole slice, and answers any release within it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
         watch.finish(in_time, tick + self.slice, done, Flag.PLANNED)
-
-    def plan(self, tick: int) -> None:
-        """Let the level plan."""
-        self.planner.plan(tick)
-        self.faults.burn(tick)
-
-    def _take_time_slice(self, tick: int) -> None:
-        """Claim the slice of a plan: the clock does not release this task until its end."""
-        self.next_cycle.hold_until(tick + self.slice)
-        self.block[Block.DEADLINE] = tick + self.slice
-        self.stopwatch.notify_clock()
 
     def _pass(self, tick: int) -> None:
         """Let a release pass without a plan; trace it if it came too late or others were
@@ -184,15 +177,3 @@ class PlannerLoop(Task):
             return
         self.stopwatch.process_ns = self.stopwatch.end_ns = monotonic_ns()
         self.stopwatch.finish(in_time, tick + self.slice, tick)
-
-    @contextmanager
-    def _critical_section(self) -> Iterator[None]:
-        """Take the executor's priority for the update of the plan, so that the executor cannot
-        preempt it."""
-        if self._critical_priority:
-            set_priority(self._critical_priority)
-        try:
-            yield
-        finally:
-            if self._critical_priority:
-                set_priority(self._priority)

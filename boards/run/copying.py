@@ -5,7 +5,7 @@ it is forked from, it gets for itself: files that are open for reading are opene
 were read last. What cannot be had twice is refused: files open for writing, sockets, threads.
 
 A copy that is to go on forks its successor, which waits as it did, and goes on itself. The crate is
-its parent by then, since the board that it was forked from has ended. A copy waits on a socket
+its parent by then, since the board that it was forked from has ended. A copy waits on a line
 whose other end only the crate holds: it ends when the crate does.
 """
 
@@ -13,15 +13,16 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import random
 import stat
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fcntl import F_GETFL, fcntl
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
-from socket import AF_UNIX, SOCK_SEQPACKET, recv_fds, send_fds, socket, socketpair
+from socket import recv_fds, send_fds, socket
 from typing import Any
 
 from rack.backplane import copies
@@ -33,7 +34,7 @@ from rack.boards.errors import SnapshotError
 from rack.levels.level import LevelContext
 
 MOST_BYTES = 4096
-"""Largest note or request on a socket of copies."""
+"""Largest note of a board."""
 MOST_FILES = 2
 _DESCRIPTORS = Path("/proc/self/fd")
 _THREADS = Path("/proc/self/task")
@@ -43,57 +44,63 @@ _THREADS = Path("/proc/self/task")
 class CopyNote:
     """A board's note to the crate: the process `pid` is a copy of it before `tick`, and waits.
 
-    With it come the crate's end of its socket and, from the clock, the memory of the segment. The
-    successor of a copy that goes on has its socket already.
+    With it come the crate's end of its line and, from the clock, the memory of the segment. The
+    successor of a copy that goes on has its line already.
     """
 
     tick: int
     name: str
     pid: int
 
+    def send(self, line: socket, *files: int) -> None:
+        """Send it with open files. Raises `OSError` when the crate is gone."""
+        send_fds(line, [encode_json(asdict(self)).encode()], files)
+
+
+def receive_note(line: socket) -> tuple[CopyNote, list[int]]:
+    """Return the next note, and the files that came with it."""
+    data, files, *_ = recv_fds(line, MOST_BYTES, MOST_FILES)
+    return CopyNote(**json.loads(data)), files
+
 
 @dataclass(frozen=True)
-class CopyRequest:
-    """The crate's request to a copy: go on, in the segment and as a child of the crate `crate`; or
-    write the attributes of the level as JSON, if that is 0. The file for either comes with it, and
-    one with another context of the level, if that `has_context`."""
+class GoOn:
+    """The crate's request to a copy: go on in the segment of `rack`, as a child of the crate, with
+    another `context` of the level if there is one.
 
-    crate: int = 0
-    has_context: bool = False
+    The other request, None, is answered with the attributes of the level as JSON.
+    """
 
-
-def send(line: socket, record: CopyNote | CopyRequest, *files: int) -> None:
-    """Send a record and open files. Raises `OSError` when the other end is gone."""
-    send_fds(line, [encode_json(asdict(record)).encode()], files)
-
-
-def receive(line: socket) -> tuple[dict[str, Any], list[int]] | None:
-    """Return the next record, as plain data, and the files that came with it; None at the end."""
-    data, files, *_ = recv_fds(line, MOST_BYTES, MOST_FILES)
-    return (json.loads(data), files) if data else None
+    crate: int
+    rack: str
+    context: LevelContext | None
 
 
 class Copier:
-    """Forks copies of this process. `attributes` returns what a copy shows of its level,
-    `change_settings` gives that another context.
+    """Forks copies of this process.
 
     Make it before the level: what is open by then is not the level's.
     """
 
     def __init__(self, segment: Segment, name: str, line: socket) -> None:
-        self.attributes: Callable[[], Mapping[str, Any]] = dict
-        self.change_settings: Callable[[LevelContext], None] = _refuse_settings
         self._segment = segment
         self._name = name
         self._line = line
         self._before = _open_files()
         self._copies: list[int] = []
 
-    def copy(self, tick: int, *memory: int) -> bool:
-        """Fork a copy before `tick`; `memory`: of the clock, the file with the segment's memory.
+    def copy(
+        self, tick: int, *memory: int, show: Callable[[], Mapping[str, Any]] = dict
+    ) -> GoOn | None:
+        """Fork a copy before `tick`.
+
+        Args:
+            tick: The tick that the copy begins with.
+            memory: Of the clock, the file with the segment's memory.
+            show: Returns the attributes of the level that the copy shows.
 
         Returns:
-            False in this process. True in a copy, as often as a rack goes on from it.
+            None in this process. In a copy, as often as a rack goes on from it, the request.
 
         Raises:
             SnapshotError: The process cannot be copied, with the reason.
@@ -106,57 +113,58 @@ class Copier:
             if _is_only_read(fd) and stat.S_ISREG(os.fstat(fd).st_mode)
         }
         seeds = random.getstate()
-        here, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
-        try:
-            pid = os.fork()
-        except OSError as error:
-            raise SnapshotError(f"{self._name}: no copy: {error.strerror}") from None
-        if pid:
-            send(self._line, CopyNote(tick, self._name, pid), here.fileno(), *memory)
+        here, theirs = Pipe()
+        with here, theirs:
+            try:
+                pid = os.fork()
+            except OSError as error:
+                raise SnapshotError(f"{self._name}: no copy: {error.strerror}") from None
+            if pid:
+                CopyNote(tick, self._name, pid).send(self._line, here.fileno(), *memory)
+                # Those that have ended since: they are this process's children.
+                self._copies = [one for one in self._copies if not os.waitpid(one, os.WNOHANG)[0]]
+                self._copies.append(pid)
+                return None
             here.close()
-            theirs.close()
-            # Those that have ended since: they are this process's children.
-            self._copies = [one for one in self._copies if not os.waitpid(one, os.WNOHANG)[0]]
-            self._copies.append(pid)
-            return False
-        here.close()
-        self._copies = []
-        copies.leave(self._segment)
-        self._wait(theirs, tick, offsets, seeds)
-        return True
-
-    def _wait(self, control: socket, tick: int, offsets: Mapping[int, int], seeds: Any) -> None:
-        """Wait until a rack goes on from here; end with the crate."""
-        name_process(f"{COPY}{self._name}")
-        while True:
-            for fd, offset in offsets.items():
-                _open_again(fd, offset)
-            # A fork gets new ones from Python.
-            random.setstate(seeds)
-            asked = receive(control)
-            if asked is None:
-                os._exit(0)
-            request, (file, *contexts) = CopyRequest(**asked[0]), asked[1]
-            if not request.crate:
-                with os.fdopen(file, "w") as shown:
-                    shown.write(encode_json(self.attributes()))
-                control.send(b".")
-            elif successor := _fork():
-                break
-            else:
-                for fd in (file, *contexts):
-                    os.close(fd)
-        control.close()
+            copies.leave(self._segment)
+            name_process(f"{COPY}{self._name}")
+            request, successor = self._await_request(theirs, offsets, seeds, show)
         die_with_parent(request.crate)
-        copies.enter(self._segment, file)
+        copies.enter(self._segment, request.rack)
         claim_again()
-        send(self._line, CopyNote(tick, self._name, successor))
+        CopyNote(tick, self._name, successor).send(self._line)
         self._copies = [successor]
         name_process(f"{self._segment.rack}:{self._name}")
-        for fd in contexts:
-            # From the crate's own process, as is all that a board is told when it is forked.
-            with os.fdopen(fd, "rb") as context:
-                self.change_settings(pickle.load(context))
+        return request
+
+    def _await_request(
+        self,
+        crate: Connection,
+        offsets: Mapping[int, int],
+        seeds: Any,
+        show: Callable[[], Mapping[str, Any]],
+    ) -> tuple[GoOn, int]:
+        """Wait until a rack goes on from here; return the request, and the process that waits from
+        then on. End with the crate."""
+        while True:
+            for fd, offset in offsets.items():
+                # Open the file for this process alone, and read it up to `offset`.
+                again = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
+                os.lseek(again, offset, os.SEEK_SET)
+                os.dup2(again, fd)
+                os.close(again)
+            # A fork gets new ones from Python.
+            random.setstate(seeds)
+            try:
+                # From the crate's own process, as is all that a board is told when it is forked.
+                request: GoOn | None = crate.recv()
+                if request is None:
+                    crate.send_bytes(encode_json(show()).encode())
+                elif successor := os.fork():
+                    return request, successor
+            except (EOFError, OSError):
+                # The crate is gone, or the system refuses a fork, as the crate notices.
+                os._exit(os.EX_OSERR)
 
     def _refused(self, memory: Collection[int]) -> list[str]:
         """Return what the process has that no copy can have; `memory`: files that are the
@@ -177,19 +185,6 @@ class Copier:
         ]
 
 
-def _refuse_settings(context: LevelContext) -> None:
-    """Refuse another context: only levels have one."""
-    raise TypeError("this process has no level")
-
-
-def _fork() -> int:
-    """Fork; end where the system refuses that, as the crate notices."""
-    try:
-        return os.fork()
-    except OSError:
-        os._exit(os.EX_OSERR)
-
-
 def _open_files() -> dict[int, str]:
     """Return the open files of this process, with what each is."""
     found = {}
@@ -206,12 +201,3 @@ def _is_only_read(fd: int) -> bool:
     has_content = stat.S_ISREG(kind) or stat.S_ISDIR(kind)
     flags = fcntl(fd, F_GETFL)
     return stat.S_ISCHR(kind) or (has_content and flags & os.O_ACCMODE == os.O_RDONLY)
-
-
-def _open_again(fd: int, offset: int) -> None:
-    """Have an open file for this process alone, read up to `offset`."""
-    flags = os.O_RDONLY | os.O_CLOEXEC
-    again = os.open(f"/proc/self/fd/{fd}", flags)
-    os.lseek(again, offset, os.SEEK_SET)
-    os.dup2(again, fd)
-    os.close(again)

@@ -29,6 +29,14 @@ REFUSED = -1
 """Value of `Block.COPY` of a task that cannot be copied."""
 
 
+def takes_snapshots(segment: Segment) -> bool:
+    """Return whether the rack wants any."""
+    words = segment.words
+    return any(
+        words[word] for word in (System.SNAPSHOT_PART, System.SNAPSHOT_EVERY, System.SNAPSHOT_AT)
+    )
+
+
 class TaskCopies:
     """Forks a copy of one task, between two of its cycles, when the clock wants it."""
 
@@ -36,22 +44,24 @@ class TaskCopies:
         self, task: Task, level: Executor | Planner, copier: Copier, attention: int
     ) -> None:
         self._block = task.block
+        self._level = level
         self._attention = attention
         self._stopwatch = task.stopwatch
         self._copier = copier
-        copier.attributes = AttributeView(level).show
-        copier.change_settings = partial(change_settings, level)
+        self._view = AttributeView(level)
 
     def __call__(self) -> None:
         """Fork it, and go on; in the copy, go on when a rack does."""
         block = self._block
         try:
-            goes_on = self._copier.copy(block[Block.COPY] - 1)
+            request = self._copier.copy(block[Block.COPY] - 1, show=self._view.show)
         except SnapshotError as error:
             print(f"{UNKEPT}{error}", file=sys.stderr, flush=True)
             block[Block.COPY] = REFUSED
         else:
-            if goes_on:
+            if request is not None:
+                if request.context is not None:
+                    change_settings(self._level, request.context)
                 block[Block.PID] = os.getpid()
                 block[Block.STATE] = TaskState.RUNNING
                 self._stopwatch.begin()
@@ -111,19 +121,19 @@ class ClockCopies:
             return False
         self._taken_at = tick
         memory = copy_memory(self._segment)
+        goes_on = False
         try:
-            goes_on = self._copier.copy(tick, memory)
+            goes_on = self._copier.copy(tick, memory) is not None
         except SnapshotError as error:
             print(f"{UNKEPT}{error}", file=sys.stderr, flush=True)
-            goes_on = False
         os.close(memory)
         words = self._segment.words
+        now_s = time.monotonic()
         if goes_on:
             words[System.CLOCK_PID] = os.getpid()
             words[System.EPOCH_NS] = time.monotonic_ns()
             words[System.STATE] = Run.RUNNING
-        now_s = time.monotonic()
-        if not goes_on:
+        else:
             self.cost_s = now_s - started_s
         self._not_before_s = now_s + self.cost_s * words[System.SNAPSHOT_PART]
         return goes_on

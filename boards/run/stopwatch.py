@@ -8,9 +8,7 @@ that a release is done.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from time import monotonic_ns, thread_time_ns
-from typing import Any
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.segment import Segment
@@ -44,7 +42,14 @@ class Stopwatch:
         self._outputs = outputs
         self._traffic = inputs.traffic + outputs.traffic
         self._reading = inputs.task
-        self._state_at, self._status = _state_of(outputs)
+        # In which byte of its status a level holds its state; always 0 without a status.
+        self._status = memoryview(bytes(1))
+        self._state_at = 0
+        if (writer := outputs.writers.get("status")) is not None:
+            fields = writer.message.record.dtype.fields
+            if fields and "state" in fields:
+                self._status = writer.message.raw
+                self._state_at = fields["state"][1]
         self._trace = TraceWriter(segment, task)
         self._lockstep_done = done_semaphore(segment, task) if self._clock.is_lockstep else None
         self._troubles = self._bus_errors = self._corrupt = 0
@@ -170,15 +175,3 @@ class Stopwatch:
         words = (Block.READS, Block.READ_BYTES, Block.WRITES, Block.WRITE_BYTES)
         for word, count, counted in zip(words, self._traffic, before, strict=True):
             self._block[word] += count - counted
-
-
-def _state_of(outputs: OutputPorts) -> tuple[int, memoryview]:
-    """Return where, in which bytes, a level's status holds its state, one byte; always 0 without a
-    status."""
-    writer = outputs.writers.get("status")
-    status = None if writer is None else writer.message
-    fields: Mapping[str, Any] = {} if status is None else status.record.dtype.fields or {}
-    at = fields.get("state")
-    return (
-        (at[1], status.raw) if status is not None and at is not None else (0, memoryview(bytes(1)))
-    )

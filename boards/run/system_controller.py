@@ -12,7 +12,7 @@ import time
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named
-from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
+from rack.backplane.clock.driver import ClockDriver, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.system_clock import SystemClock
@@ -99,7 +99,19 @@ class SystemController:
         # Read before they are acted on: a change in between is handled at the next tick.
         emergency = words[System.EMERGENCY_STOP]
         peer = words[System.PEER_STOP]
-        self._set_demand(lost, tick)
+        asked = [
+            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
+        ]
+        if emergency:
+            asked.append((Demand.BRAKE, -1))
+        if is_on(peer, tick):
+            asked.append((Demand.STOP, PEER))
+        demand, subject = max(asked, default=(Demand.NONE, -1))
+        if demand != self._demand:
+            self._driver.settle()
+            self._demand = demand
+            words[System.DEMAND] = demand
+            self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
         # The same holds for a switch that lies ahead, and for a loss that the crate is recording.
         is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
         self._settled = (*seen, emergency, peer) if is_settled else None
@@ -124,21 +136,6 @@ class SystemController:
             # Time for the arm to come to rest before the run ends.
             ends = tick + self._wiring.linger
             self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
-
-    def _set_demand(self, lost: list[ReleasedTask], tick: int) -> None:
-        asked = [
-            (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
-        ]
-        if self._words[System.EMERGENCY_STOP]:
-            asked.append((Demand.BRAKE, -1))
-        if is_on(self._words[System.PEER_STOP], tick):
-            asked.append((Demand.STOP, PEER))
-        demand, subject = max(asked, default=(Demand.NONE, -1))
-        if demand != self._demand:
-            self._driver.settle()
-            self._demand = demand
-            self._words[System.DEMAND] = demand
-            self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
 
 
 class OperatorDesk:
@@ -314,20 +311,15 @@ def run_clock(
         newest = words[System.TICK]
         alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
     end_of_run = EndOfRun(segment, wiring)
-    driver = driver_of_run(segment, wiring, end_of_run, alarms)
+    driver: ClockDriver
+    if wiring.lockstep:
+        layout = segment.layout
+        one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
+        one_at_a_time |= any(len(layout.pacers(host)) > 1 for host in layout.hosts)
+        driver = LockstepDriver(segment, end_of_run, one_at_a_time, wiring.history, alarms)
+        if copier is not None:
+            driver.snapshot = ClockCopies(segment, driver, copier)
+    else:
+        driver = RealtimeDriver(segment, end_of_run, alarms)
     driver.controller = SystemController(segment, wiring, driver, end_of_run)
-    if copier is not None and isinstance(driver, LockstepDriver):
-        driver.snapshot = ClockCopies(segment, driver, copier)
     driver.run()
-
-
-def driver_of_run(
-    segment: Segment, wiring: ClockWiring, ended: Ended, alarms: AlarmWriter
-) -> ClockDriver:
-    """Return the clock driver for the run's mode."""
-    if not wiring.lockstep:
-        return RealtimeDriver(segment, ended, alarms)
-    layout = segment.layout
-    one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
-    one_at_a_time |= any(len(layout.pacers(host)) > 1 for host in layout.hosts)
-    return LockstepDriver(segment, ended, one_at_a_time, wiring.history, alarms)

@@ -8,11 +8,11 @@ import os
 import resource
 import signal
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rack.backplane.memory import hold_memory
 from rack.backplane.process import (
     DEADLINE,
     GONE,
@@ -34,9 +34,8 @@ from rack.backplane.process import (
     start_time,
     state_of,
     take_core,
-    take_processor,
+    wake_up_exactly,
 )
-from tests.backplane.bus import task
 from tests.machine import needs_deadlines, needs_fifo
 from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_until
 
@@ -143,18 +142,20 @@ def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
     core = min(os.sched_getaffinity(0))
 
     def take() -> bool:
-        assert take_processor(replace(task("level"), core=core, priority=5)) == 5
+        assert take_core(core, 5) == 5
+        hold_memory()
         assert os.sched_getaffinity(0) == {core}
         mapped, locked = mapped_and_locked(os.getpid())
         assert mapped >= locked > 0
         return os.sched_getparam(0).sched_priority == 5
 
     def take_for_lockstep() -> bool:
-        assert take_processor(replace(task("level"), core=core, priority=5), lockstep=True) == 5
+        hold_memory(lockstep=True)
         return not gc.isenabled() and mapped_and_locked(os.getpid())[1] == 0
 
     def be_ordinary() -> bool:
-        assert take_processor(replace(task("level"), core=core)) == 0
+        assert take_core(core, 0) == 0
+        wake_up_exactly()
         return Path("/proc/self/timerslack_ns").read_text().strip() == "1"
 
     assert exit_status(fork(take)) == 0

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rack.backplane.rack_name import derive_name, is_free_name
 from rack.boards.config import load, names
 from rack.levels.errors import RobotError
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json
 from rack.tools.console.tables import fitted_records
+from rack.tools.robot.rack_name import derive_name, is_free_name
 
 if TYPE_CHECKING:
     from rack.tools.robot.draft import Wishes

@@ -62,7 +62,7 @@ class LiveRack:
         if KINDS[fault.kind].where == "core":
             # This very process takes the core.
             self._print_waiting(entry)
-            act_on_core(self._segment, entry)
+            act_on_core(self._segment, entry.index)
         elif fault.tick is None and fault.when is None:
             held = self._segment.words
             if not self._wait_until(

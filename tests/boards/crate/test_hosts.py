@@ -14,7 +14,7 @@ from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, TaskState
 from rack.boards.config import resolve
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.recovery import HostBoards, Supervision
+from rack.boards.crate.recovery import Recovery, Supervision
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
 from rack.boards.events import Event, Journal
 from tests.boards.conftest import MakeConfig
@@ -25,11 +25,17 @@ SETTINGS = ("supervision.restarts=2", "supervision.within_s=1.0")
 
 
 class Site:
-    """Host boards, the requests that they have made of the crate, and what was recorded."""
+    """A rack with host boards, and the requests made of its crate once they were started."""
 
-    def __init__(self, segment: Segment, boards: HostBoards, asked: list[object]) -> None:
-        self.boards, self.asked = boards, asked
+    def __init__(self, segment: Segment, recovery: Recovery, asked: list[object]) -> None:
+        self.recovery, self.asked = recovery, asked
         self.block = segment.block("program")
+
+    def lose(self, status: int, tick: int) -> None:
+        """Lose the program's process, and do what is due then."""
+        end = Ended("program", 1, status, 0, tick)
+        self.recovery.lose(end, is_over=False, record_printed=lambda: None)
+        self.recovery.advance()
 
 
 @pytest.fixture
@@ -55,7 +61,9 @@ def site(config: MakeConfig, journal: Journal) -> Iterator[Site]:
 
     supervision = Supervision(made, plan.layout)
     crate = cast(CrateLine, Crate())
-    yield Site(segment, HostBoards(segment, plan.hosts, supervision, crate, journal), asked)
+    recovery = Recovery(segment, supervision, crate, journal)
+    recovery.start(plan.clock(None), plan)
+    yield Site(segment, recovery, asked)
     segment.close()
     unlink(plan.layout.rack)
 
@@ -68,51 +76,52 @@ def told(journal: Journal) -> list[tuple[str, str]]:
 
 
 def test_the_rack_starts_its_own_and_no_prompts(site: Site) -> None:
-    site.boards.start()
-    assert [cast(PowerOn, request).name for request in site.asked] == ["program"]
-    assert "program" in site.boards
-    assert "prompt" not in site.boards
+    assert [cast(PowerOn, request).name for request in site.asked] == ["clock", "program"]
+    assert "prompt" not in site.recovery.wirings
 
 
 def test_one_that_ends_is_restarted_so_many_times_within_a_time(
     site: Site, journal: Journal
 ) -> None:
-    def lose(tick: int) -> bool:
-        return site.boards.lose(Ended("program", 1, -9, 0, tick), "killed")
-
-    assert [lose(tick) for tick in (10, 20, 30)] == [True, True, False]
-    assert [cast(PowerOn, request).name for request in site.asked] == ["program"] * 2
-    died = ("died", "host board 'program' ended: killed")
+    for tick in (10, 20, 30):
+        site.lose(-signal.SIGKILL, tick)
+    names = [cast(PowerOn, request).name for request in site.asked]
+    assert names == ["clock", *["program"] * 3]
+    died = ("died", "host board 'program' ended: signal SIGKILL")
     found = told(journal)
     assert [code for code, _ in found] == ["died", "restart", "died", "restart", "died", "given_up"]
     assert found[0] == died
     assert found[1][1].startswith("restart 1 of at most 2 in 1 s")
     assert found[-1] == ("given_up", "gave up on 'program'")
     assert site.block[Block.STATE] == TaskState.GIVEN_UP
+    assert site.recovery.faults == [f"{died[1]}; no restarts left"]
+    assert not site.recovery.given_up
 
 
 def test_one_whose_program_is_done_is_not_restarted(site: Site, journal: Journal) -> None:
     site.block[Block.STATE] = TaskState.ENDED
-    assert site.boards.lose(Ended("program", 1, 0, 0, 10), "exit status 0")
+    site.lose(0, 10)
     assert told(journal) == [("done", "host board 'program': its program is done")]
-    assert site.asked == []
+    assert len(site.asked) == 2
+    assert site.recovery.faults == []
 
 
 @pytest.mark.filterwarnings(FORKS)
 def test_one_that_a_signal_has_stopped_is_ended_once(site: Site, journal: Journal) -> None:
     with forked(signal.pause) as pid:
         site.block[Block.PID] = pid
-        site.boards.look()
+        site.asked.clear()
+        site.recovery.advance()
         assert (site.asked, told(journal)) == ([], [])
         os.kill(pid, signal.SIGSTOP)
         wait_until(lambda: state_of(pid) in STOPPED)
-        site.boards.look()
-        site.boards.look()
+        site.recovery.advance()
+        site.recovery.advance()
         assert site.asked == [PowerOff("program")]
         (event,) = cast("list[Event]", journal.events)
         assert (event.kind, event.code, event.subject) == ("detection", "hang", "program")
         assert event.text == "'program' is not responding: stopped by a signal"
         # Its successor may be stopped, too.
-        site.boards.lose(Ended("program", pid, -9, 0, 10), "killed")
-        site.boards.look()
+        site.lose(-signal.SIGKILL, 10)
+        site.recovery.advance()
         assert site.asked.count(PowerOff("program")) == 2

@@ -26,11 +26,10 @@ class StubCopier:
     def __init__(self) -> None:
         self.ticks: list[int] = []
 
-    def copy(self, tick: int, memory: int) -> bool:
+    def copy(self, tick: int, memory: int) -> None:
         """Take time."""
         compute_until(process_time_ns() + COST_NS)
         self.ticks.append(tick)
-        return False
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from rack.backplane.rack_name import derive_name, is_free_name
 from rack.boards.config.schema import RackName
+from rack.tools.robot.rack_name import derive_name, is_free_name
 
 TAKEN = ("nasrem",)
 DERIVED = {

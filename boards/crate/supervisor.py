@@ -1,0 +1,223 @@
+"""Supervision of the boards of a rack, from their power-on to the end of the run."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import suppress
+from multiprocessing.connection import wait
+
+from rack.backplane.address_map import CLOCK
+from rack.backplane.checked import pick
+from rack.backplane.errors import DamageError, EmergencyStopError
+from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.history import digest
+from rack.backplane.segment import Segment
+from rack.backplane.watch.alarms import Alarm
+from rack.backplane.words import Block, Run, System
+from rack.boards.config.resolved import Resolved
+from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.crate.heartbeat import Heartbeat
+from rack.boards.crate.lateness import judge_lost_cycles
+from rack.boards.crate.line import CrateLine
+from rack.boards.crate.patience import Patience, RackAwaited
+from rack.boards.crate.recovery import UP, Recovery, Supervision
+from rack.boards.crate.requests import Ended, Forked, ForkFailed
+from rack.boards.errors import UNKEPT, LaunchError
+from rack.boards.events import SUCCESSES, Cause, Ending, Journal, Outcome, brakings
+
+MOST_TICKS = 1 << 48
+"""No run has so many."""
+LAST_S = 0.2
+"""Time for the boards to finish their last cycles before these are counted."""
+STOP_S = 0.8
+"""Time for the clock to end the run after a stop request, before the Rack does so."""
+
+
+class Supervisor:
+    """Watches the boards of a rack, restarts those that are lost, and ends the run.
+
+    Attributes:
+        segment: Memory of the rack.
+        plan: The rack that was launched.
+        policy: Limits of restarts.
+        recovery: What became of lost boards.
+        alarms: The alarms of the boards.
+        pids: Processes of the boards, by name.
+        is_armed: Whether the emergency stop, set at first, was reset.
+        outcome: How the run ended; None: it has not.
+    """
+
+    def __init__(
+        self, segment: Segment, plan: Resolved, crate: CrateLine, journal: Journal
+    ) -> None:
+        self.segment = segment
+        self.plan = plan
+        self.policy = Supervision(plan.config, plan.layout)
+        self.recovery = Recovery(segment, self.policy, crate, journal)
+        self.alarms = AlarmWatch(segment)
+        self.pids: dict[str, int] = {}
+        self.is_armed = False
+        self.outcome: Outcome | None = None
+        self._crate = crate
+        self._journal = journal
+        self._heartbeat = Heartbeat(segment)
+        self._awaited = RackAwaited(segment, journal)
+        self._why_stopped = ""
+        self._stop_by: float | None = None
+
+    def await_ready(self, limit_s: float) -> None:
+        """Wait until all boards have passed their self-tests. Raises `LaunchError`."""
+        patience = Patience(self._journal, limit_s)
+        tasks = {task.name: self.segment.block(task.name) for task in self.plan.layout.tasks}
+        while absent := [name for name, block in tasks.items() if block[Block.STATE] not in UP]:
+            self._listen(patience.left_s)
+            if self.recovery.faults:
+                printed = self._crate.printed()
+                raise LaunchError("\n".join(printed) or self.recovery.faults[0])
+            if patience.is_over:
+                raise LaunchError(f"boards {', '.join(absent)}: not ready within {limit_s:g} s")
+            patience.report(f"boards {', '.join(absent)} are starting")
+
+    def watch(self, timeout_s: float) -> bool:
+        """Supervise the boards for `timeout_s` or until the run is over; return False when it is
+        over."""
+        deadline = time.monotonic() + timeout_s
+        while self.outcome is None:
+            self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
+            if self._why_stopped and self._stop_by is None:
+                self._stop_by = time.monotonic() + STOP_S
+                self._journal.add("stop", "", self._why_stopped)
+            self._record_printed()
+            for rung in self.alarms.drain():
+                # Record the event of an alarm, and kill a process that hangs.
+                self._journal.keep(rung.event)
+                if rung.alarm == Alarm.HANG:
+                    task = pick(self.plan.layout.tasks, rung.subject, "task")
+                    self.recovery.end_hanging(task.name)
+                elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self.pids.get(CLOCK):
+                    # Only the clock that was reported: its successor may be running by now.
+                    self.recovery.end_hanging(CLOCK)
+            for board in self._heartbeat.hanging():
+                self.recovery.report_hanging(board)
+                self.recovery.end_hanging(board)
+            self._awaited.look()
+            self.recovery.advance()
+            if not self.is_armed:
+                self.reset_latch()
+            is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
+            if self._is_stopped or self.recovery.is_beyond_help or is_late:
+                self._end()
+            if time.monotonic() >= deadline:
+                break
+        return self.outcome is None
+
+    def stop(self, why: str) -> None:
+        """End the run at the next tick. May be called at any time, even from a signal handler."""
+        self._why_stopped = self._why_stopped or why
+        self.segment.words[System.STOP_REQUEST] = 1
+        os.eventfd_write(self._crate.attention, 1)
+
+    def reset_latch(self) -> None:
+        """Reset the emergency stop on behalf of the caller, as soon as all inputs permit it."""
+        with suppress(EmergencyStopError):
+            UtilityLines(self.segment).reset_emergency_stop()
+            self.is_armed = True
+
+    def end_boards(self) -> None:
+        """Declare the run over, to the clock and the boards."""
+        self.segment.words[System.STOP_REQUEST] = 1
+        self.segment.words[System.STATE] = Run.STOPPED
+
+    def _record_printed(self) -> None:
+        for line in self._crate.printed():
+            self._journal.add("ready" if line.startswith(UNKEPT) else "printed", "", line)
+
+    def _listen(self, timeout_s: float) -> None:
+        """Wait for the crate or an alarm, at most `timeout_s`."""
+        attention = self._crate.attention
+        for ready in wait([self._crate.line, attention], timeout_s):
+            if ready == attention:
+                os.eventfd_read(attention)
+            else:
+                self._receive()
+
+    def _receive(self) -> None:
+        message = self._crate.receive()
+        if isinstance(message, ForkFailed):
+            if self.segment.words[System.STATE] == Run.STARTING:
+                raise LaunchError(message.why)
+            self._journal.add("printed", "", message.why)
+            message = message.end
+        match message:
+            case Forked(name, pid):
+                self.pids[name] = pid
+            case Ended(name, _, status) as end:
+                self.pids.pop(name, None)
+                is_board = name == CLOCK or name in self.segment.map.blocks
+                is_over = self._is_stopped or self.outcome is not None
+                if is_board and not (is_over and status == 0):
+                    # Of one that died before the end the policy decides, however late this is read.
+                    died_before = name != CLOCK and self.segment.block(name)[Block.LOST]
+                    is_late = self._is_stopped and not died_before
+                    self.recovery.lose(end, is_late, self._record_printed)
+            case None:
+                self.recovery.lose_crate()
+
+    def _end(self) -> None:
+        """Record the end of the run (cause, ticks, digest) and let the boards end."""
+        for rung in self.alarms.drain():
+            self._journal.keep(rung.event)
+        words = self.segment.words
+        stop = words[System.STOP_TICK] or words[System.TICK] + 1
+        if not 0 <= stop < MOST_TICKS:
+            raise DamageError(f"a run of {stop} ticks")
+        clock = self.plan.clock(None)
+        ending = Ending(self.segment, clock.ends_run, clock.silent)
+        state, reason = ending.final_state()
+        cause: Cause = ending.cause()
+        if self.recovery.given_up:
+            cause = "board lost"
+        elif words[System.STOP_REQUEST]:
+            # It may also come from another process, by this word.
+            cause = "stopped"
+        faults = self.recovery.faults
+        events = self._journal.events
+        tick_ms = self.plan.config.clock_ns * 1e-6
+        found = brakings(events, stop, tick_ms)
+        if cause in SUCCESSES:
+            faults += ending.latched()
+        if cause == "time over":
+            faults += ending.held(events, found, stop * tick_ms)
+        objects = ending.ends(self.plan.goals)
+        if cause == "task done":
+            # Written so that NaN is too far.
+            faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
+        self.end_boards()
+        # Wait until boards have finished the cycles that they have begun, at most LAST_S.
+        patience = Patience(self._journal, LAST_S)
+        while any(map(self._is_cycling, self.pids)) and not patience.is_over:
+            self._listen(patience.left_s)
+        late, excused = judge_lost_cycles(self.segment, self.plan.config, stop)
+        self.outcome = Outcome(
+            cause=cause,
+            ticks=stop,
+            state=state,
+            reason=reason,
+            digest=digest(self.segment, stop),
+            faults=(*faults, *late),
+            brakings=found,
+            objects=objects,
+            excused=tuple(excused),
+        )
+        self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
+
+    def _is_cycling(self, name: str) -> bool:
+        if self.recovery.is_beyond_help or name not in self.segment.map.blocks:
+            return False
+        block = self.segment.block(name)
+        return block[Block.DONE] < block[Block.RELEASED] and not block[Block.LOST]
+
+    @property
+    def _is_stopped(self) -> bool:
+        return self.segment.words[System.STATE] == Run.STOPPED
