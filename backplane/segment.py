@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args, get_type_hints
 from zlib import crc32
 
+import posix_ipc
+
 from rack.backplane.address_map import BLOCK_SIZE, HEAD_SIZE, MAILBOX_HEAD_SIZE, AddressMap, pages
 from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
@@ -210,19 +212,22 @@ class Segment:
         if (kind := stranger(rack)) is not None:
             raise SegmentError(f"rack '{rack}': {shm_path(rack)} is a {kind}, not a segment")
         try:
-            fd = os.open(shm_path(rack), os.O_RDWR | os.O_NOFOLLOW)
-        except OSError as error:
-            is_foreign = isinstance(error, PermissionError)
-            why = "belongs to another user" if is_foreign else "does not exist"
+            shm = posix_ipc.SharedMemory(_shm_name(rack))
+        except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
+            why = (
+                "belongs to another user"
+                if isinstance(error, posix_ipc.PermissionsError)
+                else "does not exist"
+            )
             raise SegmentError(
                 f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}"
             ) from None
-        found = os.fstat(fd)
+        found = os.fstat(shm.fd)
         if os.getuid() not in (found.st_uid, 0) or found.st_size < HEAD_SIZE:
-            os.close(fd)
+            os.close(shm.fd)
             why = f"owner {found.st_uid}, {found.st_size} bytes: not a segment of this user's"
             raise SegmentError(f"rack '{rack}': {why}")
-        return cls(rack, mmap.mmap(fd, found.st_size), fd)
+        return cls(rack, mmap.mmap(shm.fd, found.st_size), shm.fd)
 
     def read_head(self) -> None:
         """Read the texts. Raises `SegmentError` when size or version is wrong, or a text is
@@ -363,8 +368,10 @@ def unlink(rack: str) -> None:
     Raises `SegmentError` when it is another user's.
     """
     try:
-        shm_path(rack).unlink(missing_ok=True)
-    except PermissionError:
+        posix_ipc.unlink_shared_memory(_shm_name(rack))
+    except posix_ipc.ExistentialError:
+        return
+    except posix_ipc.PermissionsError:
         raise SegmentError(
             f"rack '{rack}' belongs to another user: only that user may remove it"
         ) from None
@@ -377,6 +384,10 @@ def shm_path(rack: str) -> Path:
 
 def _pid_namespace() -> int:
     return Path("/proc/self/ns/pid").stat().st_ino
+
+
+def _shm_name(rack: str) -> str:
+    return f"/{PREFIX}{rack}"
 
 
 def layout_of(plain: dict[str, Any]) -> Layout:
