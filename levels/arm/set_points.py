@@ -6,7 +6,7 @@ import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, mat_vec, solve
-from rack.levels.arm.arm import Arm, JointTarget
+from rack.levels.arm.drivable import DrivableArm, JointTarget
 from rack.levels.arm.drives import LimitGate, speed_towards
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
@@ -29,7 +29,9 @@ class SetPointGate:
     sensed, those of position where the last one was.
     """
 
-    def __init__(self, arm: Arm, bounds: Bounds, tick_s: float, span_s: float, last: Array) -> None:
+    def __init__(
+        self, arm: DrivableArm, bounds: Bounds, tick_s: float, span_s: float, last: Array
+    ) -> None:
         """Keep `bounds` for `span_s`, as later cycles may be missed; `last`, (2, joints), rad,
         rad/s, is room for the last set point."""
         cell = arm.cell

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from rack.levels.algebra import Array, mat_vec
-from rack.levels.arm.arm import Arm, JointTarget, Sensed, copied
+from rack.levels.arm.arm import Arm
+from rack.levels.arm.drivable import JointTarget, Sensed, copied
 from rack.levels.arm.drives import LimitGate
 from rack.levels.arm.sensors import CoarseSensors, WristSensor
 from rack.levels.arm.set_points import SetPointGate

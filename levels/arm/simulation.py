@@ -184,10 +184,8 @@ class Simulation(Plant):
         part, joint = (int(at[0]) for at in np.nonzero(wrong[step]))
         value = float(self._steps.seen[step, part, joint])
         if not self.first_violation:
-            model = self.cell.model
-            name = model.joint(int(model.dof_jntid[self.cell.dof[joint]])).name
             what, unit = QUANTITIES[part]
-            where = f"joint '{name}' at {self._now_s:.4f} s, step {step}"
+            where = f"joint '{self.cell.joints[joint]}' at {self._now_s:.4f} s, step {step}"
             low, high = self._steps.judged[:2, part, joint]
             permitted = f"{low:g} to {high:g} is permitted"
             self.first_violation = f"{what} {value:.6g} {unit} of {where}; {permitted}"

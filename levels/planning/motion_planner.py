@@ -168,11 +168,8 @@ class MotionPlanner:
         beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
         if beyond.size:
             j = int(beyond[0])
-            name = self.cell.model.joint(self.cell.model.dof_jntid[self.cell.dof[j]]).name
-            raise Refused(
-                Error.UNREACHABLE,
-                f"joint '{name}' to {move.joints[j]:.4g} rad; valid: {low[j]:.4g} to {high[j]:.4g}",
-            )
+            where = f"joint '{self.cell.joints[j]}' to {move.joints[j]:.4g} rad"
+            raise Refused(Error.UNREACHABLE, f"{where}; valid: {low[j]:.4g} to {high[j]:.4g}")
 
 
 def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:

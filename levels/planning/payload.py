@@ -77,7 +77,7 @@ class Payloads:
             load = np.abs(self._dynamics.terms(q, self._rest, payload).bias)
             worst = int(np.argmax(load - limit))
             if load[worst] > limit[worst]:
-                joint = model.joint(int(model.dof_jntid[self._cell.dof[worst]])).name
+                joint = self._cell.joints[worst]
                 why = (
                     f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
                 )

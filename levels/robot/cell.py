@@ -56,6 +56,7 @@ class Cell:
     model: mujoco.MjModel
     """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons.
     Keyframe 0 is the start, the gripper open."""
+    joints: tuple[str, ...]  # their names
     qpos: Ints  # (joints,), the arm's joints in qpos
     dof: Ints  # (joints,), the same in qvel
     actuators: Ints  # (joints,), their motors in ctrl; of a hand, its flexors
@@ -199,6 +200,7 @@ def index(
     mujoco.mj_energyVel(model, data)
     return Cell(
         model=model,
+        joints=robot.joints,
         qpos=model.jnt_qposadr[joints].astype(int),
         dof=model.jnt_dofadr[joints].astype(int),
         actuators=np.array([model.actuator(name).id for name in motors]),
