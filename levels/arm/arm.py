@@ -10,7 +10,11 @@ ends the board, which is restarted as after any crash; report a broken arm in `f
 
 from __future__ import annotations
 
-from rack.levels.arm.drivable import DrivableArm, Link
+from collections.abc import Callable
+
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import Connection
+from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm, kept_bounds
 from rack.levels.arm.present import present_link
 from rack.levels.errors import RobotError
@@ -19,7 +23,7 @@ from rack.levels.robot.cell import Cell
 from rack.levels.tables import SensorConfig
 
 
-class Arm(DrivableArm):
+class Arm(BrakedArm):
     """Base of every arm: it is guarded, unless its drives keep its limits.
 
     Subclasses write `sense`, `brake`, `step` and, as their drives take torques or set points,
@@ -35,15 +39,17 @@ class Arm(DrivableArm):
     mrad at 3 rad/s, six times this noise."""
     _guard: GuardedArm | None = None
 
-    def connect(self, tick_s: float, part: float) -> Link:
-        """Return the link that the servo level drives it through; see `DrivableArm.connect`."""
+    def connect(
+        self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
+    ) -> Connection:
+        """Return the path that the servo level drives it through; see `DrivableArm.connect`."""
         link = present_link(self, tick_s)
         if not self.keeps_limits:
             link = self._guard = GuardedArm(self, tick_s, link, part)
-        return link
+        return Connection(link, FaultyLink(self, acted, link, holds))
 
     def permit(self, part: float) -> None:
-        """Let the link keep velocities within another `part` of their limits."""
+        """Let the path keep velocities within another `part` of their limits."""
         if self._guard is not None:
             self._guard.permit(part)
 

@@ -1,25 +1,18 @@
-"""What the servo level asks of an arm, and what every arm does for it."""
+"""What the servo level asks of an arm."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import ClassVar, NamedTuple, Protocol
 
-import numpy as np
-
-from rack.backplane.watch.alarms import AT_START, NO_TORQUE, Alarm
 from rack.levels.algebra import Array
-from rack.levels.arm.plant import Plant
-from rack.levels.level import Finding
-from rack.levels.messages import ArmState, Error, Scene
+from rack.levels.level import Fault, Finding
+from rack.levels.messages import ArmState, Scene
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import Interface, SceneConfig, SensorConfig, named_class
-
-TORQUE_MARGIN = 1.001
-"""Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits
-itself."""
 
 
 class DriveState(IntEnum):
@@ -81,79 +74,90 @@ class Link(Protocol):
         that velocity. Otherwise as `drive`."""
 
 
-class DrivableArm(Plant, ABC):
-    """An arm whose joints have drives and brakes, and a force-driven gripper. Implements `Link`.
+class FaultyPath(Link, Protocol):
+    """The same path with injected faults."""
+
+    def inject(self, faults: Sequence[Fault]) -> None:
+        """Replace the active faults."""
+
+
+class Connection(NamedTuple):
+    """The path between the servo level and an arm, in use without and with injected faults."""
+
+    sound: Link
+    faulty: FaultyPath
+
+
+class DrivableArm(ABC):
+    """An arm whose joints have drives and brakes, and a force-driven gripper.
 
     Its limits are kept by its own drives, or by the link that `connect` returns. Subclass
-    `rack.levels.arm.Arm`, which has that link.
+    `rack.levels.arm.Arm`, which has that link, the counters and the reports.
     """
 
     keeps_limits: ClassVar[bool]
     """Whether its drives keep positions and velocities within the limits by themselves."""
     sensors: ClassVar[SensorConfig]
     """Its encoders, where `[robot.sensors]` does not say."""
-    exceeded: Exceeded | None = None
-    """The limit that the newest sample is beyond, where the link of the arm judges samples."""
-
     reports_torque = False
     """Whether, after `follow`, `torque` is what the motors give throughout the coming cycle. Else
     it is what was predicted, and only the following error tells that a motor has failed."""
+    exceeded: Exceeded | None = None
+    """The limit that the newest sample is beyond, where the link judges samples."""
 
+    dynamics: Dynamics  # for the level that drives the arm
+    tick: int  # of the state
+    state: DriveState  # of the drives, as of the last `step`
+    torque: Array  # (joints,), N m: given to the motors last
+    grip_force: float  # N: given to the gripper last
+    braked: bool  # the brakes are engaged
+    brake_cause: int  # of brakes that engage in this cycle: see their alarm
+    fault: str  # why it has failed and moves no more; empty: it has not
+    contact: tuple[int, int] | None  # geoms of an unintended contact, of it or its load, in a step
+    clipped: int  # cycles in which a command was refused or cut
+    touches: int  # unintended contacts so far
+    first_touch: str  # the first of them, readable: which geoms, and when
+    violations: int  # steps in which the drives broke a limit of position, velocity or torque
+    first_violation: str  # the first of them, readable: which limit, by how much, and when
+    pushed: int  # steps in which a blow pushed a joint beyond a limit of position or velocity
+
+    @abstractmethod
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
         """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
         for random noise."""
-        super().__init__(cell)
-        self.every = every  # ticks of a cycle
-        # Ticks without a command after which the brakes must engage.
-        self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
-        self.waited = self.patience
-        self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
-        self.grip_force = 0.0  # N: given to the gripper last
-        self.state = DriveState.DISABLED  # of the drives, as of the last `step`
-        # Reason (see `Alarm.BRAKES_CLOSED`) and first tick of braking. None while released.
-        self._brakes: tuple[int, int] | None = (AT_START, self.tick)
-        self.dynamics = Dynamics(
-            cell
-        )  # for the level that drives the arm; one that senses exactly shares it with it
-        self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
     @abstractmethod
-    def connect(self, tick_s: float, part: float) -> Link:
-        """Return the link that the servo level drives it through, velocities within `part` of their
-        limits. Raises `RobotError` for encoders too coarse to tell a limit."""
+    def connect(
+        self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
+    ) -> Connection:
+        """Return the path that the servo level drives it through.
+
+        Args:
+            tick_s: One tick, s.
+            part: Part of their limits within which velocities are kept.
+            acted: Collects the faults that act, for `Executor.acted`.
+            holds: Whether the gripper holds a part, for all that the level knows.
+
+        Raises:
+            RobotError: Encoders are too coarse to tell a limit.
+        """
 
     @abstractmethod
     def permit(self, part: float) -> None:
-        """Let the link keep velocities within another `part` of their limits."""
+        """Let the path keep velocities within another `part` of their limits."""
 
     @classmethod
     @abstractmethod
     def misfit(cls, cell: Cell, part: float) -> str:
         """Return why `connect` would fail for a cell, before the launch; empty: it would not."""
 
-    @abstractmethod
-    def sense(self) -> Sensed:
-        """Return the newest sample, see `Link.sense`."""
-
-    def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets
-        `waited` to 0. Default: refused, see `takes`."""
-        raise NotImplementedError
-
-    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Release the brakes and follow; see `Link.follow`. Sets `waited` to 0, and `torque` to
-        what is predicted or reported. Default: refused, see `takes`."""
-        raise NotImplementedError
-
     @classmethod
+    @abstractmethod
     def takes(cls, interface: Interface) -> bool:
-        """Say whether the drives have an interface: `rack check` refuses a config that names
-        another. Default: by the methods that the class has."""
-        if interface == "torque":
-            return cls.drive is not DrivableArm.drive
-        return cls.follow is not DrivableArm.follow
+        """Return whether the drives have an interface: `rack check` refuses a config that names
+        another."""
 
     @abstractmethod
     def brake(self) -> None:
@@ -168,96 +172,47 @@ class DrivableArm(Plant, ABC):
         `ticks` exceeds the level's cycle after missed cycles, and may be 0.
         """
 
+    @abstractmethod
+    def report_waiting(self) -> None:
+        """Add to the findings that the arm has engaged its brakes by itself, between two cycles."""
+
+    @abstractmethod
     def enable(self) -> None:
         """Ask the drives for torque; does not block: `state` becomes ENABLED in a later `step`.
 
-        Until then, and whenever the arm is not enabled, it is braked in every cycle. Default:
-        drives that know no states are enabled at once.
+        Until then, and whenever the arm is not enabled, it is braked in every cycle.
         """
-        self.state = DriveState.ENABLED
 
+    @abstractmethod
     def disable(self) -> None:
-        """Ask the drives to give no torque any more. Default: the brakes do it, at once."""
-        self.brake()
-        self.state = DriveState.DISABLED
+        """Ask the drives to give no torque any more."""
 
+    @abstractmethod
     def reset(self) -> None:
         """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
-        were in it. Default: they cannot."""
+        were in it."""
 
-    def refused(self, torque: Array) -> Finding | None:
-        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;
-        None: it may. The caller then brakes; the refusal is counted and reported here."""
-        if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
-            return None
-        if np.isfinite(torque).all():
-            joint = int((np.abs(torque) / self._permitted).argmax())
-            return self.refuse(Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint])))
-        return self.refuse(Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax())))
-
-    def report_waiting(self) -> None:
-        """Add to the findings that the arm has engaged its brakes by itself, between two cycles."""
-        if self._brakes is None and self.braked:
-            if self.state is not DriveState.ENABLED:
-                self._report_brakes(Error.DRIVES, self.tick)
-            else:
-                since = self.tick - max(self.waited - self.patience, 1)
-                self._report_brakes(NO_TORQUE, since, self.waited - self.every)
-
-    def report_cycle(self) -> None:
-        """Add to the findings what a cycle did to the brakes, each time, however short; and why."""
-        super().report_cycle()
-        why = self.brake_cause
-        self.brake_cause = Error.NONE
-        if self.braked:
-            if self._brakes is None:
-                self._report_brakes(why, self.tick)
-        elif self._brakes is not None:
-            why, since = self._brakes
-            self._brakes = None
-            if self.tick > since:
-                self.findings.append(Finding(Alarm.BRAKES_OPENED, why, self.tick - since))
-
-    def _report_brakes(self, why: int, since: int, missed: int = 0) -> None:
-        self._brakes = why, since
-        self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
-
-    def restore(self, state: ArmState) -> None:
-        """Continue from an `ARM_STATE`. Default: drives that know no states are as they were."""
-        super().restore(state)
-        was_disabled = state.error == Error.DISABLED
-        self.state = DriveState.DISABLED if was_disabled else DriveState.ENABLED
-        self._brakes = (NO_TORQUE, self.tick) if self.braked else None
-
-    @property
-    def holds(self) -> bool:
-        """Whether the gripper touches a part. Default: False."""
-        return False
-
-    @property
-    def leans(self) -> bool:
-        """Whether the arm, or its load, touches anything else. Default: False."""
-        return False
-
+    @abstractmethod
     def named(self, contact: tuple[int, int]) -> str:
-        """Return a `contact` in words. Default: the numbers of the geoms."""
-        return f"geom {contact[0]} touches geom {contact[1]}"
+        """Return a `contact` in words."""
 
-    def weaken(self, most: Array | None) -> None:
-        """Limit the motors' torque to `most`, (joints,), N m, as if they were weak; None: they are
-        sound.
-
-        Injected faults of motors act through this. Default: they have no effect.
-        """
-
+    @abstractmethod
     def feel(self) -> Array | None:
-        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. Default: None,
-        it has none."""
-        return None
+        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. None: it has
+        none."""
 
     @abstractmethod
     def look(self, scene: Scene) -> None:
         """Fill a `SCENE` with the poses of bodies and tool."""
+
+    @abstractmethod
+    def save(self, state: ArmState) -> None:
+        """Fill an `ARM_STATE` with the state that a restarted board needs."""
+
+    @abstractmethod
+    def restore(self, state: ArmState) -> None:
+        """Continue from an `ARM_STATE`: called once, before the first `step`, on a restarted
+        board."""
 
 
 def find_arm(reference: str) -> type[DrivableArm]:

@@ -11,14 +11,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from rack.levels.algebra import Array, Mask
-from rack.levels.arm.drivable import DrivableArm, JointTarget, Link, Sensed
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import JointTarget, Link, Sensed
 from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
 from rack.levels.robot.dynamics import FRICTION_SPEED
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
-STEPS = (SensorStep, MotorStep, CommandStep)
-"""Classes of steps that act on an arm, as `Executor.faults` names them."""
 SLIGHT = 0.02
 """Part of its torque limit that a motor must lack to count, in addition to what friction and a
 contact may hide."""
@@ -32,7 +31,7 @@ class FaultyLink:
 
     def __init__(
         self,
-        arm: DrivableArm,
+        arm: BrakedArm,
         acted: dict[int, bool],
         link: Link | None = None,
         holds: Callable[[], bool] = bool,

@@ -7,7 +7,8 @@ import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
-from rack.levels.arm.drivable import DrivableArm, DriveState, Exceeded, JointTarget, Link, Sensed
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import DriveState, Exceeded, JointTarget, Link, Sensed
 from rack.levels.arm.drives import LimitGate
 from rack.levels.arm.present import PresentLink
 from rack.levels.arm.set_points import SetPointGate
@@ -55,7 +56,7 @@ class GuardedArm:
     """
 
     def __init__(
-        self, arm: DrivableArm, tick_s: float, below: Link | None = None, part: float = 1.0
+        self, arm: BrakedArm, tick_s: float, below: Link | None = None, part: float = 1.0
     ) -> None:
         """Guard an arm, sensed by the link `below`, if it has one of its own. Raises `RobotError`
         for encoders too coarse to tell a limit, velocities by `part`."""

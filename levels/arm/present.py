@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.levels.algebra import Array, solve
-from rack.levels.arm.drivable import DrivableArm, JointTarget, Link, Sensed, copied
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import JointTarget, Link, Sensed, copied
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
 
@@ -31,7 +32,7 @@ class Present(NamedTuple):
     )
 
 
-def present_link(arm: DrivableArm, tick_s: float) -> Link:
+def present_link(arm: BrakedArm, tick_s: float) -> Link:
     """Return the link to an arm through which samples are of the present: the arm, if they are."""
     encoders = arm.cell.encoders
     is_present = encoders.offset is None and not encoders.latency_ticks
@@ -47,7 +48,7 @@ class PresentLink:
     is passed on as it is.
     """
 
-    def __init__(self, arm: DrivableArm, tick_s: float) -> None:
+    def __init__(self, arm: BrakedArm, tick_s: float) -> None:
         cell = arm.cell
         self._arm = arm
         self._offset = cell.encoders.offset

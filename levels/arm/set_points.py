@@ -6,7 +6,8 @@ import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, mat_vec, solve
-from rack.levels.arm.drivable import DrivableArm, JointTarget
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import JointTarget
 from rack.levels.arm.drives import LimitGate, speed_towards
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
@@ -30,7 +31,7 @@ class SetPointGate:
     """
 
     def __init__(
-        self, arm: DrivableArm, bounds: Bounds, tick_s: float, span_s: float, last: Array
+        self, arm: BrakedArm, bounds: Bounds, tick_s: float, span_s: float, last: Array
     ) -> None:
         """Keep `bounds` for `span_s`, as later cycles may be missed; `last`, (2, joints), rad,
         rad/s, is room for the last set point."""

@@ -15,7 +15,7 @@ from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import DrivableArm, DriveState, Sensed, find_arm, preload
 from rack.levels.arm.drivable import Link
-from rack.levels.arm.faulty import STEPS, FaultyLink
+from rack.levels.faults import ARM_STEPS
 from rack.levels.level import (
     Executor,
     Fault,
@@ -63,7 +63,7 @@ class ArmDriver(Executor):
     A subclass reads its last state as "before", and writes "status", "state" and "scene".
     """
 
-    faults = STEPS
+    faults = ARM_STEPS
     params: ClassVar[type[ArmParams]] = ArmParams
     gives_set_points: ClassVar[bool] = False
     """Whether it can drive an arm by set points, too: its `torques` are then those predicted."""
@@ -85,10 +85,8 @@ class ArmDriver(Executor):
         self.cell = cell
         self.arm: DrivableArm = kind(cell, context.scene, context.clock_ns, every, context.seed)
         self.part = robot.bring_up or 1.0  # of full speed, until the operator's release
-        # The path to the arm; through `_faulty` while faults are injected.
-        self._sound: Link = self.arm.connect(context.tick_s, self.part)
-        self._link = self._sound
-        self._faulty = FaultyLink(self.arm, self.acted, self._sound, lambda: self.holds)
+        self._path = self.arm.connect(context.tick_s, self.part, self.acted, lambda: self.holds)
+        self._link: Link = self._path.sound
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
@@ -147,8 +145,8 @@ class ArmDriver(Executor):
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
-        self._faulty.inject(faults)
-        self._link = self._faulty if faults else self._sound
+        self._path.faulty.inject(faults)
+        self._link = self._path.faulty if faults else self._path.sound
 
     @abstractmethod
     def take_messages(self) -> None:
