@@ -70,10 +70,7 @@ class CollisionChecker:
         self._model = copy.copy(cell.model)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
-        self._row_geoms = [
-            np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b)
-            for b in cell.bodies
-        ]
+        self._row_geoms = [cell.parts(row) for row in range(len(cell.bodies))]
         self._offset = np.zeros(7)  # pose of the held object in the tool's frame: m; w, x, y, z
         # Fingers that swing may reach farther than open as they close: a load is planned with them
         # so.

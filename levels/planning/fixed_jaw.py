@@ -61,10 +61,9 @@ class FixedJaw:
         address = self._cell.object_qpos[row]
         data.qpos[address : address + 7] = np.concatenate(at)
         mujoco.mj_kinematics(model, data)
-        parts = np.flatnonzero(model.body_rootid[model.geom_bodyid] == self._cell.bodies[row])
         distances = [
             mujoco.mj_geomDistance(model, data, int(part), int(geom), FARTHEST_M, None)
-            for part in parts
+            for part in self._cell.parts(row)
             for geom in self._geoms
         ]
         return max(0.0, float(min(distances)))

@@ -50,10 +50,6 @@ class Payloads:
         self._dynamics = Dynamics(cell)
         self._data = cell.start()
         self._rest = np.zeros(len(cell.home))
-        model = cell.model
-        self._objects = [
-            np.flatnonzero(model.body_rootid[model.geom_bodyid] == body) for body in cell.bodies
-        ]
         self.jaws = self._closing()
 
     def check_grip(self, row: int, grip: Pose) -> None:
@@ -103,7 +99,7 @@ class Payloads:
         most = float(model.actuator_forcerange[gripper.actuator, 1])
         force = min(most, gripper.stiffness * abs(narrow.opening - gripper.closed))
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
-        parts = self._objects[row]
+        parts = self._cell.parts(row)
         return normal * sum(
             max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms
         )
@@ -117,7 +113,7 @@ class Payloads:
         tool = pose(*site_pose(data, cell.tool))
         data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
-        parts = self._objects[row]
+        parts = self._cell.parts(row)
         return sum(
             RAY_RANGE_M - self._nearest(parts, RAY_RANGE_M * side, -side)[0] for side in SIDES
         )

@@ -87,6 +87,11 @@ class Cell:
         mujoco.mj_forward(self.model, data)
         return data
 
+    def parts(self, row: int) -> Ints:
+        """Return the geoms of an object or obstacle, by its row in `bodies`."""
+        model = self.model
+        return np.flatnonzero(model.body_rootid[model.geom_bodyid] == self.bodies[row])
+
 
 def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     """Build the cell; one tick of `clock_ns` is `robot.substeps` MuJoCo steps. Each caller gets a

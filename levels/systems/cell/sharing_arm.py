@@ -8,7 +8,6 @@ import numpy as np
 from rack.levels.algebra import Array, Mask
 from rack.levels.arm.simulated import SimulatedArm
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.lookup import below, geoms_of
 from rack.levels.tables import SceneConfig
 
 POSE = 7
@@ -36,9 +35,7 @@ class SharingArm(SimulatedArm):
     def is_touched(self, row: int) -> bool:
         """Return whether the gripper touches an object."""
         if row not in self._parts:
-            model = self._model
-            parts = geoms_of(model, below(model, self.cell.bodies[[row]]))
-            self._parts[row] = np.isin(np.arange(model.ngeom), parts)
+            self._parts[row] = np.isin(np.arange(self._model.ngeom), self.cell.parts(row))
         pairs = self._data.contact.geom
         return bool((self._in_hand[pairs].any(axis=1) & self._parts[row][pairs].any(axis=1)).any())
 
