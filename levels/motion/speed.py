@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,12 +20,6 @@ MIN_ACCELERATION_PART = 1e-6
 """Acceleration or jerk below this part of the speed, in 1/s or 1/s2, counts as none."""
 SMALLEST_LINEAR_TERM = 1e-12
 """A cubic with a smaller linear coefficient is solved without it."""
-
-
-def braking_limits(limits: Limits, factor: float) -> Limits:
-    """Return the limits of a hold, `factor` times the acceleration and jerk: planned motion on a
-    curve may use all."""
-    return replace(limits, acceleration=factor * limits.acceleration, jerk=factor * limits.jerk)
 
 
 class SpeedLimits(NamedTuple):
@@ -51,28 +44,22 @@ def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits
     acceleration = limits.acceleration
     jerk = limits.jerk
     curved = bool(second.any())
-    speed = _least(velocity, first)
+    speed = least_ratio(velocity, first)
     if curved:
         speed = min(
             speed,
-            share * math.sqrt(_least(acceleration, second)),
-            share * math.cbrt(_least(jerk, third)),
+            share * math.sqrt(least_ratio(acceleration, second)),
+            share * math.cbrt(least_ratio(jerk, third)),
         )
     left = np.maximum(acceleration - second * speed**2, 0.0)
     left_jerk = np.maximum(jerk - third * speed**3, 0.0)
-    most = _least(left, first)
+    most = least_ratio(left, first)
     if curved:
-        most = min(most, 0.5 * _least(left_jerk, 3.0 * second * speed))
-    change = _least(np.maximum(left_jerk - 3.0 * second * speed * most, 0.0), first)
+        most = min(most, 0.5 * least_ratio(left_jerk, 3.0 * second * speed))
+    change = least_ratio(np.maximum(left_jerk - 3.0 * second * speed * most, 0.0), first)
     if min(most, change) < MIN_ACCELERATION_PART * speed:
         return SpeedLimits(speed, 0.0, 0.0)
     return SpeedLimits(speed, most, change)
-
-
-def acceleration_room(first: Array, limits: Limits) -> tuple[float, float]:
-    """Return the acceleration and jerk of s that the joints have on a straight line with |q'| =
-    `first`."""
-    return _least(limits.acceleration, first), _least(limits.jerk, first)
 
 
 def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
@@ -106,7 +93,7 @@ def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> 
     return speeds
 
 
-def _least(room: Array, rate: Array) -> float:
+def least_ratio(room: Array, rate: Array) -> float:
     """Return the least room / rate over the joints that move; infinite when none does."""
     return float(np.divide(room, rate, out=np.full(len(rate), np.inf), where=rate > 0.0).min())
 

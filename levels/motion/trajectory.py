@@ -14,7 +14,7 @@ import ruckig
 from rack.levels.algebra import Array
 from rack.levels.messages import SECTIONS_A_LINE
 from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath, PathBounds
-from rack.levels.motion.speed import SpeedLimits, acceleration_room, boundary_speeds, speed_limits
+from rack.levels.motion.speed import SpeedLimits, boundary_speeds, least_ratio, speed_limits
 from rack.levels.robot.limits import Limits
 
 SHARES = (1.0, 0.9, 0.75, 0.6)
@@ -115,7 +115,9 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
     """
     if state.ds < MAX_REST_RAD_S:
         return _joined([], state.s)
-    most, jerk = acceleration_room(path.bounds.first[path.pieces_at(state.s)], limits)
+    rate = path.bounds.first[path.pieces_at(state.s)]
+    most = least_ratio(limits.acceleration, rate)
+    jerk = least_ratio(limits.jerk, rate)
     # After a stop the path continues in another direction: the motion must rest there.
     end = (
         next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD

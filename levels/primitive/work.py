@@ -6,7 +6,7 @@ arm has settled. A gripper segment is done when the gripper rests.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,6 @@ from pydantic import Field
 from rack.levels.algebra import Array
 from rack.levels.messages import DrivenArm, Error, WorldState
 from rack.levels.motion.path import BlendedPath
-from rack.levels.motion.speed import braking_limits
 from rack.levels.motion.trajectory import Trajectory
 from rack.levels.primitive.guard import Guard
 from rack.levels.primitive.path_motion import PathMotion
@@ -75,8 +74,12 @@ class WorkRules:
 
     @property
     def braking(self) -> Limits:
-        """Limits of a hold."""
-        return braking_limits(self.limits, self.params.braking)
+        """Limits of a hold: planned motion on a curve may use all of its own."""
+        planned = self.limits
+        factor = self.params.braking
+        return replace(
+            planned, acceleration=factor * planned.acceleration, jerk=factor * planned.jerk
+        )
 
     def cycles(self, time_s: float) -> int:
         """Return the cycles that fill `time_s`."""
