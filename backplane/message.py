@@ -115,6 +115,11 @@ def field(
     return Declaration(kind, unit, doc, sizes, length, default)
 
 
+def integer(doc: str, kind: str = "u4") -> Any:
+    """Declare a field that counts or numbers something, by a pure number of an integer type."""
+    return field(kind, unit="1", doc=doc)
+
+
 def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
     """Return a message class whose fields a config decides: integers, and groups.
 

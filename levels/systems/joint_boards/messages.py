@@ -21,7 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import field
-from rack.levels.messages import DrivenArm, JointCommand, ServoStatus
+from rack.levels.messages import DrivenArm, JointCommand, ServoStatus, per_joint
 from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 
@@ -32,15 +32,11 @@ class JointReference(RelayedCommand, version=1):
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
     )
-    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    acceleration: np.ndarray = field(unit="rad/s2", doc="joint accelerations", shape="joints")
-    inertia: np.ndarray = field(
-        unit="kg m2", doc="diagonal of the joint-space inertia there", shape="joints"
-    )
-    load: np.ndarray = field(
-        unit="N m", doc="torques of gravity and motion there, without acceleration", shape="joints"
-    )
+    position: np.ndarray = per_joint("rad", "joint positions")
+    velocity: np.ndarray = per_joint("rad/s", "joint velocities")
+    acceleration: np.ndarray = per_joint("rad/s2", "joint accelerations")
+    inertia: np.ndarray = per_joint("kg m2", "diagonal of the joint-space inertia there")
+    load: np.ndarray = per_joint("N m", "torques of gravity and motion there, without acceleration")
     opening: float = field(unit="m", doc="gripper joint position to go to")
     force: float = field(unit="N", doc="largest gripper force")
     payload_mass: float = field(
@@ -59,15 +55,11 @@ class JointTorque(SampledCommand, version=1):
     sampled: int = field(
         unit="tick", doc="tick of the arm's status that it rests on; -1: none yet, so no torque"
     )
-    torque: np.ndarray = field(
-        unit="N m", doc="of the board's own joints; others 0", shape="joints"
+    torque: np.ndarray = per_joint("N m", "of the board's own joints; others 0")
+    target: np.ndarray = per_joint(
+        "rad", "where the board wants its own joints when the torque acts; others 0"
     )
-    target: np.ndarray = field(
-        unit="rad",
-        doc="where the board wants its own joints when the torque acts; others 0",
-        shape="joints",
-    )
-    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
+    target_velocity: np.ndarray = per_joint("rad/s", "likewise")
     grip_force: float = field(
         unit="N", doc="of the gripper, from the board that drives it; others 0"
     )
@@ -82,18 +74,12 @@ class JointTorque(SampledCommand, version=1):
 class JointStatus(AnsweringStatus, version=1):
     """From a board that servoes joints to the trajectory level."""
 
-    position: np.ndarray = field(
-        unit="rad", doc="joint positions, from the arm's status", shape="joints"
+    position: np.ndarray = per_joint("rad", "joint positions, from the arm's status")
+    target: np.ndarray = per_joint(
+        "rad", "set point of the board's own joints in this cycle; others 0"
     )
-    target: np.ndarray = field(
-        unit="rad",
-        doc="set point of the board's own joints in this cycle; others 0",
-        shape="joints",
-    )
-    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
-    torque: np.ndarray = field(
-        unit="N m", doc="of the board's own joints; others 0", shape="joints"
-    )
+    target_velocity: np.ndarray = per_joint("rad/s", "likewise")
+    torque: np.ndarray = per_joint("N m", "of the board's own joints; others 0")
     driven: np.ndarray = field(
         "u1", unit="1", doc="1: the joint is one of this board's", shape="joints"
     )

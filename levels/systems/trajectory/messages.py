@@ -7,7 +7,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import Message, field, integer
+from rack.levels.messages import per_joint
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 HELD = 16
@@ -50,17 +51,15 @@ class MotionRequest(RelayedCommand, version=1):
     is a repetition."""
 
     kind: MotionKind = field(doc="what to do")
-    joints: np.ndarray = field(unit="rad", doc="goal of JOINTS", shape="joints")
+    joints: np.ndarray = per_joint("rad", "goal of JOINTS")
     position: np.ndarray = field(
         unit="m", doc="goal of POSE: tool position, in the frame of `body`", shape=3
     )
     quaternion: np.ndarray = field(
         unit="1", doc="goal of POSE: tool orientation, in the frame of `body`", shape=4
     )
-    body: int = field(
-        "i2",
-        unit="1",
-        doc="row of the body in the world model in whose frame the goal is; -1: the world",
+    body: int = integer(
+        "row of the body in the world model in whose frame the goal is; -1: the world", "i2"
     )
     live: bool = field(
         doc="1: the goal follows the body; 0: its frame is copied when the request begins"
@@ -89,16 +88,16 @@ class MotionState(Message, version=1):
         MotionRequest,
         doc="the request at whose goal the arm is, or to which it goes; id 0: none",
     )
-    count: int = field("u2", unit="1", doc="requests that follow")
+    count: int = integer("requests that follow", "u2")
     requests: np.ndarray = field(MotionRequest, doc="taken and not ended, oldest first", shape=HELD)
 
 
 class MotionStatus(AnsweringStatus, version=1):
     """Status of a trajectory level."""
 
-    taken: int = field("u4", unit="1", doc="newest request taken from the queue; 0: none yet")
-    current: int = field("u4", unit="1", doc="request under way; 0: none")
-    done: int = field("u4", unit="1", doc="newest request ended, however; 0: none yet")
+    taken: int = integer("newest request taken from the queue; 0: none yet")
+    current: int = integer("request under way; 0: none")
+    done: int = integer("newest request ended, however; 0: none yet")
     ended: np.ndarray = field(
         "u4", unit="1", doc="ids of the last requests ended, newest first; 0: none", shape=ENDED
     )
@@ -107,10 +106,8 @@ class MotionStatus(AnsweringStatus, version=1):
         unit="1", doc="part of the current request's time that has passed, 0 to 1"
     )
     resting: bool = field(doc="1: commanded velocity is zero")
-    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
-    velocity: np.ndarray = field(
-        unit="rad/s", doc="joint velocities commanded last", shape="joints"
-    )
+    position: np.ndarray = per_joint("rad", "joint positions commanded last")
+    velocity: np.ndarray = per_joint("rad/s", "joint velocities commanded last")
     tool: np.ndarray = field(unit="m", doc="tool position commanded last", shape=3)
     astray: float = field(
         unit="m", doc="distance of that from a live goal, once reached; 0: there is none"
