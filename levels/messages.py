@@ -1,7 +1,7 @@
 """The messages of the default rack: commands go down, statuses come up, plans stay within a level.
 
 Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (of a simulated
-cell, see `rack.levels.robot.state`). Quaternions are w, x, y, z. Poses are in the world frame.
+cell, see `rack.levels.robot.engine`). Quaternions are w, x, y, z. Poses are in the world frame.
 Simulated time is tick times the clock's period.
 """
 
@@ -340,7 +340,7 @@ class ArmState(Message, version=3):
     error: Error = field("u2", doc="latched fault; 0: none")
     reason: str = field(doc="that fault, readable")
     state: np.ndarray = field(
-        unit="", doc="of the simulated cell, see rack.levels.robot.state", shape="state"
+        unit="", doc="of the simulated cell, see rack.levels.robot.engine", shape="state"
     )
 
 

@@ -18,9 +18,8 @@ from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
 from rack.levels.messages import ArmState, Scene
 from rack.levels.robot.cell import Cell, unintended_contacts
-from rack.levels.robot.engine import INTEGRATION, mj_update_sleep
+from rack.levels.robot.engine import SLEEP, mj_update_sleep, view_state
 from rack.levels.robot.lookup import geom_name
-from rack.levels.robot.state import SLEEP, view_state
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
@@ -280,13 +279,6 @@ def sleeping(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
     if not (lingers or scene.motion or tendons.any() or model.nflex):
         option.enableflags |= SLEEP
     return found
-
-
-def save_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Fill `state`, (state_size,)."""
-    trees = state.size - model.ntree
-    mujoco.mj_getState(model, data, state[:trees], INTEGRATION)
-    state[trees:] = data.tree_asleep
 
 
 def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:

@@ -87,37 +87,6 @@ def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
     return tool
 
 
-def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: Mask) -> int | None:
-    """Return the id of the gripper's joint; None: the arm has no gripper. Raises `RobotError`."""
-    if robot.gripper is None:
-        return None
-    name = robot.gripper.joint
-    joint = find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
-    if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
-        raise RobotError(
-            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the"
-            " arm's own"
-        )
-    return joint
-
-
-def hand(model: mujoco.MjModel, gripper: int | None, arm: Ints) -> Mask:
-    """Mark (nbody,) the body that carries the gripper's linkage, and its descendants.
-
-    The driven joint may be anywhere in the linkage; the joints `arm` are not part of it.
-    """
-    if gripper is None:
-        return np.zeros(model.nbody, dtype=bool)
-    body = model.jnt_bodyid[gripper]
-    while (
-        (parent := model.body_parentid[body])
-        and model.body_jntnum[parent]
-        and parent not in model.jnt_bodyid[arm]
-    ):
-        body = parent
-    return below(model, model.body_parentid[[body]])
-
-
 def free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the ids of the objects' free joints. Raises `RobotError` for a body without one."""
     joints = model.body_jntadr[bodies]
