@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import Connection
+from rack.levels.arm.drivable import ArmLinks
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm, kept_bounds
 from rack.levels.arm.present import present_link
@@ -41,12 +41,12 @@ class Arm(BrakedArm):
 
     def connect(
         self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
-    ) -> Connection:
+    ) -> ArmLinks:
         """Return the path that the servo level drives it through; see `DrivableArm.connect`."""
         link = present_link(self, tick_s)
         if not self.keeps_limits:
             link = self._guard = GuardedArm(self, tick_s, link, part)
-        return Connection(link, FaultyLink(self, acted, link, holds))
+        return ArmLinks(link, FaultyLink(self, acted, link, holds))
 
     def permit(self, part: float) -> None:
         """Let the path keep velocities within another `part` of their limits."""

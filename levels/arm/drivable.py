@@ -81,7 +81,7 @@ class FaultyPath(Link, Protocol):
         """Replace the active faults."""
 
 
-class Connection(NamedTuple):
+class ArmLinks(NamedTuple):
     """The path between the servo level and an arm, in use without and with injected faults."""
 
     sound: Link
@@ -131,7 +131,7 @@ class DrivableArm(ABC):
     @abstractmethod
     def connect(
         self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
-    ) -> Connection:
+    ) -> ArmLinks:
         """Return the path that the servo level drives it through.
 
         Args:

@@ -9,9 +9,8 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.drivable import DriveState, Exceeded, JointTarget, Link, Sensed
-from rack.levels.arm.drives import LimitGate
+from rack.levels.arm.drives import LimitGate, SetPointGate
 from rack.levels.arm.present import PresentLink
-from rack.levels.arm.set_points import SetPointGate
 from rack.levels.errors import RobotError
 from rack.levels.level import Finding
 from rack.levels.messages import Error

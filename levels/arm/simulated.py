@@ -11,9 +11,8 @@ import numpy as np
 from rack.levels.algebra import Array, mat_vec
 from rack.levels.arm.arm import Arm
 from rack.levels.arm.drivable import JointTarget, Sensed, copied
-from rack.levels.arm.drives import LimitGate
+from rack.levels.arm.drives import LimitGate, SetPointGate
 from rack.levels.arm.sensors import CoarseSensors, WristSensor
-from rack.levels.arm.set_points import SetPointGate
 from rack.levels.arm.simulation import Simulation
 from rack.levels.level import Finding
 from rack.levels.messages import ArmState

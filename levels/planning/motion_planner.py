@@ -15,11 +15,10 @@ from rack.levels.motion import path as paths
 from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.planning import collision, path_planner
 from rack.levels.planning.collision import CollisionChecker
-from rack.levels.planning.fixed_jaw import find_fixed_jaw
 from rack.levels.planning.ik import SAME_RAD, InverseKinematics
 from rack.levels.planning.moves import VERB_NAMES, Move, Situation
 from rack.levels.planning.path_planner import MAX_SEARCHES, FirstBlocked, PathPlanner
-from rack.levels.planning.payload import Payloads
+from rack.levels.planning.payload import Payloads, find_fixed_jaw
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig

@@ -10,13 +10,16 @@ import pytest
 
 from rack.levels.messages import SECTIONS, WAYPOINTS
 from rack.levels.motion.path import BlendedPath, PathBounds
-from rack.levels.motion.speed import (
+from rack.levels.motion.trajectory import (
+    PathState,
     SpeedLimits,
+    Trajectory,
     boundary_speeds,
+    make_stop,
+    make_trajectory,
     reachable_speed,
     speed_limits,
 )
-from rack.levels.motion.trajectory import PathState, Trajectory, make_stop, make_trajectory
 from tests.levels.arms import cell
 
 EXACT = 1e-6
