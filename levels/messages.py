@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any, Protocol
 
-import numpy as np
+from numpy import ndarray
 
 from rack.backplane.message import Message, field, integer
 from rack.backplane.words import Demand
@@ -92,9 +92,9 @@ class ElementalMove(Message, version=1):
     action: int = integer("index of the program's action that it serves", "u2")
     verb: Verb = field(doc="what to do")
     object: int = integer("row of the object concerned in the world model; -1: none", "i2")
-    position: np.ndarray = field(unit="m", doc="tool position at the end", shape=3)
-    quaternion: np.ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
-    joints: np.ndarray = per_joint("rad", "where MOVE_JOINTS ends; with `posture`, near the end")
+    position: ndarray = field(unit="m", doc="tool position at the end", shape=3)
+    quaternion: ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
+    joints: ndarray = per_joint("rad", "where MOVE_JOINTS ends; with `posture`, near the end")
     posture: bool = field(
         doc="1: of the configurations at the pose, the one nearest to `joints` is wanted"
     )
@@ -109,7 +109,7 @@ class TaskPlan(Message, version=1):
     reason: str = field(doc="the refusal, readable")
     earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
     count: int = integer("moves that follow", "u2")
-    moves: np.ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
+    moves: ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
 
 
 class TaskCommand(RelayedCommand, version=2):
@@ -117,7 +117,7 @@ class TaskCommand(RelayedCommand, version=2):
 
     hold: bool = field(doc="1: ramp to rest and stay, whatever is under way")
     count: int = integer("moves that follow; id is the newest one's", "u2")
-    moves: np.ndarray = field(ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW)
+    moves: ndarray = field(ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW)
 
 
 class TaskStatus(AnsweringStatus, version=2):
@@ -143,11 +143,11 @@ class MoveStatus(AnsweringStatus, version=3):
     verb: Verb = field(doc="of the move under way")
     held: int = integer("row of the object in the gripper; -1: none", "i2")
     planned: int = integer("newest elemental move whose path is ready; 0: none yet")
-    end: np.ndarray = per_joint("rad", "joint positions at the end of that path")
+    end: ndarray = per_joint("rad", "joint positions at the end of that path")
     replan: int = integer(
         "open request to plan the current move anew from `start`; 0: none is open"
     )
-    start: np.ndarray = per_joint("rad", "joint positions where that motion holds")
+    start: ndarray = per_joint("rad", "joint positions where that motion holds")
     replans: int = integer("plans made anew because something was in the way")
     operated: bool = OPERATED
     resting: bool = field(
@@ -164,10 +164,10 @@ class MovePlan(Message, version=1):
     reason: str = field(doc="the error, readable")
     kind: SegmentKind = field(doc="path or gripper")
     count: int = integer("waypoints that follow", "u2")
-    waypoints: np.ndarray = field(
+    waypoints: ndarray = field(
         unit="rad", doc="collision-free path in joint space", shape=(WAYPOINTS, "joints")
     )
-    blend: np.ndarray = field(
+    blend: ndarray = field(
         unit="rad",
         doc="length over which corner k is rounded, before and after it",
         shape=WAYPOINTS,
@@ -183,14 +183,12 @@ class MoveSegment(Message, version=1, message="segment"):
     object: int = integer("object held, or to be grasped; -1: none", "i2")
     touch: bool = field(doc="1: the object may touch supports and fingers (approach, depart)")
     count: int = integer("waypoints that follow", "u2")
-    waypoints: np.ndarray = field(
+    waypoints: ndarray = field(
         unit="rad",
         doc="path in joint space, from where the motion starts",
         shape=(WAYPOINTS, "joints"),
     )
-    blend: np.ndarray = field(
-        unit="rad", doc="length over which corner k is rounded", shape=WAYPOINTS
-    )
+    blend: ndarray = field(unit="rad", doc="length over which corner k is rounded", shape=WAYPOINTS)
     by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to, for GRIPPER")
     force: float = field(unit="N or N m", doc="largest gripper force on the way and afterwards")
@@ -201,7 +199,7 @@ class MoveCommand(RelayedCommand, version=2):
 
     hold: bool = field(doc="1: ramp to rest on the path and stay")
     count: int = integer("segments that follow; id is the newest one's", "u2")
-    segments: np.ndarray = field(MoveSegment, doc="segments to do, oldest first", shape=SEGMENTS)
+    segments: ndarray = field(MoveSegment, doc="segments to do, oldest first", shape=SEGMENTS)
 
 
 class PrimitiveStatus(AnsweringStatus, version=3):
@@ -215,7 +213,7 @@ class PrimitiveStatus(AnsweringStatus, version=3):
     operated: bool = OPERATED
     held: int = integer("row of the object in the gripper; -1: none", "i2")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
-    position: np.ndarray = per_joint("rad", "joint positions commanded last")
+    position: ndarray = per_joint("rad", "joint positions commanded last")
     earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
     ends: float = field(
         unit="s", doc="simulated time at which the segment under way should be done; 0: not known"
@@ -238,7 +236,7 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
         unit="s", doc="simulated time at which the segment could be done at the earliest"
     )
     count: int = integer("sections that follow", "u2")
-    sections: np.ndarray = field(
+    sections: ndarray = field(
         unit="s, 1, 1/s, 1/s2, 1/s3",
         doc="start, s, ds, dds, jerk of the path parameter",
         shape=(SECTIONS, 5),
@@ -251,9 +249,9 @@ class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
     )
-    position: np.ndarray = per_joint("rad", "joint positions")
-    velocity: np.ndarray = per_joint("rad/s", "joint velocities")
-    acceleration: np.ndarray = per_joint("rad/s2", "joint accelerations")
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to")
     force: float = field(unit="N or N m", doc="largest gripper force")
     held: int = integer("row of the object in the gripper; -1: none", "i2")
@@ -263,8 +261,8 @@ class ArmSetPoint(Protocol):
     """What the servo level takes of a set point, of whichever message: see `JointCommand`."""
 
     due: int
-    position: np.ndarray
-    velocity: np.ndarray
+    position: ndarray
+    velocity: ndarray
     opening: float
     force: float
 
@@ -272,30 +270,26 @@ class ArmSetPoint(Protocol):
 class ServoPlan(Message, version=1):
     """From the planner of the servo level to its executor: the inertia of arm and load."""
 
-    inertia: np.ndarray = field(
+    inertia: ndarray = field(
         unit="kg m2",
         doc="joint-space inertia, the object held included",
         shape=("joints", "joints"),
     )
     held: int = integer("object included; -1: none", "i2")
     payload_mass: float = field(unit="kg", doc="mass in the gripper")
-    payload_offset: np.ndarray = field(
-        unit="m", doc="its centre, in the frame of the tool", shape=3
-    )
+    payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
 
 class DrivenArm(AnsweringStatus):
     """Fields of the status of a level that drives an arm."""
 
-    position: np.ndarray = per_joint(
-        "rad", "joint positions, measured; estimated for suspect sensors"
-    )
-    velocity: np.ndarray = per_joint("rad/s", "joint velocities, likewise")
-    torque: np.ndarray = per_joint(
+    position: ndarray = per_joint("rad", "joint positions, measured; estimated for suspect sensors")
+    velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
+    torque: ndarray = per_joint(
         "N m", "torque given to the arm in this cycle, after the limit gate"
     )
-    target: np.ndarray = per_joint("rad", "where the joints are wanted in this cycle")
-    target_velocity: np.ndarray = per_joint("rad/s", "likewise")
+    target: ndarray = per_joint("rad", "where the joints are wanted in this cycle")
+    target_velocity: ndarray = per_joint("rad/s", "likewise")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
     opening_velocity: float = field(unit="m/s or rad/s", doc="gripper joint velocity, measured")
     grip_force: float = field(unit="N or N m", doc="force given to the gripper")
@@ -329,17 +323,17 @@ class ArmState(Message, version=3):
     struck: int = field("i4", unit="tick", doc="ticks for which the motion is still that of a blow")
     waited: int = field("i4", unit="tick", doc="ticks since the last command")
     braked: bool = field(doc="1: the brakes are engaged")
-    rest: np.ndarray = per_joint("rad", "where engaged brakes hold the joints")
-    position: np.ndarray = per_joint("rad", "joint positions as the servo level estimates them")
-    velocity: np.ndarray = per_joint("rad/s", "joint velocities, likewise")
-    doubt: np.ndarray = per_joint("rad", "largest error of those positions")
+    rest: ndarray = per_joint("rad", "where engaged brakes hold the joints")
+    position: ndarray = per_joint("rad", "joint positions as the servo level estimates them")
+    velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
+    doubt: ndarray = per_joint("rad", "largest error of those positions")
     kept: int = field(
         unit="tick",
         doc="ticks for which faults have kept the arm from its set points: see ArmParams.patience",
     )
     error: Error = field("u2", doc="latched fault; 0: none")
     reason: str = field(doc="that fault, readable")
-    state: np.ndarray = field(
+    state: ndarray = field(
         unit="", doc="of the simulated cell, see rack.levels.robot.engine", shape="state"
     )
 
@@ -347,10 +341,10 @@ class ArmState(Message, version=3):
 class Scene(Message, version=1):
     """Bodies and tool as sensed."""
 
-    position: np.ndarray = field(unit="m", doc="body origins as sensed", shape=("bodies", 3))
-    quaternion: np.ndarray = field(unit="1", doc="body orientations as sensed", shape=("bodies", 4))
-    tool_position: np.ndarray = field(unit="m", doc="tool as sensed", shape=3)
-    tool_quaternion: np.ndarray = field(unit="1", doc="tool as sensed", shape=4)
+    position: ndarray = field(unit="m", doc="body origins as sensed", shape=("bodies", 3))
+    quaternion: ndarray = field(unit="1", doc="body orientations as sensed", shape=("bodies", 4))
+    tool_position: ndarray = field(unit="m", doc="tool as sensed", shape=3)
+    tool_quaternion: ndarray = field(unit="1", doc="tool as sensed", shape=4)
 
 
 class WorldState(Message, version=1, message="world_model"):
@@ -359,7 +353,7 @@ class WorldState(Message, version=1, message="world_model"):
     revision: int = integer(
         "rises when a body starts to move and when it rests again; 0: nothing sensed"
     )
-    position: np.ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))
-    quaternion: np.ndarray = field(unit="1", doc="body orientations", shape=("bodies", 4))
-    velocity: np.ndarray = field(unit="m/s", doc="body velocities, estimated", shape=("bodies", 3))
+    position: ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))
+    quaternion: ndarray = field(unit="1", doc="body orientations", shape=("bodies", 4))
+    velocity: ndarray = field(unit="m/s", doc="body velocities, estimated", shape=("bodies", 3))
     sensed: int = field(unit="tick", doc="cycle in which the newest scene was taken over")

@@ -103,7 +103,13 @@ class MotionPlanner:
         """Return the configuration at the end of a free motion, with the checker as it is set.
         Raises `Refused`."""
         if move.verb is Verb.MOVE_JOINTS:
-            self._check_limits(move)
+            low, high = self.cell.limits.position.T
+            beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
+            if beyond.size:
+                j = int(beyond[0])
+                where = f"joint '{self.cell.joints[j]}' to {move.joints[j]:.4g} rad"
+                valid = f"valid: {low[j]:.4g} to {high[j]:.4g}"
+                raise Refused(Error.UNREACHABLE, f"{where}; {valid}")
             return move.joints
         if move.posture:
             near = self.ik.nearby(move.tool, move.joints)
@@ -161,14 +167,6 @@ class MotionPlanner:
         arm."""
         room = self.checker.room(start)
         return self.clearance if room >= self.clearance else max(CLOSE_PART * room, 0.0)
-
-    def _check_limits(self, move: Move) -> None:
-        low, high = self.cell.limits.position.T
-        beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
-        if beyond.size:
-            j = int(beyond[0])
-            where = f"joint '{self.cell.joints[j]}' to {move.joints[j]:.4g} rad"
-            raise Refused(Error.UNREACHABLE, f"{where}; valid: {low[j]:.4g} to {high[j]:.4g}")
 
 
 def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:

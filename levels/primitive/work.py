@@ -85,10 +85,6 @@ class WorkRules:
         """Return the cycles that fill `time_s`."""
         return max(1, round(time_s / self.period_s))
 
-    def quiet(self) -> Quiet:
-        """Return a new count of settled cycles."""
-        return Quiet(self.params.settled_cycles, self.cycles(self.params.settling))
-
     @property
     def latency_s(self) -> float:
         """Time from the end of a trajectory until its segment is reported done, in s."""
@@ -99,9 +95,9 @@ class Quiet:
     """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it
     will never settle."""
 
-    def __init__(self, wanted_cycles: int, most_cycles: int) -> None:
-        self._wanted_cycles = wanted_cycles
-        self._most_cycles = most_cycles
+    def __init__(self, rules: WorkRules) -> None:
+        self._wanted_cycles = rules.params.settled_cycles
+        self._most_cycles = rules.cycles(rules.params.settling)
         self._quiet = 0
         self._cycles = 0
 
@@ -143,7 +139,7 @@ class PathWork:
         self.unplanned_cycles = 0  # consecutive cycles in which the motion waits for a trajectory
         self._guard = guard
         self._rules = rules
-        self._quiet = rules.quiet()
+        self._quiet = Quiet(rules)
         self._clear_cycles = 0
         self._fresh = True
 
@@ -162,7 +158,7 @@ class PathWork:
         """
         self._fresh = False
         self._clear_cycles = 0
-        self._quiet = self._rules.quiet()
+        self._quiet = Quiet(self._rules)
         away = self.motion.rest_near(position, progress)
         self.astray = self.blocked = away > self._rules.params.astray
         self.obstacle = f"the arm is {away:.3f} rad off its path"
@@ -265,7 +261,7 @@ class GripperWork:
         """Start waiting until the gripper rests: at the start, and when the servo is back in
         step."""
         self._cycles = 0
-        self._quiet = self._rules.quiet()
+        self._quiet = Quiet(self._rules)
 
     @property
     def held_after(self) -> int:

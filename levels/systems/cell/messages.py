@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Annotated
 
-import numpy as np
+from numpy import ndarray
 from pydantic import StringConstraints
 
 from rack.backplane.message import Command, Message, Status, field, integer
@@ -71,16 +71,16 @@ class CellAction(Message):
     action: OrderAction = field(doc="what to do")
     object: str = field(f"S{OBJECT_BYTES}", doc="object of a transfer")
     goal: Goal = field(doc="form of a goto's goal: joints, pose or direction")
-    position: np.ndarray = field(
+    position: ndarray = field(
         unit="m", doc="where a transfer takes the object's origin, or a goto the tool", shape=3
     )
     turned: bool = field(doc="1: a transfer turns the object to `yaw`; 0: any turn")
     yaw: float = field(unit="rad", doc="turn of the object's x axis about the vertical")
     lift: float = field(unit="m", doc="height of a transfer's straight motions")
-    quaternion: np.ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
-    direction: np.ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
+    quaternion: ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
+    direction: ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
     count: int = integer("joints that follow", "u1")
-    joints: np.ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
+    joints: ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
     by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
 
 
@@ -134,7 +134,7 @@ class RequestHead(Message):
         doc=("simulated time of the rack that gave the order, in which `by` is, less that here"),
     )
     revision: int = integer("of the world model then")
-    start: np.ndarray = per_joint("rad", "where the arm rested then")
+    start: ndarray = per_joint("rad", "where the arm rested then")
 
 
 class CellRequest(RequestHead, CellAction, version=1):

@@ -12,7 +12,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Any
 
-import numpy as np
+from numpy import ndarray
 
 from rack.backplane.message import Message, field, integer
 from rack.levels.operator import AnsweringStatus, RelayedCommand
@@ -31,10 +31,10 @@ class Wrench(Message, version=1):
     """From the board of an arm with a wrist sensor, in every cycle."""
 
     tick: int = field(unit="tick", doc="tick at which it was sensed")
-    wrench: np.ndarray = per_axis(
+    wrench: ndarray = per_axis(
         "N, N m", "of the contact, at the tool, in the world's frame, without weights"
     )
-    sample: np.ndarray = per_axis("N, N m", "as the sensor gives it, in the sensor's frame")
+    sample: ndarray = per_axis("N, N m", "as the sensor gives it, in the sensor's frame")
     saturated: bool = field(doc="1: the sensor is at the end of its range")
     exceeded: int = integer("cycles in which the contact was beyond the arm's force limits")
 
@@ -42,17 +42,17 @@ class Wrench(Message, version=1):
 class TaskContact(Message):
     """What is wanted of a contact, by axis of the task frame."""
 
-    frame: np.ndarray = field(
+    frame: ndarray = field(
         unit="1", doc="orientation of the task frame in the world, w, x, y, z", shape=4
     )
-    selected: np.ndarray = per_axis("1", "1: an axis of force; 0: of motion", "u1")
-    wrench: np.ndarray = per_axis(
+    selected: ndarray = per_axis("1", "1: an axis of force; 0: of motion", "u1")
+    wrench: ndarray = per_axis(
         "N, N m", "wanted of the tool on the surroundings, on the axes of force"
     )
-    speed: np.ndarray = per_axis(
+    speed: ndarray = per_axis(
         "m/s, rad/s", "most on the axes of force, both ways; 0 in a request: the level's default"
     )
-    guard: np.ndarray = per_axis(
+    guard: ndarray = per_axis(
         "N, N m", "wrench, either way, at which motion ends; 0: the axis is not guarded"
     )
 
@@ -72,10 +72,10 @@ class ForceStatus(AnsweringStatus, version=1):
     """From the level of hybrid control to the motion server."""
 
     sensed: int = field(unit="tick", doc="tick of the wrench; -1: none yet")
-    wrench: np.ndarray = per_axis("N, N m", "of the contact, at the tool, in the task frame")
-    wanted: np.ndarray = per_axis("N, N m", "on the axes of force; others 0")
-    selected: np.ndarray = per_axis("1", "1: an axis of force", "u1")
-    offset: np.ndarray = field(
+    wrench: ndarray = per_axis("N, N m", "of the contact, at the tool, in the task frame")
+    wanted: ndarray = per_axis("N, N m", "on the axes of force; others 0")
+    selected: ndarray = per_axis("1", "1: an axis of force", "u1")
+    offset: ndarray = field(
         unit="m",
         doc="from where the motion alone would have the tool to where it is commanded",
         shape=3,
@@ -100,11 +100,11 @@ class ServerRequest(MotionRequest, TaskContact, version=1):
 class ServerState(MotionState, version=1):
     """As `MotionState`; what is in force says the level's own `Compliance`."""
 
-    goal: np.ndarray = field(
+    goal: ndarray = field(
         ServerRequest,
         doc="the request at whose goal the arm is, or to which it goes; id 0: none",
     )
-    requests: np.ndarray = field(ServerRequest, doc="taken and not ended, oldest first", shape=HELD)
+    requests: ndarray = field(ServerRequest, doc="taken and not ended, oldest first", shape=HELD)
 
 
 class Mode(IntEnum):
@@ -123,11 +123,11 @@ class ServerStatus(MotionStatus, version=1):
     """Requests as the server keeps them, from taking to end, and the contact."""
 
     mode: Mode = field(doc="motion, force, or what is left of it without a client")
-    place: np.ndarray = field(unit="m", doc="tool position as sensed", shape=3)
-    quaternion: np.ndarray = field(unit="1", doc="tool orientation as sensed, w, x, y, z", shape=4)
-    frame: np.ndarray = field(unit="1", doc="orientation of the task frame, w, x, y, z", shape=4)
-    wrench: np.ndarray = per_axis("N, N m", "of the tool on the surroundings, in the task frame")
-    wanted: np.ndarray = per_axis("N, N m", "the same as wanted, on the axes of force; others 0")
-    selected: np.ndarray = per_axis("1", "1: an axis of force", "u1")
+    place: ndarray = field(unit="m", doc="tool position as sensed", shape=3)
+    quaternion: ndarray = field(unit="1", doc="tool orientation as sensed, w, x, y, z", shape=4)
+    frame: ndarray = field(unit="1", doc="orientation of the task frame, w, x, y, z", shape=4)
+    wrench: ndarray = per_axis("N, N m", "of the tool on the surroundings, in the task frame")
+    wanted: ndarray = per_axis("N, N m", "the same as wanted, on the axes of force; others 0")
+    selected: ndarray = per_axis("1", "1: an axis of force", "u1")
     guarded: int = integer("newest request that a guard has ended; 0: none yet")
     axis: int = integer("axis on which that was; -1: none yet", "i2")

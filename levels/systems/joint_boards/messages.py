@@ -18,7 +18,7 @@ begins again where they hold the arm.
 
 from __future__ import annotations
 
-import numpy as np
+from numpy import ndarray
 
 from rack.backplane.message import field
 from rack.levels.messages import DrivenArm, JointCommand, ServoStatus, per_joint
@@ -32,19 +32,17 @@ class JointReference(RelayedCommand, version=1):
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
     )
-    position: np.ndarray = per_joint("rad", "joint positions")
-    velocity: np.ndarray = per_joint("rad/s", "joint velocities")
-    acceleration: np.ndarray = per_joint("rad/s2", "joint accelerations")
-    inertia: np.ndarray = per_joint("kg m2", "diagonal of the joint-space inertia there")
-    load: np.ndarray = per_joint("N m", "torques of gravity and motion there, without acceleration")
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
+    inertia: ndarray = per_joint("kg m2", "diagonal of the joint-space inertia there")
+    load: ndarray = per_joint("N m", "torques of gravity and motion there, without acceleration")
     opening: float = field(unit="m", doc="gripper joint position to go to")
     force: float = field(unit="N", doc="largest gripper force")
     payload_mass: float = field(
         unit="kg", doc="mass in the gripper, which `inertia` and `load` include"
     )
-    payload_offset: np.ndarray = field(
-        unit="m", doc="its centre, in the frame of the tool", shape=3
-    )
+    payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
 
 class JointTorque(SampledCommand, version=1):
@@ -55,32 +53,30 @@ class JointTorque(SampledCommand, version=1):
     sampled: int = field(
         unit="tick", doc="tick of the arm's status that it rests on; -1: none yet, so no torque"
     )
-    torque: np.ndarray = per_joint("N m", "of the board's own joints; others 0")
-    target: np.ndarray = per_joint(
+    torque: ndarray = per_joint("N m", "of the board's own joints; others 0")
+    target: ndarray = per_joint(
         "rad", "where the board wants its own joints when the torque acts; others 0"
     )
-    target_velocity: np.ndarray = per_joint("rad/s", "likewise")
+    target_velocity: ndarray = per_joint("rad/s", "likewise")
     grip_force: float = field(
         unit="N", doc="of the gripper, from the board that drives it; others 0"
     )
     payload_mass: float = field(
         unit="kg", doc="mass in the gripper, from the board that drives it; others 0"
     )
-    payload_offset: np.ndarray = field(
-        unit="m", doc="its centre, in the frame of the tool", shape=3
-    )
+    payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
 
 class JointStatus(AnsweringStatus, version=1):
     """From a board that servoes joints to the trajectory level."""
 
-    position: np.ndarray = per_joint("rad", "joint positions, from the arm's status")
-    target: np.ndarray = per_joint(
+    position: ndarray = per_joint("rad", "joint positions, from the arm's status")
+    target: ndarray = per_joint(
         "rad", "set point of the board's own joints in this cycle; others 0"
     )
-    target_velocity: np.ndarray = per_joint("rad/s", "likewise")
-    torque: np.ndarray = per_joint("N m", "of the board's own joints; others 0")
-    driven: np.ndarray = field(
+    target_velocity: ndarray = per_joint("rad/s", "likewise")
+    torque: ndarray = per_joint("N m", "of the board's own joints; others 0")
+    driven: ndarray = field(
         "u1", unit="1", doc="1: the joint is one of this board's", shape="joints"
     )
     holding: bool = field(doc="1: no fresh set point, the joints ramp to rest and stay")

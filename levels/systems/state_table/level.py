@@ -21,6 +21,7 @@ from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
     HELD_FROM_ABOVE,
+    HOLDABLE,
     AnsweringStatus,
     Commands,
     Operation,
@@ -117,7 +118,7 @@ class WordCommand(NamedTuple):
     words: str
 
 
-OPERATIONS: Commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.TABLE: ()}
+OPERATIONS: Commands = {**HOLDABLE, Operation.TABLE: ()}
 """An operator's commands to every level of this kind."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-import numpy as np
+from numpy import ndarray
 
 from rack.backplane.message import Message, field, integer
 from rack.levels.messages import per_joint
@@ -51,11 +51,11 @@ class MotionRequest(RelayedCommand, version=1):
     is a repetition."""
 
     kind: MotionKind = field(doc="what to do")
-    joints: np.ndarray = per_joint("rad", "goal of JOINTS")
-    position: np.ndarray = field(
+    joints: ndarray = per_joint("rad", "goal of JOINTS")
+    position: ndarray = field(
         unit="m", doc="goal of POSE: tool position, in the frame of `body`", shape=3
     )
-    quaternion: np.ndarray = field(
+    quaternion: ndarray = field(
         unit="1", doc="goal of POSE: tool orientation, in the frame of `body`", shape=4
     )
     body: int = integer(
@@ -84,12 +84,12 @@ class MotionState(Message, version=1):
 
     begun: bool = field(doc="1: the first of `requests` is under way")
     passed: float = field(unit="s", doc="time that it has stayed or gripped")
-    goal: np.ndarray = field(
+    goal: ndarray = field(
         MotionRequest,
         doc="the request at whose goal the arm is, or to which it goes; id 0: none",
     )
     count: int = integer("requests that follow", "u2")
-    requests: np.ndarray = field(MotionRequest, doc="taken and not ended, oldest first", shape=HELD)
+    requests: ndarray = field(MotionRequest, doc="taken and not ended, oldest first", shape=HELD)
 
 
 class MotionStatus(AnsweringStatus, version=1):
@@ -98,17 +98,17 @@ class MotionStatus(AnsweringStatus, version=1):
     taken: int = integer("newest request taken from the queue; 0: none yet")
     current: int = integer("request under way; 0: none")
     done: int = integer("newest request ended, however; 0: none yet")
-    ended: np.ndarray = field(
+    ended: ndarray = field(
         "u4", unit="1", doc="ids of the last requests ended, newest first; 0: none", shape=ENDED
     )
-    ends: np.ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
+    ends: ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
     progress: float = field(
         unit="1", doc="part of the current request's time that has passed, 0 to 1"
     )
     resting: bool = field(doc="1: commanded velocity is zero")
-    position: np.ndarray = per_joint("rad", "joint positions commanded last")
-    velocity: np.ndarray = per_joint("rad/s", "joint velocities commanded last")
-    tool: np.ndarray = field(unit="m", doc="tool position commanded last", shape=3)
+    position: ndarray = per_joint("rad", "joint positions commanded last")
+    velocity: ndarray = per_joint("rad/s", "joint velocities commanded last")
+    tool: ndarray = field(unit="m", doc="tool position commanded last", shape=3)
     astray: float = field(
         unit="m", doc="distance of that from a live goal, once reached; 0: there is none"
     )
