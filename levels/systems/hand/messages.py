@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-import numpy as np
+from numpy import ndarray
 
-from rack.backplane.message import field
+from rack.backplane.message import field, integer
 from rack.backplane.words import Demand
+from rack.levels.messages import per_joint
 from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 FLEXOR = 0
@@ -53,24 +54,22 @@ class TensionCommand(SampledCommand, version=1):
     sampled: int = field(
         unit="tick", doc="tick of the hand's status that it rests on; -1: none yet, so no tension"
     )
-    tension: np.ndarray = field(
+    tension: ndarray = field(
         unit="N", doc="of the tendons of the board's own joints", shape=(2, "joints")
     )
-    driven: np.ndarray = DRIVEN
+    driven: ndarray = DRIVEN
 
 
 class HandStatus(AnsweringStatus, version=1):
     """From the board of the hand: 16 angles and 32 tensions of the Utah/MIT hand."""
 
     tick: int = field(unit="tick", doc="tick at which the hand was sensed")
-    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    torque: np.ndarray = field(unit="N m", doc="of the tendons on the joints", shape="joints")
-    tension: np.ndarray = field(unit="N", doc="of the tendons, as sensed", shape=(2, "joints"))
-    wanted: np.ndarray = field(
-        unit="N", doc="tensions commanded of the valves", shape=(2, "joints")
-    )
-    force: np.ndarray = field(
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    torque: ndarray = per_joint("N m", "of the tendons on the joints")
+    tension: ndarray = field(unit="N", doc="of the tendons, as sensed", shape=(2, "joints"))
+    wanted: ndarray = field(unit="N", doc="tensions commanded of the valves", shape=(2, "joints"))
+    force: ndarray = field(
         unit="N", doc="of the surroundings on the fingertips, as sensed", shape=("fingers", 3)
     )
     holding: bool = field(doc="1: no fresh tensions: the valves are closed")
@@ -78,14 +77,10 @@ class HandStatus(AnsweringStatus, version=1):
         doc="1: tensions are not followed: a demand, an operator, or a lost board"
     )
     demand: Demand = field(doc="stop that the rack's safety demands in this cycle")
-    clipped: int = field("u4", unit="1", doc="cycles in which a tension was cut to its limits")
-    touches: int = field("u4", unit="1", doc="unintended contacts, counted at every substep")
-    violations: int = field(
-        "u4", unit="1", doc="substeps in which a tendon drove a joint beyond a limit"
-    )
-    pushed: int = field(
-        "u4", unit="1", doc="substeps in which a blow pushed a joint beyond a limit"
-    )
+    clipped: int = integer("cycles in which a tension was cut to its limits")
+    touches: int = integer("unintended contacts, counted at every substep")
+    violations: int = integer("substeps in which a tendon drove a joint beyond a limit")
+    pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
 
 
 class TendonTorque(RelayedCommand, version=1):
@@ -94,22 +89,20 @@ class TendonTorque(RelayedCommand, version=1):
     sampled: int = field(
         unit="tick", doc="tick of the hand's status that it rests on; -1: none yet"
     )
-    torque: np.ndarray = field(unit="N m", doc="of the joints", shape="joints")
+    torque: ndarray = per_joint("N m", "of the joints")
 
 
 class FingerTarget(RelayedCommand, version=1):
     """From the fingertip loop to the joint loop."""
 
     active: bool = field(doc="0: no target yet, hold")
-    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    stiff: np.ndarray = field(
-        unit="1",
-        doc="part of the joint loop's stiffness that acts, 0 to 1; its damping acts",
-        shape="joints",
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    stiff: ndarray = per_joint(
+        "1", "part of the joint loop's stiffness that acts, 0 to 1; its damping acts"
     )
-    torque: np.ndarray = field(unit="N m", doc="in addition: of the forces of tips", shape="joints")
-    spring: np.ndarray = field(
+    torque: ndarray = per_joint("N m", "in addition: of the forces of tips")
+    spring: ndarray = field(
         unit="N m/rad",
         doc="in addition: stiffness of tips, by joint and joint",
         shape=("joints", "joints"),
@@ -120,19 +113,19 @@ class GraspTarget(RelayedCommand, version=1):
     """From the grasp loop to the fingertip loop, or to the boards of fingers."""
 
     active: bool = field(doc="0: no target yet, hold")
-    mode: np.ndarray = field(
+    mode: ndarray = field(
         "u1", unit=FingerMode, doc="how each finger is controlled", shape="fingers"
     )
-    position: np.ndarray = field(unit="rad", doc="joint positions, for JOINTS", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities, for JOINTS", shape="joints")
-    tip: np.ndarray = field(
+    position: ndarray = per_joint("rad", "joint positions, for JOINTS")
+    velocity: ndarray = per_joint("rad/s", "joint velocities, for JOINTS")
+    tip: ndarray = field(
         unit="m", doc="points of the tips, for POINT and FORCE", shape=("fingers", 3)
     )
-    tip_velocity: np.ndarray = field(unit="m/s", doc="their velocities", shape=("fingers", 3))
-    stiffness: np.ndarray = field(
+    tip_velocity: ndarray = field(unit="m/s", doc="their velocities", shape=("fingers", 3))
+    stiffness: ndarray = field(
         unit="N/m", doc="of each tip about its point, for FORCE", shape="fingers"
     )
-    force: np.ndarray = field(
+    force: ndarray = field(
         unit="N",
         doc="of each tip on the surroundings, at its point, for FORCE",
         shape=("fingers", 3),
@@ -142,11 +135,9 @@ class GraspTarget(RelayedCommand, version=1):
 class LoopStatus(AnsweringStatus, version=1):
     """From the tendon loop to the joint loop, and from that to the fingertip loop."""
 
-    driven: np.ndarray = DRIVEN
+    driven: ndarray = DRIVEN
     sensed: int = SENSED
-    clipped: int = field(
-        "u4", unit="1", doc="cycles in which a torque was cut to what tendons can give"
-    )
+    clipped: int = integer("cycles in which a torque was cut to what tendons can give")
     holding: bool = field(doc="1: no fresh command from above: what was commanded last is kept")
     stopped: bool = field(
         doc="1: commands are not followed: the hand is stopped, or an operator holds the loop"
@@ -157,16 +148,14 @@ class FingerStatus(AnsweringStatus, version=1):
     """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp
     loop."""
 
-    driven: np.ndarray = field(
+    driven: ndarray = field(
         "u1", unit="1", doc="1: the finger is one of this board's", shape="fingers"
     )
     sensed: int = SENSED
-    position: np.ndarray = field(
-        unit="rad", doc="joint positions, from the hand's status", shape="joints"
-    )
-    target: np.ndarray = field(unit="rad", doc="joint positions wanted", shape="joints")
-    tip: np.ndarray = field(unit="m", doc="points of the tips", shape=("fingers", 3))
-    force: np.ndarray = field(unit="N", doc="of the surroundings on the tips", shape=("fingers", 3))
+    position: ndarray = per_joint("rad", "joint positions, from the hand's status")
+    target: ndarray = per_joint("rad", "joint positions wanted")
+    tip: ndarray = field(unit="m", doc="points of the tips", shape=("fingers", 3))
+    force: ndarray = field(unit="N", doc="of the surroundings on the tips", shape=("fingers", 3))
     holding: bool = field(doc="1: no fresh target: the fingers stay")
     stopped: bool = field(
         doc="1: targets are not followed: the hand is stopped, or an operator holds a loop"
@@ -176,24 +165,22 @@ class FingerStatus(AnsweringStatus, version=1):
 class GraspStatus(AnsweringStatus, version=1):
     """From the grasp loop. Points and forces are in the frame of the palm."""
 
-    step: int = field("u2", unit="1", doc="steps of the program that are done")
-    steps: int = field("u2", unit="1", doc="steps of the program")
+    step: int = integer("steps of the program that are done", "u2")
+    steps: int = integer("steps of the program", "u2")
     kind: GraspKind = field(doc="of the step under way")
     passed: float = field(unit="s", doc="time for which that step is under way")
-    object: int = field(
-        "i2", unit="1", doc="row of the object grasped, in the world model; -1: none"
-    )
-    touching: np.ndarray = field(
+    object: int = integer("row of the object grasped, in the world model; -1: none", "i2")
+    touching: ndarray = field(
         "u1", unit="1", doc="1: the finger touches the object", shape="fingers"
     )
     grip: float = field(
         unit="N", doc="internal force of the finger that opposes the others; they share it"
     )
-    load: np.ndarray = field(unit="N", doc="that the grasp makes up for: weight and pull", shape=3)
-    anchor: np.ndarray = field(unit="m", doc="where the object is to be", shape=3)
+    load: ndarray = field(unit="N", doc="that the grasp makes up for: weight and pull", shape=3)
+    anchor: ndarray = field(unit="m", doc="where the object is to be", shape=3)
     moved: float = field(unit="m", doc="distance of the object from there")
     farthest: float = field(unit="m", doc="largest such distance since the object was gripped")
-    plan: int = field("u4", unit="1", doc="id of the grasp plan in use; 0: none")
+    plan: int = integer("id of the grasp plan in use; 0: none")
 
 
 class GraspPlan(RelayedCommand, version=1):
@@ -201,17 +188,15 @@ class GraspPlan(RelayedCommand, version=1):
     hold of
     an object, and from which posture they close. The newest with an `id` above 0 counts."""
 
-    object: int = field("i2", unit="1", doc="row of the object in the world model")
+    object: int = integer("row of the object in the world model", "i2")
     sensed: int = field(unit="tick", doc="tick of the world model that it rests on")
-    posture: np.ndarray = field(
-        unit="rad", doc="joint positions from which the fingers close", shape="joints"
-    )
-    contact: np.ndarray = field(
+    posture: ndarray = per_joint("rad", "joint positions from which the fingers close")
+    contact: ndarray = field(
         unit="m",
         doc="of each tip, on the object's surface, in the object's frame",
         shape=("fingers", 3),
     )
-    normal: np.ndarray = field(
+    normal: ndarray = field(
         unit="1",
         doc="direction of each tip's force there, in the object's frame",
         shape=("fingers", 3),
