@@ -115,11 +115,6 @@ def field(
     return Declaration(kind, unit, doc, sizes, length, default)
 
 
-def integer(doc: str, kind: str = "u4") -> Any:
-    """Declare a field that counts or numbers something, by a pure number of an integer type."""
-    return field(kind, unit="1", doc=doc)
-
-
 def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
     """Return a message class whose fields a config decides: integers, and groups.
 
@@ -132,6 +127,11 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
     made: Any = _Slotted(name, (base,), body, version=version, message=name)
     return made  # type: ignore[no-any-return]
+
+
+def integer(doc: str, kind: str = "u4") -> Any:
+    """Declare a field that counts or numbers something, by a pure number of an integer type."""
+    return field(kind, unit="1", doc=doc)
 
 
 class _Slotted(type):

@@ -49,12 +49,14 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     broken model."""
     model = compile_spec(load_spec(robot.model), robot.model)
     kind = mujoco.mjtObj
-    wanted = [(kind.mjOBJ_JOINT, robot.joints, "robot.joints")]
-    if mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) < 0:
-        wanted.append((kind.mjOBJ_SITE, (robot.tool,), "robot.tool"))
-    wanted.append((kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"))
-    if robot.gripper is not None:
-        wanted.append((kind.mjOBJ_JOINT, (robot.gripper.joint,), "robot.gripper.joint"))
+    is_body = mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) >= 0
+    gripper = robot.gripper
+    wanted = [
+        (kind.mjOBJ_JOINT, robot.joints, "robot.joints"),
+        (kind.mjOBJ_SITE, () if is_body else (robot.tool,), "robot.tool"),
+        (kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"),
+        (kind.mjOBJ_JOINT, () if gripper is None else (gripper.joint,), "robot.gripper.joint"),
+    ]
     if robot.hand is not None:
         tips = tuple(finger.tip for finger in robot.hand.finger)
         wanted += [
