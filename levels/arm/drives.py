@@ -8,7 +8,7 @@ import daqp
 import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
-from rack.levels.algebra import Array, cholesky_solve, mat_vec, solve
+from rack.levels.algebra import Array, mat_vec, solve
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.drivable import JointTarget
 from rack.levels.compiled import compiled, compiled_for
@@ -147,6 +147,28 @@ def is_clear(
         if not (least <= 0.0 <= most and least <= twice[joint] <= most):
             return False
     return True
+
+
+@compiled
+def cholesky_solve(matrix: Array, vector: Array) -> Array:
+    """Return the same as `rack.levels.algebra.solve`, to compiled callers."""
+    size = len(vector)
+    factor = np.zeros((size, size))
+    solution = vector.copy()
+    for row in range(size):
+        for column in range(row + 1):
+            rest = matrix[row, column]
+            for k in range(column):
+                rest -= factor[row, k] * factor[column, k]
+            factor[row, column] = np.sqrt(rest) if row == column else rest / factor[column, column]
+        for k in range(row):
+            solution[row] -= factor[row, k] * solution[k]
+        solution[row] /= factor[row, row]
+    for row in range(size - 1, -1, -1):
+        for k in range(row + 1, size):
+            solution[row] -= factor[k, row] * solution[k]
+        solution[row] /= factor[row, row]
+    return solution
 
 
 @compiled
