@@ -32,7 +32,7 @@ class SharingArm(SimulatedArm):
 
     def is_touched(self, row: int) -> bool:
         """Return whether the gripper touches an object."""
-        return bool(self._contacts.held(self._data)[self.cell.parts(row)].any())
+        return bool(self._held()[self.cell.parts(row)].any())
 
     def pose(self, row: int) -> Array:
         """Return the pose of an object, (7,), m and quaternion, as simulated."""
