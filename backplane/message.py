@@ -129,11 +129,6 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
     return made  # type: ignore[no-any-return]
 
 
-def integer(doc: str, kind: str = "u4") -> Any:
-    """Declare a field that counts or numbers something, by a pure number of an integer type."""
-    return field(kind, unit="1", doc=doc)
-
-
 class _Slotted(type):
     """Gives classes no attributes besides their slots: a misspelt field is an error."""
 
@@ -237,6 +232,11 @@ class AnyMessage(Message):
 
         def __getattr__(self, name: str) -> Any: ...
         def __setattr__(self, name: str, value: Any) -> None: ...
+
+
+def integer(doc: str, kind: str = "u4") -> Any:
+    """Declare a field that counts or numbers something, by a pure number of an integer type."""
+    return field(kind, unit="1", doc=doc)
 
 
 def text_of(content: bytes | bytearray) -> str:
