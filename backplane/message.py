@@ -234,6 +234,11 @@ class AnyMessage(Message):
         def __setattr__(self, name: str, value: Any) -> None: ...
 
 
+def integer(doc: str, kind: str = "u4") -> Any:
+    """Declare a field that counts or numbers something, by a pure number of an integer type."""
+    return field(kind, unit="1", doc=doc)
+
+
 def text_of(content: bytes | bytearray) -> str:
     """Return the content of a text field for people: see `printable`."""
     return printable(content.decode("ascii", "replace"))

@@ -23,8 +23,6 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rack.levels.compiled import compiled
-
 Array = NDArray[np.float64]
 Ints = NDArray[np.int_]
 Mask = NDArray[np.bool_]
@@ -62,28 +60,6 @@ def solve(matrix: Array, vector: Array) -> Array:
     solution = np.empty(len(vector))
     mujoco.mju_cholFactor(factor, LEAST_PIVOT)
     mujoco.mju_cholSolve(solution, factor, vector)
-    return solution
-
-
-@compiled
-def cholesky_solve(matrix: Array, vector: Array) -> Array:
-    """Return the same as `solve`, to compiled callers."""
-    size = len(vector)
-    factor = np.zeros((size, size))
-    solution = vector.copy()
-    for row in range(size):
-        for column in range(row + 1):
-            rest = matrix[row, column]
-            for k in range(column):
-                rest -= factor[row, k] * factor[column, k]
-            factor[row, column] = np.sqrt(rest) if row == column else rest / factor[column, column]
-        for k in range(row):
-            solution[row] -= factor[row, k] * solution[k]
-        solution[row] /= factor[row, row]
-    for row in range(size - 1, -1, -1):
-        for k in range(row + 1, size):
-            solution[row] -= factor[k, row] * solution[k]
-        solution[row] /= factor[row, row]
     return solution
 
 

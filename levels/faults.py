@@ -108,6 +108,10 @@ class TendonStep:
     extensor."""
 
 
+ARM_STEPS = (SensorStep, MotorStep, CommandStep)
+"""Classes of steps that act on an arm, as `Executor.faults` names them."""
+
+
 def position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Make positions NaN."""
     return sample._replace(position=np.where(fault.joints, np.nan, sample.position)), True

@@ -1,18 +1,18 @@
 """The messages of the default rack: commands go down, statuses come up, plans stay within a level.
 
 Symbolic sizes: `joints`, `bodies` (objects, then obstacles; at least 1) and `state` (of a simulated
-cell, see `rack.levels.robot.state`). Quaternions are w, x, y, z. Poses are in the world frame.
+cell, see `rack.levels.robot.engine`). Quaternions are w, x, y, z. Poses are in the world frame.
 Simulated time is tick times the clock's period.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
-import numpy as np
+from numpy import ndarray
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import Message, field, integer
 from rack.backplane.words import Demand
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
@@ -80,20 +80,21 @@ class SegmentKind(IntEnum):
     GRIPPER = 2
 
 
+def per_joint(unit: str, doc: str) -> Any:
+    """Declare a field with one number for each joint of the arm."""
+    return field(unit=unit, doc=doc, shape="joints")
+
+
 class ElementalMove(Message, version=1):
     """One elemental move of a program."""
 
-    id: int = field("u4", unit="1", doc="serial of the move, rising by one from 1; 0: empty")
-    action: int = field("u2", unit="1", doc="index of the program's action that it serves")
+    id: int = integer("serial of the move, rising by one from 1; 0: empty")
+    action: int = integer("index of the program's action that it serves", "u2")
     verb: Verb = field(doc="what to do")
-    object: int = field(
-        "i2", unit="1", doc="row of the object concerned in the world model; -1: none"
-    )
-    position: np.ndarray = field(unit="m", doc="tool position at the end", shape=3)
-    quaternion: np.ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
-    joints: np.ndarray = field(
-        unit="rad", doc="where MOVE_JOINTS ends; with `posture`, near the end", shape="joints"
-    )
+    object: int = integer("row of the object concerned in the world model; -1: none", "i2")
+    position: ndarray = field(unit="m", doc="tool position at the end", shape=3)
+    quaternion: ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
+    joints: ndarray = per_joint("rad", "where MOVE_JOINTS ends; with `posture`, near the end")
     posture: bool = field(
         doc="1: of the configurations at the pose, the one nearest to `joints` is wanted"
     )
@@ -103,33 +104,31 @@ class ElementalMove(Message, version=1):
 class TaskPlan(Message, version=1):
     """From the planner of the task level to its executor: the program, decomposed."""
 
-    id: int = field("u4", unit="1", doc="serial of the plan")
+    id: int = integer("serial of the plan")
     error: Error = field("u2", doc="why the program is refused; 0: it is not refused")
     reason: str = field(doc="the refusal, readable")
     earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
-    count: int = field("u2", unit="1", doc="moves that follow")
-    moves: np.ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
+    count: int = integer("moves that follow", "u2")
+    moves: ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
 
 
 class TaskCommand(RelayedCommand, version=2):
     """From the task level to the elemental move level: a window on the plan."""
 
     hold: bool = field(doc="1: ramp to rest and stay, whatever is under way")
-    count: int = field("u2", unit="1", doc="moves that follow; id is the newest one's")
-    moves: np.ndarray = field(ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW)
+    count: int = integer("moves that follow; id is the newest one's", "u2")
+    moves: ndarray = field(ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW)
 
 
 class TaskStatus(AnsweringStatus, version=2):
     """Status of the task level."""
 
-    action: int = field("u2", unit="1", doc="actions done")
-    actions: int = field("u2", unit="1", doc="actions of the program")
-    moves_done: int = field("u2", unit="1", doc="elemental moves done")
-    moves: int = field("u2", unit="1", doc="elemental moves of the plan; 0 before there is one")
-    first: int = field("u4", unit="1", doc="id under which the plan's first move is handed down")
-    detour: int = field(
-        "u4", unit="1", doc="id of the move that an operator wants instead; 0: none"
-    )
+    action: int = integer("actions done", "u2")
+    actions: int = integer("actions of the program", "u2")
+    moves_done: int = integer("elemental moves done", "u2")
+    moves: int = integer("elemental moves of the plan; 0 before there is one", "u2")
+    first: int = integer("id under which the plan's first move is handed down")
+    detour: int = integer("id of the move that an operator wants instead; 0: none")
 
 
 OPERATED = field(doc="1: an operator keeps this level, or one below it, from its own work")
@@ -138,26 +137,18 @@ OPERATED = field(doc="1: an operator keeps this level, or one below it, from its
 class MoveStatus(AnsweringStatus, version=3):
     """Status of the elemental move level."""
 
-    done: int = field("u4", unit="1", doc="newest elemental move done; 0: none yet")
-    current: int = field("u4", unit="1", doc="elemental move under way; 0: none")
+    done: int = integer("newest elemental move done; 0: none yet")
+    current: int = integer("elemental move under way; 0: none")
     progress: float = field(unit="1", doc="part of its path done, 0 to 1")
     verb: Verb = field(doc="of the move under way")
-    held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")
-    planned: int = field(
-        "u4", unit="1", doc="newest elemental move whose path is ready; 0: none yet"
+    held: int = integer("row of the object in the gripper; -1: none", "i2")
+    planned: int = integer("newest elemental move whose path is ready; 0: none yet")
+    end: ndarray = per_joint("rad", "joint positions at the end of that path")
+    replan: int = integer(
+        "open request to plan the current move anew from `start`; 0: none is open"
     )
-    end: np.ndarray = field(
-        unit="rad", doc="joint positions at the end of that path", shape="joints"
-    )
-    replan: int = field(
-        "u4",
-        unit="1",
-        doc="open request to plan the current move anew from `start`; 0: none is open",
-    )
-    start: np.ndarray = field(
-        unit="rad", doc="joint positions where that motion holds", shape="joints"
-    )
-    replans: int = field("u4", unit="1", doc="plans made anew because something was in the way")
+    start: ndarray = per_joint("rad", "joint positions where that motion holds")
+    replans: int = integer("plans made anew because something was in the way")
     operated: bool = OPERATED
     resting: bool = field(
         doc="1: the arm rests, and the level that moves it has the operator's newest command"
@@ -167,18 +158,16 @@ class MoveStatus(AnsweringStatus, version=3):
 class MovePlan(Message, version=1):
     """From the planner of the elemental move level to its executor: a path for one move."""
 
-    move: int = field("u4", unit="1", doc="elemental move that the plan serves")
-    replan: int = field(
-        "u4", unit="1", doc="request that it answers; 0: the first plan of the move"
-    )
+    move: int = integer("elemental move that the plan serves")
+    replan: int = integer("request that it answers; 0: the first plan of the move")
     error: Error = field("u2", doc="why there is no plan; 0: there is")
     reason: str = field(doc="the error, readable")
     kind: SegmentKind = field(doc="path or gripper")
-    count: int = field("u2", unit="1", doc="waypoints that follow")
-    waypoints: np.ndarray = field(
+    count: int = integer("waypoints that follow", "u2")
+    waypoints: ndarray = field(
         unit="rad", doc="collision-free path in joint space", shape=(WAYPOINTS, "joints")
     )
-    blend: np.ndarray = field(
+    blend: ndarray = field(
         unit="rad",
         doc="length over which corner k is rounded, before and after it",
         shape=WAYPOINTS,
@@ -188,20 +177,18 @@ class MovePlan(Message, version=1):
 class MoveSegment(Message, version=1, message="segment"):
     """One segment of a move: a path, or a motion of the gripper."""
 
-    id: int = field("u4", unit="1", doc="serial of the segment, rising by one from 1; 0: empty")
-    move: int = field("u4", unit="1", doc="elemental move that it serves")
+    id: int = integer("serial of the segment, rising by one from 1; 0: empty")
+    move: int = integer("elemental move that it serves")
     kind: SegmentKind = field(doc="path or gripper")
-    object: int = field("i2", unit="1", doc="object held, or to be grasped; -1: none")
+    object: int = integer("object held, or to be grasped; -1: none", "i2")
     touch: bool = field(doc="1: the object may touch supports and fingers (approach, depart)")
-    count: int = field("u2", unit="1", doc="waypoints that follow")
-    waypoints: np.ndarray = field(
+    count: int = integer("waypoints that follow", "u2")
+    waypoints: ndarray = field(
         unit="rad",
         doc="path in joint space, from where the motion starts",
         shape=(WAYPOINTS, "joints"),
     )
-    blend: np.ndarray = field(
-        unit="rad", doc="length over which corner k is rounded", shape=WAYPOINTS
-    )
+    blend: ndarray = field(unit="rad", doc="length over which corner k is rounded", shape=WAYPOINTS)
     by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to, for GRIPPER")
     force: float = field(unit="N or N m", doc="largest gripper force on the way and afterwards")
@@ -211,29 +198,27 @@ class MoveCommand(RelayedCommand, version=2):
     """From the elemental move level to the primitive level: the next segments."""
 
     hold: bool = field(doc="1: ramp to rest on the path and stay")
-    count: int = field("u2", unit="1", doc="segments that follow; id is the newest one's")
-    segments: np.ndarray = field(MoveSegment, doc="segments to do, oldest first", shape=SEGMENTS)
+    count: int = integer("segments that follow; id is the newest one's", "u2")
+    segments: ndarray = field(MoveSegment, doc="segments to do, oldest first", shape=SEGMENTS)
 
 
 class PrimitiveStatus(AnsweringStatus, version=3):
     """Status of the primitive level."""
 
-    done: int = field("u4", unit="1", doc="newest segment done; 0: none yet")
-    current: int = field("u4", unit="1", doc="segment under way; 0: none")
+    done: int = integer("newest segment done; 0: none yet")
+    current: int = integer("segment under way; 0: none")
     progress: float = field(unit="1", doc="part of the segment's path done, 0 to 1")
     blocked: bool = field(doc="1: motion holds because something is in the way")
     resting: bool = field(doc="1: commanded velocity is zero")
     operated: bool = OPERATED
-    held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")
+    held: int = integer("row of the object in the gripper; -1: none", "i2")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
-    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
+    position: ndarray = per_joint("rad", "joint positions commanded last")
     earliest: float = field(unit="s", doc="with TOO_LATE: the earliest time that could be met")
     ends: float = field(
         unit="s", doc="simulated time at which the segment under way should be done; 0: not known"
     )
-    wants: int = field(
-        "u4", unit="1", doc="segment for which the level wants a trajectory of its planner; 0: none"
-    )
+    wants: int = integer("segment for which the level wants a trajectory of its planner; 0: none")
     begin: float = field(
         unit="rad", doc="path parameter at which that trajectory is to begin, from rest"
     )
@@ -242,7 +227,7 @@ class PrimitiveStatus(AnsweringStatus, version=3):
 class TrajectoryPlan(Message, version=1, message="trajectory"):
     """From the planner of the primitive level to its executor: when the arm is where on a path."""
 
-    segment: int = field("u4", unit="1", doc="segment that it serves")
+    segment: int = integer("segment that it serves")
     error: Error = field("u2", doc="why there is none; 0: there is")
     reason: str = field(doc="the error, readable")
     begin: float = field(unit="rad", doc="path parameter at which it begins")
@@ -250,8 +235,8 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
     earliest: float = field(
         unit="s", doc="simulated time at which the segment could be done at the earliest"
     )
-    count: int = field("u2", unit="1", doc="sections that follow")
-    sections: np.ndarray = field(
+    count: int = integer("sections that follow", "u2")
+    sections: ndarray = field(
         unit="s, 1, 1/s, 1/s2, 1/s3",
         doc="start, s, ds, dds, jerk of the path parameter",
         shape=(SECTIONS, 5),
@@ -264,20 +249,20 @@ class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point yet, hold"
     )
-    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    acceleration: np.ndarray = field(unit="rad/s2", doc="joint accelerations", shape="joints")
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to")
     force: float = field(unit="N or N m", doc="largest gripper force")
-    held: int = field("i2", unit="1", doc="row of the object in the gripper; -1: none")
+    held: int = integer("row of the object in the gripper; -1: none", "i2")
 
 
 class ArmSetPoint(Protocol):
     """What the servo level takes of a set point, of whichever message: see `JointCommand`."""
 
     due: int
-    position: np.ndarray
-    velocity: np.ndarray
+    position: ndarray
+    velocity: ndarray
     opening: float
     force: float
 
@@ -285,34 +270,26 @@ class ArmSetPoint(Protocol):
 class ServoPlan(Message, version=1):
     """From the planner of the servo level to its executor: the inertia of arm and load."""
 
-    inertia: np.ndarray = field(
+    inertia: ndarray = field(
         unit="kg m2",
         doc="joint-space inertia, the object held included",
         shape=("joints", "joints"),
     )
-    held: int = field("i2", unit="1", doc="object included; -1: none")
+    held: int = integer("object included; -1: none", "i2")
     payload_mass: float = field(unit="kg", doc="mass in the gripper")
-    payload_offset: np.ndarray = field(
-        unit="m", doc="its centre, in the frame of the tool", shape=3
-    )
+    payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
 
 class DrivenArm(AnsweringStatus):
     """Fields of the status of a level that drives an arm."""
 
-    position: np.ndarray = field(
-        unit="rad", doc="joint positions, measured; estimated for suspect sensors", shape="joints"
+    position: ndarray = per_joint("rad", "joint positions, measured; estimated for suspect sensors")
+    velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
+    torque: ndarray = per_joint(
+        "N m", "torque given to the arm in this cycle, after the limit gate"
     )
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities, likewise", shape="joints")
-    torque: np.ndarray = field(
-        unit="N m",
-        doc="torque given to the arm in this cycle, after the limit gate",
-        shape="joints",
-    )
-    target: np.ndarray = field(
-        unit="rad", doc="where the joints are wanted in this cycle", shape="joints"
-    )
-    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
+    target: ndarray = per_joint("rad", "where the joints are wanted in this cycle")
+    target_velocity: ndarray = per_joint("rad/s", "likewise")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
     opening_velocity: float = field(unit="m/s or rad/s", doc="gripper joint velocity, measured")
     grip_force: float = field(unit="N or N m", doc="force given to the gripper")
@@ -322,18 +299,12 @@ class DrivenArm(AnsweringStatus):
     )
     braked: bool = field(doc="1: the brakes are engaged")
     demand: Demand = field(doc="stop that the rack's safety demands in this cycle")
-    clipped: int = field(
-        "u4", unit="1", doc="cycles in which the limit gate cut a torque or a set point"
+    clipped: int = integer("cycles in which the limit gate cut a torque or a set point")
+    touches: int = integer("unintended contacts, counted at every substep")
+    violations: int = integer(
+        "substeps in which the arm drove a position, velocity or torque beyond its limit"
     )
-    touches: int = field("u4", unit="1", doc="unintended contacts, counted at every substep")
-    violations: int = field(
-        "u4",
-        unit="1",
-        doc="substeps in which the arm drove a position, velocity or torque beyond its limit",
-    )
-    pushed: int = field(
-        "u4", unit="1", doc="substeps in which a blow pushed a joint beyond a limit"
-    )
+    pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
     slowed: bool = field(doc="1: speeds are scaled down by robot.bring_up, until the release of it")
 
 
@@ -345,50 +316,44 @@ class ArmState(Message, version=3):
     """State of the arm, from which a restarted board continues."""
 
     tick: int = field(unit="tick", doc="tick that the state belongs to")
-    clipped: int = field("u4", unit="1", doc="cycles in which the limit gate cut a command")
-    touches: int = field("u4", unit="1", doc="unintended contacts")
-    violations: int = field("u4", unit="1", doc="substeps in which the arm broke a limit")
-    pushed: int = field(
-        "u4", unit="1", doc="substeps in which a blow pushed a joint beyond a limit"
-    )
+    clipped: int = integer("cycles in which the limit gate cut a command")
+    touches: int = integer("unintended contacts")
+    violations: int = integer("substeps in which the arm broke a limit")
+    pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
     struck: int = field("i4", unit="tick", doc="ticks for which the motion is still that of a blow")
     waited: int = field("i4", unit="tick", doc="ticks since the last command")
     braked: bool = field(doc="1: the brakes are engaged")
-    rest: np.ndarray = field(unit="rad", doc="where engaged brakes hold the joints", shape="joints")
-    position: np.ndarray = field(
-        unit="rad", doc="joint positions as the servo level estimates them", shape="joints"
-    )
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities, likewise", shape="joints")
-    doubt: np.ndarray = field(unit="rad", doc="largest error of those positions", shape="joints")
+    rest: ndarray = per_joint("rad", "where engaged brakes hold the joints")
+    position: ndarray = per_joint("rad", "joint positions as the servo level estimates them")
+    velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
+    doubt: ndarray = per_joint("rad", "largest error of those positions")
     kept: int = field(
         unit="tick",
         doc="ticks for which faults have kept the arm from its set points: see ArmParams.patience",
     )
     error: Error = field("u2", doc="latched fault; 0: none")
     reason: str = field(doc="that fault, readable")
-    state: np.ndarray = field(
-        unit="", doc="of the simulated cell, see rack.levels.robot.state", shape="state"
+    state: ndarray = field(
+        unit="", doc="of the simulated cell, see rack.levels.robot.engine", shape="state"
     )
 
 
 class Scene(Message, version=1):
     """Bodies and tool as sensed."""
 
-    position: np.ndarray = field(unit="m", doc="body origins as sensed", shape=("bodies", 3))
-    quaternion: np.ndarray = field(unit="1", doc="body orientations as sensed", shape=("bodies", 4))
-    tool_position: np.ndarray = field(unit="m", doc="tool as sensed", shape=3)
-    tool_quaternion: np.ndarray = field(unit="1", doc="tool as sensed", shape=4)
+    position: ndarray = field(unit="m", doc="body origins as sensed", shape=("bodies", 3))
+    quaternion: ndarray = field(unit="1", doc="body orientations as sensed", shape=("bodies", 4))
+    tool_position: ndarray = field(unit="m", doc="tool as sensed", shape=3)
+    tool_quaternion: ndarray = field(unit="1", doc="tool as sensed", shape=4)
 
 
 class WorldState(Message, version=1, message="world_model"):
     """Bodies as the world model knows them."""
 
-    revision: int = field(
-        "u4",
-        unit="1",
-        doc="rises when a body starts to move and when it rests again; 0: nothing sensed",
+    revision: int = integer(
+        "rises when a body starts to move and when it rests again; 0: nothing sensed"
     )
-    position: np.ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))
-    quaternion: np.ndarray = field(unit="1", doc="body orientations", shape=("bodies", 4))
-    velocity: np.ndarray = field(unit="m/s", doc="body velocities, estimated", shape=("bodies", 3))
+    position: ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))
+    quaternion: ndarray = field(unit="1", doc="body orientations", shape=("bodies", 4))
+    velocity: ndarray = field(unit="m/s", doc="body velocities, estimated", shape=("bodies", 3))
     sensed: int = field(unit="tick", doc="cycle in which the newest scene was taken over")

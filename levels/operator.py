@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import REASON_BYTES, AnyMessage, Command, Status, field
+from rack.backplane.message import REASON_BYTES, AnyMessage, Command, Status, field, integer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,7 +80,7 @@ class OperatorCommand(Command, version=2):
 
     what: Operation = field(doc="what to do")
     goal: Goal = field(doc="form of the goal")
-    count: int = field("u1", unit="1", doc="joints that follow")
+    count: int = integer("joints that follow", "u1")
     joints: np.ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
     position: np.ndarray = field(unit="m", doc="of the tool, for goals pose and direction", shape=3)
     quaternion: np.ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
@@ -88,9 +88,7 @@ class OperatorCommand(Command, version=2):
     name: str = field(f"S{NAME_BYTES}", doc="what a setting sets, or the level's own command to do")
 
 
-RESTS_ON = field(
-    "u4", unit="1", doc="newest command of an operator, here or above, that this rests on; 0: none"
-)
+RESTS_ON = integer("newest command of an operator, here or above, that this rests on; 0: none")
 
 
 class RelayedCommand(Command):
@@ -109,9 +107,7 @@ class AnsweringStatus(Status):
     """Base of statuses that answer an operator."""
 
     operator: int = RESTS_ON
-    order: int = field(
-        "u4", unit="1", doc="command of an operator that this answers, new or not; 0: none yet"
-    )
+    order: int = integer("command of an operator that this answers, new or not; 0: none yet")
     answer: Answer = field(doc="this level's answer to it")
     standing: Operation = field(
         doc="operator's command in force; 0: none, the level does its own work"

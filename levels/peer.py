@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import Message, field, integer
 
 DRIFT_PPM = 100
 """Largest difference between the rates of two clocks: each crystal within 50 ppm."""
@@ -29,10 +29,8 @@ class PeerPresence(Message, version=1, message="peer"):
     launch: int = field(
         unit="1", doc="number of the launch that is there, or was last; 0: none, or in lockstep"
     )
-    launches: int = field(
-        "u4", unit="1", doc="its launches seen so far: a number above 1 means restarts"
-    )
-    losses: int = field("u4", unit="1", doc="how often it was lost")
+    launches: int = integer("its launches seen so far: a number above 1 means restarts")
+    losses: int = integer("how often it was lost")
     since: int = field(unit="tick", doc="since when it is there, or lost")
     offset: float = field(
         unit="s", doc="its CLOCK_MONOTONIC less that of this machine; 0 in lockstep"
@@ -43,10 +41,8 @@ class PeerPresence(Message, version=1, message="peer"):
     round_trip: float = field(
         unit="s", doc="shortest recent round trip; -1: not measured yet; 0 in lockstep"
     )
-    steps: int = field(
-        "u4",
-        unit="1",
-        doc="how often its clock or ours was found to have stepped, as when a machine sleeps",
+    steps: int = integer(
+        "how often its clock or ours was found to have stepped, as when a machine sleeps"
     )
     ahead: float = field(
         unit="s", doc="its simulated time less that of this rack, at the same instant"

@@ -83,7 +83,9 @@ MUTANTS = (
     ),
     Mutant("silence", "mute", (first(f"{WATCH}/silence_watch.py", REPORT, "return"),)),
     Mutant("watchdog", "hang", (first(RELEASED, HANGS, "return False"),)),
-    Mutant("limit gate", "command-limit", (first("levels/arm/arm.py", GATE, "return None"),)),
+    Mutant(
+        "limit gate", "command-limit", (first("levels/arm/braked_arm.py", GATE, "return None"),)
+    ),
     Mutant("brake", "sensor-nan", (first(ARM, "def brake(self) -> None:", "return"),)),
     Mutant(
         "restart", "kill", (("boards/crate/recovery.py", "if len(recent) >= most:", "if True:"),)

@@ -3,11 +3,21 @@ two."""
 
 from rack.levels import compiled
 from rack.levels.arm import drives, sensors, substeps
-from rack.levels.arm.arm import Arm, DriveState, JointTarget, Sensed, find_arm
+from rack.levels.arm.arm import Arm
+from rack.levels.arm.drivable import DrivableArm, DriveState, JointTarget, Sensed, find_arm
 from rack.levels.arm.simulated import SimulatedArm
 from rack.levels.robot import dynamics
 
-__all__ = ["Arm", "DriveState", "JointTarget", "Sensed", "SimulatedArm", "find_arm", "preload"]
+__all__ = [
+    "Arm",
+    "DrivableArm",
+    "DriveState",
+    "JointTarget",
+    "Sensed",
+    "SimulatedArm",
+    "find_arm",
+    "preload",
+]
 
 
 def preload() -> None:

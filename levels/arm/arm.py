@@ -10,238 +10,58 @@ ends the board, which is restarted as after any crash; report a broken arm in `f
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from enum import IntEnum
-from typing import ClassVar, NamedTuple, Protocol
+from collections.abc import Callable
 
-import numpy as np
-
-from rack.backplane.watch.alarms import AT_START, NO_TORQUE, Alarm
-from rack.levels.algebra import Array
-from rack.levels.arm.plant import Plant
-from rack.levels.level import Finding
-from rack.levels.messages import ArmState, Error, Scene
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import ArmLinks
+from rack.levels.arm.faulty import FaultyLink
+from rack.levels.arm.guard import GuardedArm, kept_bounds
+from rack.levels.arm.present import present_link
+from rack.levels.errors import RobotError
+from rack.levels.messages import Scene
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.dynamics import Dynamics
-from rack.levels.tables import Interface, SceneConfig, SensorConfig, named_class
-
-TORQUE_MARGIN = 1.001
-"""Multiple of a torque limit beyond which a command is refused: the servo level keeps the limits
-itself."""
+from rack.levels.tables import SensorConfig
 
 
-class DriveState(IntEnum):
-    """State of an arm's drives: those of CiA 402, reduced to what a level above must tell apart."""
-
-    DISABLED = 0  # up to "switched on", without a request: no power, brakes engaged
-    ENABLING = 1  # asked for: on the way to "operation enabled", homing included
-    ENABLED = 2  # "operation enabled": torques act; in "quick stop active" none would
-    FAULT = 3  # "fault reaction active" and "fault": until `Arm.reset`
-
-
-class Sensed(NamedTuple):
-    """One sample of the arm's sensors; joints are as coarse and noisy as their encoders."""
-
-    position: Array  # (joints,), rad
-    velocity: Array  # (joints,), rad/s
-    opening: float  # gripper joint, m; 0 without a gripper
-    opening_velocity: float  # m/s
-    tick: int  # of the sample: an older one than that of the cycle counts as no new sample
-
-
-class JointTarget(NamedTuple):
-    """Set points of the joints for the end of a cycle; arrays are (joints,)."""
-
-    position: Array  # rad
-    velocity: Array  # rad/s; for drives of velocity corrected by the error of the position
-    torque: Array  # N m: predicted for the motion, payload included
-
-
-def copied(sample: Sensed) -> Sensed:
-    """Return a sample whose arrays stay valid."""
-    return sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
-
-
-class Link(Protocol):
-    """The path between the servo level and an arm: samples come up, torques or set points go
-    down."""
-
-    def sense(self) -> Sensed:
-        """Return the newest sample. The arrays are valid until the next call."""
-
-    def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, (joints,), N m, and the gripper's force, N, for one
-        torque cycle.
-
-        A torque that must not be applied (see `Arm.refused`) engages the brakes, and the finding is
-        returned.
-        """
-
-    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Release the brakes, and let the drives be at `target` in one cycle; then they go on at
-        that velocity. Otherwise as `drive`."""
-
-
-class Arm(Plant, ABC):
-    """An arm whose joints have drives and brakes, and a force-driven gripper. Implements `Link`.
+class Arm(BrakedArm):
+    """Base of every arm: it is guarded, unless its drives keep its limits.
 
     Subclasses write `sense`, `brake`, `step` and, as their drives take torques or set points,
-    `drive` or `follow`, and keep the attributes below up to date. All else has a default that suits
-    an arm without contact sensors, whose state outlives its board.
+    `drive` or `follow`, and keep the attributes of `DrivableArm` up to date. All else has a default
+    that suits an arm without contact sensors, whose state outlives its board.
     """
 
     keeps_limits = False
-    """Whether its drives keep positions and velocities within the limits by themselves, as the
-    simulated ones do. Every other arm is driven through `rack.levels.arm.guard.GuardedArm`."""
-    sensors: ClassVar[SensorConfig] = SensorConfig(resolution=1e-4, noise=5e-5)
-    """Its encoders, where `[robot.sensors]` does not say. Default: 16 bits a turn; and samples that
-    are taken up to 0.1 ms early or late, which is 0.3 mrad at 3 rad/s, six times this noise."""
+    """The simulated arm's drives do. Every other arm is driven through
+    `rack.levels.arm.guard.GuardedArm`."""
+    sensors = SensorConfig(resolution=1e-4, noise=5e-5)
+    """Default: 16 bits a turn; and samples that are taken up to 0.1 ms early or late, which is 0.3
+    mrad at 3 rad/s, six times this noise."""
+    _guard: GuardedArm | None = None
 
-    reports_torque = False
-    """Whether, after `follow`, `torque` is what the motors give throughout the coming cycle. Else
-    it is what was predicted, and only the following error tells that a motor has failed."""
+    def connect(
+        self, tick_s: float, part: float, acted: dict[int, bool], holds: Callable[[], bool]
+    ) -> ArmLinks:
+        """Return the path that the servo level drives it through; see `DrivableArm.connect`."""
+        link = present_link(self, tick_s)
+        if not self.keeps_limits:
+            link = self._guard = GuardedArm(self, tick_s, link, part)
+        return ArmLinks(link, FaultyLink(self, acted, link, holds))
 
-    def __init__(
-        self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
-    ) -> None:
-        """Start braked at home. One tick is `clock_ns`, one torque cycle `every` ticks; `seed` is
-        for random noise."""
-        super().__init__(cell)
-        self.every = every  # ticks of a cycle
-        # Ticks without a command after which the brakes must engage.
-        self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
-        self.waited = self.patience
-        self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
-        self.grip_force = 0.0  # N: given to the gripper last
-        self.state = DriveState.DISABLED  # of the drives, as of the last `step`
-        # Reason (see `Alarm.BRAKES_CLOSED`) and first tick of braking. None while released.
-        self._brakes: tuple[int, int] | None = (AT_START, self.tick)
-        self.dynamics = Dynamics(
-            cell
-        )  # for the level that drives the arm; one that senses exactly shares it with it
-        self._permitted = TORQUE_MARGIN * cell.bounds.torque
-
-    @abstractmethod
-    def sense(self) -> Sensed:
-        """Return the newest sample, see `Link.sense`."""
-
-    def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`. Sets
-        `waited` to 0. Default: refused, see `takes`."""
-        raise NotImplementedError
-
-    def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Release the brakes and follow; see `Link.follow`. Sets `waited` to 0, and `torque` to
-        what is predicted or reported. Default: refused, see `takes`."""
-        raise NotImplementedError
+    def permit(self, part: float) -> None:
+        """Let the path keep velocities within another `part` of their limits."""
+        if self._guard is not None:
+            self._guard.permit(part)
 
     @classmethod
-    def takes(cls, interface: Interface) -> bool:
-        """Say whether the drives have an interface: `rack check` refuses a config that names
-        another. Default: by the methods that the class has."""
-        if interface == "torque":
-            return cls.drive is not Arm.drive
-        return cls.follow is not Arm.follow
-
-    @abstractmethod
-    def brake(self) -> None:
-        """Engage the brakes: they stop and hold the joints, motors give no torque, the gripper
-        keeps its force."""
-
-    @abstractmethod
-    def step(self, ticks: int) -> None:
-        """Let `ticks` ticks pass: advance `tick` and `waited` (all that hardware does), and keep to
-        `patience`.
-
-        `ticks` exceeds the level's cycle after missed cycles, and may be 0.
-        """
-
-    def enable(self) -> None:
-        """Ask the drives for torque; does not block: `state` becomes ENABLED in a later `step`.
-
-        Until then, and whenever the arm is not enabled, it is braked in every cycle. Default:
-        drives that know no states are enabled at once.
-        """
-        self.state = DriveState.ENABLED
-
-    def disable(self) -> None:
-        """Ask the drives to give no torque any more. Default: the brakes do it, at once."""
-        self.brake()
-        self.state = DriveState.DISABLED
-
-    def reset(self) -> None:
-        """Ask drives in FAULT to leave it, for DISABLED, and clear `fault`, which says why they
-        were in it. Default: they cannot."""
-
-    def refused(self, torque: Array) -> Finding | None:
-        """Return why `torque`, (joints,), N m, must not be applied: NaN, infinite, beyond a limit;
-        None: it may. The caller then brakes; the refusal is counted and reported here."""
-        if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
-            return None
-        if np.isfinite(torque).all():
-            joint = int((np.abs(torque) / self._permitted).argmax())
-            return self.refuse(Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint])))
-        return self.refuse(Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax())))
-
-    def report_waiting(self) -> None:
-        """Add to the findings that the arm has engaged its brakes by itself, between two cycles."""
-        if self._brakes is None and self.braked:
-            if self.state is not DriveState.ENABLED:
-                self._report_brakes(Error.DRIVES, self.tick)
-            else:
-                since = self.tick - max(self.waited - self.patience, 1)
-                self._report_brakes(NO_TORQUE, since, self.waited - self.every)
-
-    def report_cycle(self) -> None:
-        """Add to the findings what a cycle did to the brakes, each time, however short; and why."""
-        super().report_cycle()
-        why = self.brake_cause
-        self.brake_cause = Error.NONE
-        if self.braked:
-            if self._brakes is None:
-                self._report_brakes(why, self.tick)
-        elif self._brakes is not None:
-            why, since = self._brakes
-            self._brakes = None
-            if self.tick > since:
-                self.findings.append(Finding(Alarm.BRAKES_OPENED, why, self.tick - since))
-
-    def _report_brakes(self, why: int, since: int, missed: int = 0) -> None:
-        self._brakes = why, since
-        self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
-
-    def restore(self, state: ArmState) -> None:
-        """Continue from an `ARM_STATE`. Default: drives that know no states are as they were."""
-        super().restore(state)
-        was_disabled = state.error == Error.DISABLED
-        self.state = DriveState.DISABLED if was_disabled else DriveState.ENABLED
-        self._brakes = (NO_TORQUE, self.tick) if self.braked else None
-
-    @property
-    def holds(self) -> bool:
-        """Whether the gripper touches a part. Default: False."""
-        return False
-
-    @property
-    def leans(self) -> bool:
-        """Whether the arm, or its load, touches anything else. Default: False."""
-        return False
-
-    def named(self, contact: tuple[int, int]) -> str:
-        """Return a `contact` in words. Default: the numbers of the geoms."""
-        return f"geom {contact[0]} touches geom {contact[1]}"
-
-    def weaken(self, most: Array | None) -> None:
-        """Limit the motors' torque to `most`, (joints,), N m, as if they were weak; None: they are
-        sound.
-
-        Injected faults of motors act through this. Default: they have no effect.
-        """
-
-    def feel(self) -> Array | None:
-        """Return the newest sample of the wrist sensor, (6,), N, N m, in its frame. Default: None,
-        it has none."""
-        return None
+    def misfit(cls, cell: Cell, part: float) -> str:
+        """Return why `connect` would fail for a cell, before the launch; empty: it would not."""
+        try:
+            if not cls.keeps_limits:
+                kept_bounds(cell, part)
+        except RobotError as error:
+            return str(error)
+        return ""
 
     def look(self, scene: Scene) -> None:
         """Fill a `SCENE` with the poses of bodies and tool. Default: bodies at their start, the
@@ -250,9 +70,3 @@ class Arm(Plant, ABC):
         position = self.sense().position
         self._data.qpos[self.cell.qpos] = position if offset is None else position + offset
         self._show(scene)
-
-
-def find_arm(reference: str) -> type[Arm]:
-    """Return the class that "package.module:Class" names. Raises `ValueError` where it is missing
-    or no whole `Arm`."""
-    return named_class(reference, Arm)

@@ -11,15 +11,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from rack.levels.algebra import Array, Mask
-from rack.levels.arm.arm import Arm, JointTarget, Link, Sensed
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import JointTarget, Link, Sensed
 from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
-from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
 
-STEPS = (SensorStep, MotorStep, CommandStep)
-"""Classes of steps that act on an arm, as `Executor.faults` names them."""
 SLIGHT = 0.02
 """Part of its torque limit that a motor must lack to count, in addition to what friction and a
 contact may hide."""
@@ -33,20 +31,17 @@ class FaultyLink:
 
     def __init__(
         self,
-        arm: Arm,
-        cell: Cell,
-        every: int,
+        arm: BrakedArm,
         acted: dict[int, bool],
         link: Link | None = None,
         holds: Callable[[], bool] = bool,
     ) -> None:
-        """Connect the servo level, which cycles every `every` ticks, to the `arm` of a cell; by its
-        `link`, if it has one of its own. `holds`: whether the gripper holds a part, for all that
-        the level knows."""
+        """Connect the servo level to an arm; by its `link`, if it has one of its own. `holds`:
+        whether the gripper holds a part, for all that the level knows."""
+        cell = arm.cell
         self._arm = arm
         self._holds = holds
         self._next: Link = link or arm
-        self._every = every
         self._acted = acted
         self._limits = limits = cell.bounds.torque
         # Friction that helped may now resist: it hides twice its value.
@@ -64,7 +59,7 @@ class FaultyLink:
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the active faults; one of a joint that the arm lacks has no effect."""
         active = [
-            ActiveFault(place, fault, joints, self._every, self._kept)
+            ActiveFault(place, fault, joints, self._arm.every, self._kept)
             for place, fault in enumerate(faults)
             if (joints := self._joints(fault)).any()
         ]

@@ -3,17 +3,14 @@ and torques cut by them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
-
 import numpy as np
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
-from rack.levels.arm.arm import Arm, DriveState, JointTarget, Link, Sensed
-from rack.levels.arm.drives import LimitGate
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import DriveState, Exceeded, JointTarget, Link, Sensed
+from rack.levels.arm.drives import LimitGate, SetPointGate
 from rack.levels.arm.present import PresentLink
-from rack.levels.arm.set_points import SetPointGate
 from rack.levels.errors import RobotError
 from rack.levels.level import Finding
 from rack.levels.messages import Error
@@ -22,16 +19,9 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import Bounds
 
 
-class Exceeded(NamedTuple):
-    """A limit that a joint is beyond: what found it, and in words."""
-
-    finding: Finding
-    text: str
-
-
-def kept_bounds(cell: Cell, joints: Sequence[str], part: float) -> Bounds:
+def kept_bounds(cell: Cell, part: float) -> Bounds:
     """Return the bounds of a cell, velocities by `part`, less what samples may be off by. Raises
-    `RobotError` for encoders too coarse to tell a limit of one of `joints`."""
+    `RobotError` for encoders too coarse to tell a limit."""
     velocity = part * cell.bounds.velocity
     off = cell.encoders.off
     speed_off = cell.encoders.speed_off
@@ -45,7 +35,7 @@ def kept_bounds(cell: Cell, joints: Sequence[str], part: float) -> Bounds:
         joint = int(coarse.argmax())
         name = "latency_ticks" if cell.encoders.latency_ticks else "sensors"
         raise RobotError(
-            f"robot.{name}: '{joints[joint]}' may be off by {off[joint]:g} rad,"
+            f"robot.{name}: '{cell.joints[joint]}' may be off by {off[joint]:g} rad,"
             f" {speed_off[joint]:g} rad/s: too coarse to keep it below"
             f" {velocity[joint]:g} rad/s; permitted: less than half of that"
         )
@@ -60,38 +50,29 @@ class GuardedArm:
     (`LimitGate`), for as long as the motors would keep them: for the arm's patience, as later
     cycles may be missed. The largest error that the encoders may have is kept as a margin on each
     limit. A sample beyond a limit by more than that error, or not finite, is a violation: it is
-    counted, shows in `exceeded`, and nothing is driven on it. What only a simulation knows,
-    contacts and the truth, is not judged here.
+    counted, shows in the arm's `exceeded`, and nothing is driven on it. What only a simulation
+    knows, contacts and the truth, is not judged here.
     """
 
     def __init__(
-        self,
-        arm: Arm,
-        cell: Cell,
-        joints: Sequence[str],
-        tick_s: float,
-        below: Link | None = None,
-        part: float = 1.0,
+        self, arm: BrakedArm, tick_s: float, below: Link | None = None, part: float = 1.0
     ) -> None:
-        """Guard an arm with these `joints`, sensed by the link `below`, if it has one of its own.
-        Raises `RobotError` for encoders too coarse to tell a limit, velocities by `part`."""
+        """Guard an arm, sensed by the link `below`, if it has one of its own. Raises `RobotError`
+        for encoders too coarse to tell a limit, velocities by `part`."""
         self._arm = arm
         self._below: Link = below or arm
-        self._cell = cell
-        self._joints = joints
+        self._cell = cell = arm.cell
         self._tick_s = tick_s
         self._span_s = arm.patience * tick_s
         self._last_set_point: Array = np.full((2, len(cell.dof)), np.nan)
         self._dynamics = Dynamics(cell)
         self._state: Sensed | None = None
-        self.exceeded: Exceeded | None = None
-        """Of the newest sample."""
         self.permit(part)
 
     def permit(self, part: float) -> None:
         """Keep velocities within `part` of their limits. Raises `RobotError`."""
         cell = self._cell
-        kept = kept_bounds(cell, self._joints, part)
+        kept = kept_bounds(cell, part)
         off = cell.encoders.off
         self._low = cell.bounds.position[:, 0] - off
         self._high = cell.bounds.position[:, 1] + off
@@ -121,18 +102,18 @@ class GuardedArm:
             return refused
         state = self._state
         assert state is not None, "it is sensed before it is driven"
-        if self.exceeded is not None:
+        if arm.exceeded is not None:
             arm.brake()
-            return self.exceeded.finding
+            return arm.exceeded.finding
         torque, cut = self._gate.admit(torque, state.position, state.velocity)
         arm.clipped += cut
         return arm.drive(torque, grip_force)
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Pass on the set points, as the limits permit them (`SetPointGate`); see `Link.follow`."""
-        if self.exceeded is not None:
+        if self._arm.exceeded is not None:
             self._arm.brake()
-            return self.exceeded.finding
+            return self._arm.exceeded.finding
         state = self._state
         assert state is not None, "it is sensed before it is driven"
         passed = self._set_points.admit(target, state.position, state.velocity)
@@ -144,7 +125,7 @@ class GuardedArm:
         far = ~((q >= self._low) & (q <= self._high))
         fast = ~(np.abs(sample.velocity) <= self._fastest)
         if not (far.any() or fast.any()):
-            self.exceeded = None
+            self._arm.exceeded = None
             return
         joint = int((far | fast).argmax())
         if far[joint]:
@@ -155,7 +136,7 @@ class GuardedArm:
             value = float(sample.velocity[joint])
             permitted = f"up to {self._fastest[joint]:g} rad/s"
             what = f"velocity {value:.4g} rad/s"
-        text = f"{what} of joint '{self._joints[joint]}' as sensed; permitted: {permitted}"
+        text = f"{what} of joint '{self._cell.joints[joint]}' as sensed; permitted: {permitted}"
         arm = self._arm
         finding = Finding(Alarm.LIMIT_EXCEEDED, joint, value)
         if arm.state is DriveState.ENABLED:  # before that it is moved by others
@@ -163,4 +144,4 @@ class GuardedArm:
             arm.first_violation = arm.first_violation or f"{text}, at tick {sample.tick}"
             arm.find(finding)
             arm.brake_cause = Error.LIMIT
-        self.exceeded = Exceeded(finding, text)
+        arm.exceeded = Exceeded(finding, text)

@@ -73,7 +73,7 @@ class Plant:
     def save(self, state: ArmState) -> None:
         """Fill an `ARM_STATE` with the state that a restarted board needs. Default: the attributes.
 
-        A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.state`.
+        A simulation adds its state: `state.state` has room for it, see `rack.levels.robot.engine`.
         """
         self.report_cycle()
         state.tick = self.tick

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.levels.algebra import Array, solve
-from rack.levels.arm.arm import Arm, JointTarget, Sensed, copied
+from rack.levels.arm.braked_arm import BrakedArm
+from rack.levels.arm.drivable import JointTarget, Link, Sensed, copied
 from rack.levels.level import Finding
-from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
 
 
@@ -32,6 +32,13 @@ class Present(NamedTuple):
     )
 
 
+def present_link(arm: BrakedArm, tick_s: float) -> Link:
+    """Return the link to an arm through which samples are of the present: the arm, if they are."""
+    encoders = arm.cell.encoders
+    is_present = encoders.offset is None and not encoders.latency_ticks
+    return arm if is_present else PresentLink(arm, tick_s)
+
+
 class PresentLink:
     """Implements `Link` around an arm whose samples are up to `robot.latency_ticks` old, and off by
     `robot.calibration.offset`.
@@ -41,7 +48,8 @@ class PresentLink:
     is passed on as it is.
     """
 
-    def __init__(self, arm: Arm, cell: Cell, tick_s: float) -> None:
+    def __init__(self, arm: BrakedArm, tick_s: float) -> None:
+        cell = arm.cell
         self._arm = arm
         self._offset = cell.encoders.offset
         self._braking = cell.limits.acceleration

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 
 from rack.levels.algebra import Array, mat_vec
-from rack.levels.arm.arm import Arm, JointTarget, Sensed, copied
-from rack.levels.arm.drives import LimitGate
+from rack.levels.arm.arm import Arm
+from rack.levels.arm.drivable import JointTarget, Sensed, copied
+from rack.levels.arm.drives import LimitGate, SetPointGate
 from rack.levels.arm.sensors import CoarseSensors, WristSensor
-from rack.levels.arm.set_points import SetPointGate
 from rack.levels.arm.simulation import Simulation
 from rack.levels.level import Finding
 from rack.levels.messages import ArmState
@@ -23,6 +23,8 @@ from rack.levels.tables import SceneConfig, SensorConfig
 
 STANDSTILL = 0.01
 """Joint speed, rad/s, below which a joint holds its position."""
+BRAKE_BANDWIDTH = 20.0
+"""Of the hold by the brakes, rad/s."""
 POSITION_GAIN = 25.0
 VELOCITY_GAIN = 100.0
 INTEGRAL_GAIN = 10.0
@@ -54,7 +56,7 @@ class SimulatedArm(Simulation, Arm):
         self._gripper = cell.gripper
         dynamics = self.dynamics
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, clock_ns * 1e-9, dynamics)
-        self._brake = Brake(cell.limits.acceleration, dynamics, cell.begin)
+        self._rest: Array = cell.begin.copy()  # (joints,), rad: where brakes hold the joints
         self._most: Array | None = None  # (joints,), N m: torques of weakened motors
         self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
         self._latency = cell.encoders.latency_ticks
@@ -81,12 +83,14 @@ class SimulatedArm(Simulation, Arm):
     @property
     def holds(self) -> bool:
         """Whether the gripper touches a part."""
-        return bool(self._contacts.held(self._data).any())
+        return bool(self._held().any())
 
     @property
     def leans(self) -> bool:
         """Whether the arm, or its load, touches anything else."""
-        return self._contacts.leans(self._data)
+        contact = self._data.contact
+        one_sided = self._ours()[contact.geom].sum(axis=1) == 1
+        return bool((one_sided & (contact.dist < 0.0)).any())
 
     def sense(self) -> Sensed:
         """Return joint positions and velocities, rad, rad/s, and the gripper's, m, m/s."""
@@ -148,7 +152,7 @@ class SimulatedArm(Simulation, Arm):
     def _engage(self) -> None:
         if not self.braked:
             self.braked = True
-            self._brake.hold_at(self._state[0])
+            np.copyto(self._rest, self._state[0])
 
     def weaken(self, most: Array | None) -> None:
         """Limit the motors to `most` (joints,), N m, from the next command on; None: they are
@@ -183,14 +187,14 @@ class SimulatedArm(Simulation, Arm):
     def save(self, state: ArmState) -> None:
         """Fill an `ARM_STATE`."""
         super().save(state)
-        state.rest = self._brake.rest
+        state.rest = self._rest
 
     def restore(self, state: ArmState) -> None:
         """Continue, bit for bit, from an `ARM_STATE`; its last torques are the last command."""
         super().restore(state)
         d = self._data
         cell = self.cell
-        np.copyto(self._brake.rest, state.rest)
+        np.copyto(self._rest, state.rest)
         np.take(d.ctrl, cell.actuators, out=self._command)
         np.copyto(self.torque, self._command)
         if self._gripper is not None:
@@ -205,7 +209,7 @@ class SimulatedArm(Simulation, Arm):
         braked = self.braked
         q, qd = self._state
         if braked:
-            torque = self._brake.torque(q, qd)
+            torque = self._braking_torque(q, qd)
         elif self._drives is None:
             torque = self._command
         else:
@@ -218,30 +222,14 @@ class SimulatedArm(Simulation, Arm):
         self._data.ctrl[cell.actuators] = given
         self._given = True
 
-
-class Brake:
-    """Stops the joints and holds them where they came to rest, even with the motors off."""
-
-    def __init__(
-        self, braking: Array, dynamics: Dynamics, rest: Array, stiffness: float = 20.0
-    ) -> None:
-        """Stop with at most `braking` (joints,), rad/s2; `stiffness`, rad/s, is the bandwidth of
-        the hold."""
-        self._braking = braking
-        self._dynamics = dynamics
-        self._stiffness = stiffness
-        self.rest: Array = rest.copy()  # (joints,), rad: where the joints came to rest
-
-    def hold_at(self, q: Array) -> None:
-        """Engage at positions `q`, (joints,), rad."""
-        np.copyto(self.rest, q)
-
-    def torque(self, q: Array, qd: Array) -> Array:
-        """Return the torques (joints,), N m, that stop or hold the arm at state `q`, `qd`."""
-        np.copyto(self.rest, q, where=np.abs(qd) > STANDSTILL)
-        wanted = self._stiffness**2 * (self.rest - q) - 2.0 * self._stiffness * qd
-        inertia, bias = self._dynamics.terms(q, qd)
-        return np.asarray(mat_vec(inertia, np.clip(wanted, -self._braking, self._braking)) + bias)
+    def _braking_torque(self, q: Array, qd: Array) -> Array:
+        """Return the torques (joints,), N m, that stop the joints, or hold them where they came to
+        rest, even with the motors off."""
+        most = self.cell.limits.acceleration
+        np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
+        wanted = BRAKE_BANDWIDTH**2 * (self._rest - q) - 2.0 * BRAKE_BANDWIDTH * qd
+        inertia, bias = self.dynamics.terms(q, qd)
+        return np.asarray(mat_vec(inertia, np.clip(wanted, -most, most)) + bias)
 
 
 class CascadedDrives:

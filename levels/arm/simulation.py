@@ -4,7 +4,6 @@ itself in it."""
 from __future__ import annotations
 
 from copy import copy
-from itertools import pairwise
 from typing import ClassVar
 
 import mujoco
@@ -17,10 +16,9 @@ from rack.levels.arm.plant import Plant
 from rack.levels.arm.substeps import advance, copy_state, substeps
 from rack.levels.level import Finding
 from rack.levels.messages import ArmState, Scene
-from rack.levels.robot.cell import Cell, unintended_contacts
-from rack.levels.robot.engine import INTEGRATION, mj_update_sleep
+from rack.levels.robot.cell import unintended_contacts
+from rack.levels.robot.engine import SLEEP, mj_update_sleep, view_state
 from rack.levels.robot.lookup import geom_name
-from rack.levels.robot.state import SLEEP, view_state
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
@@ -55,17 +53,14 @@ class Simulation(Plant):
             self._steps.seen[-1, 1],
         )  # (joints,): true positions and velocities
         self._refresh()
-        self._contacts = Contacts(cell)
+        self._is_arm, self._is_gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
+        self._is_arm[cell.arm_geoms] = self._is_gripper[cell.gripper_geoms] = True
+        self._root = cell.model.body_rootid[cell.model.geom_bodyid]
         obstacles = zip(
             cell.mocap, cell.bodies[len(cell.object_qpos) :], scene.obstacles, strict=True
         )
         self._motions = [
-            (
-                mocap,
-                ObstacleMotion(
-                    cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name)
-                ),
-            )
+            (mocap, cell.model.body_pos[body], tuple(m for m in scene.motion if m.body == name))
             for mocap, body, name in obstacles
         ]
         self._pushes = [
@@ -114,8 +109,8 @@ class Simulation(Plant):
 
     def _simulate(self) -> None:
         """Simulate one tick."""
-        for mocap, motion in self._motions:
-            self._data.mocap_pos[mocap] = motion.position(self._now_s)
+        for mocap, start, moves in self._motions:
+            self._data.mocap_pos[mocap] = obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = push_force(pushes, self._now_s)
         made = self._advance(0, self._after_s, *self._steps)
@@ -155,9 +150,20 @@ class Simulation(Plant):
             named = self.named(pairs[0])
             self.first_touch = f"unintended contact: {named} at {self._data.time:.3f} s"
         self.touches += len(pairs)
-        ours = pairs[self._contacts.ours(self._data)[pairs].any(axis=1)]
+        ours = pairs[self._ours()[pairs].any(axis=1)]
         if len(ours):
             self.contact = int(ours[0, 0]), int(ours[0, 1])
+
+    def _held(self) -> Mask:
+        """Mark (ngeom,) the geoms of free bodies that the gripper touches."""
+        pairs = self._data.contact.geom
+        others = pairs[self._is_gripper[pairs].any(axis=1)].ravel()
+        roots = self._root[others[~self._is_arm[others]]]
+        return np.asarray(np.isin(self._root, roots[roots != 0]))
+
+    def _ours(self) -> Mask:
+        """Mark (ngeom,) the geoms of the arm and of its load."""
+        return np.asarray(self._is_arm | self._held())
 
     def _judge_limits(self) -> bool:
         """Judge position, velocity and torque, of motor and brake together, in every step of a
@@ -184,10 +190,8 @@ class Simulation(Plant):
         part, joint = (int(at[0]) for at in np.nonzero(wrong[step]))
         value = float(self._steps.seen[step, part, joint])
         if not self.first_violation:
-            model = self.cell.model
-            name = model.joint(int(model.dof_jntid[self.cell.dof[joint]])).name
             what, unit = QUANTITIES[part]
-            where = f"joint '{name}' at {self._now_s:.4f} s, step {step}"
+            where = f"joint '{self.cell.joints[joint]}' at {self._now_s:.4f} s, step {step}"
             low, high = self._steps.judged[:2, part, joint]
             permitted = f"{low:g} to {high:g} is permitted"
             self.first_violation = f"{what} {value:.6g} {unit} of {where}; {permitted}"
@@ -204,51 +208,20 @@ class Simulation(Plant):
         return ""
 
 
-class Contacts:
-    """Tells which contacts of a cell are those of the arm, or of its load."""
-
-    def __init__(self, cell: Cell) -> None:
-        self._arm, self._gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
-        self._arm[cell.arm_geoms] = self._gripper[cell.gripper_geoms] = True
-        self._root = cell.model.body_rootid[cell.model.geom_bodyid]
-
-    def ours(self, data: mujoco.MjData) -> Mask:
-        """Mark (ngeom,) the geoms of the arm and of its load."""
-        return np.asarray(self._arm | self.held(data))
-
-    def leans(self, data: mujoco.MjData) -> bool:
-        """Return whether the arm, or its load, touches anything else."""
-        one_sided = self.ours(data)[data.contact.geom].sum(axis=1) == 1
-        return bool((one_sided & (data.contact.dist < 0.0)).any())
-
-    def held(self, data: mujoco.MjData) -> Mask:
-        """Mark (ngeom,) the geoms of free bodies that the gripper touches."""
-        pairs = data.contact.geom
-        others = pairs[self._gripper[pairs].any(axis=1)].ravel()
-        roots = self._root[others[~self._arm[others]]]
-        return np.asarray(np.isin(self._root, roots[roots != 0]))
-
-
-class ObstacleMotion:
-    """The moves of one obstacle; a move that starts before the last one has ended cuts it short."""
-
-    def __init__(self, start: Array, moves: tuple[MotionConfig, ...]) -> None:
-        """Start at the place `start`, (3,), m."""
-        self._start = np.array(start)
-        self._moves = tuple(sorted(moves, key=lambda move: move.at))
-        self._ends = (*(later.at for _, later in pairwise(self._moves)), np.inf)
-
-    def position(self, time_s: float) -> Array:
-        """Return the obstacle's origin (3,), m, at simulated `time_s`."""
-        place = self._start
-        for move, end in zip(self._moves, self._ends, strict=False):
-            if time_s <= move.at:
-                break
-            way = np.array(move.to) - place
-            length = norm(way)
-            driven = move.speed * (min(time_s, end) - move.at)
-            place = np.array(move.to) if driven >= length else place + way * (driven / length)
-        return place
+def obstacle_position(start: Array, moves: tuple[MotionConfig, ...], time_s: float) -> Array:
+    """Return the origin of an obstacle that starts at `start`, (3,), m, at simulated `time_s`; a
+    move that starts before the last one has ended cuts it short."""
+    ordered = sorted(moves, key=lambda move: move.at)
+    ends = (*(later.at for later in ordered[1:]), np.inf)
+    place = start
+    for move, end in zip(ordered, ends, strict=False):
+        if time_s <= move.at:
+            break
+        way = np.array(move.to) - place
+        length = norm(way)
+        driven = move.speed * (min(time_s, end) - move.at)
+        place = np.array(move.to) if driven >= length else place + way * (driven / length)
+    return place
 
 
 def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
@@ -282,13 +255,6 @@ def sleeping(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
     if not (lingers or scene.motion or tendons.any() or model.nflex):
         option.enableflags |= SLEEP
     return found
-
-
-def save_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Fill `state`, (state_size,)."""
-    trees = state.size - model.ntree
-    mujoco.mj_getState(model, data, state[:trees], INTEGRATION)
-    state[trees:] = data.tree_asleep
 
 
 def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:

@@ -19,8 +19,8 @@ from rack.levels.robot.engine import (
     mj_set_state,
     mj_step,
     one_view,
+    state_size,
 )
-from rack.levels.robot.state import state_size
 
 TIME = int(mujoco.mjtState.mjSTATE_TIME)
 PHYSICS = int(mujoco.mjtState.mjSTATE_PHYSICS)
@@ -75,7 +75,7 @@ def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int)
 
 @compiled_for("i8, i8, i4[::1], f8[::1]")
 def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -> None:
-    """Fill `state` as `save_state` does; `asleep` is MuJoCo's `tree_asleep`."""
+    """Fill `state`, (state_size,), of which `asleep`, MuJoCo's `tree_asleep`, is the end."""
     mj_get_state(model, data, state.ctypes.data, INTEGRATION)
     first = len(state) - len(asleep)
     for tree in range(len(asleep)):

@@ -142,10 +142,11 @@ class ElementalMovePlanner(Planner):
     def plan(self, tick: int) -> None:
         """Make the path of one move, or give the reason why there is none."""
         job = self._job
+        plan = self.output
         assert job is not None, "plan is called only when one is wanted"
-        self.output.clear()
-        self.output.move = job.move.id
-        self.output.replan = job.request
+        plan.clear()
+        plan.move = job.move.id
+        plan.replan = job.request
         visible_at = tick + self.context.every * self.context.within_cycles
         try:
             situation = self._situation(job.move)
@@ -153,8 +154,8 @@ class ElementalMovePlanner(Planner):
                 job.move, job.start, situation, attempt=self._tries, goal=job.goal
             )
         except Refused as refused:
-            self.output.error = Error(refused.code)
-            self.output.reason = str(refused)
+            plan.error = Error(refused.code)
+            plan.reason = str(refused)
             again_at = visible_at + round(self._params.retry / self.context.tick_s)
             self._refusal = Refusal(
                 job.move.id, job.request, refused.code, self.world.message.revision, again_at
@@ -164,9 +165,9 @@ class ElementalMovePlanner(Planner):
                 self._published = [p for p in self._published if p.move.id < job.move.id]
             return
         count = len(path.waypoints)
-        self.output.kind = SegmentKind.PATH
-        self.output.count = count
-        self.output.waypoints[:count], self.output.blend[:count] = path
+        plan.kind = SegmentKind.PATH
+        plan.count = count
+        plan.waypoints[:count], plan.blend[:count] = path
         self._note_path(job, path, visible_at)
 
     def _requested(self, tick: int) -> PlanningJob | None:

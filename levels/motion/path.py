@@ -85,20 +85,20 @@ class BlendedPath:
         self.stops: list[float] = []  # s of the corners where motion must come to rest, rad
         pieces, breaks = self._lay_pieces()
         self.breaks = np.array(breaks)  # (pieces + 1,), rad: s where each piece begins, and the end
-        at = np.array([at for at, _ in pieces])
-        before = np.array([at - (b > 0.0) for at, b in pieces])
-        blends = np.array([[b] for _, b in pieces])
+        at, radius = (np.array(column) for column in zip(*pieces, strict=True))
+        before = at - (radius > 0.0)
+        blends = radius[:, None]
         changes = np.where(blends > 0.0, self._changes[at], 0.0)
         # The rows of `set_point`.
         self._marks = np.hstack((self.breaks[:-1, None], self._corners[at, None], blends))
         self._table = np.stack((points[at], directions[before], changes), axis=1)
         self._point = np.zeros((3, self.joints))
         changes = np.abs(changes)
-        widths = [b or math.inf for _, b in pieces]
+        widths = np.where(blends > 0.0, blends, np.inf)
         self.bounds = PathBounds(
             np.maximum(np.abs(directions[before]), np.abs(directions[at])),
-            0.75 * changes / np.array([[b] for b in widths]),
-            1.5 * changes / np.array([[b**2] for b in widths]),
+            0.75 * changes / widths,
+            1.5 * changes / widths**2,
         )
 
     def evaluate(self, s: float) -> PathPoint:

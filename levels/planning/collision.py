@@ -63,24 +63,20 @@ class CollisionChecker:
 
     def __init__(self, cell: Cell, scene: SceneConfig, margin: float = 0.0) -> None:
         self.cell = cell
-        self._margin = margin
         self.clearance = scene.clearance  # m
         self.held: int | None = None  # row of the object that is carried
         self._touched: int | None = None
-        self._model = copy.copy(cell.model)
+        self._margin = margin
+        self._row_geoms = [cell.parts(row) for row in range(len(cell.bodies))]
+        self._offset = np.zeros(7)  # pose of the held object in the tool's frame: m; w, x, y, z
+        self._model = restricted_to_arm(cell, self.clearance, margin)
+        self._types = np.stack((self._model.geom_contype, self._model.geom_conaffinity))
         self._data = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
-        self._row_geoms = [
-            np.flatnonzero(self._model.body_rootid[self._model.geom_bodyid] == b)
-            for b in cell.bodies
-        ]
-        self._offset = np.zeros(7)  # pose of the held object in the tool's frame: m; w, x, y, z
         # Fingers that swing may reach farther than open as they close: a load is planned with them
         # so.
         self.longest = self._longest() if margin > 0.0 else None
-        self._types = self._filter_to_arm()
-        self._base = self._required_distances()
-        self._ease_at_home()
+        self._base = required_distances(cell, self._model, self.clearance, margin)
         self._required = self._base.copy()
         self._one = np.zeros((1, len(cell.qpos)))  # room for one configuration to check
         self._least = np.inf  # m: the clearance of the last configuration checked
@@ -185,58 +181,6 @@ class CollisionChecker:
             np.minimum(self._required[pairs[:, 0], pairs[:, 1]], self._least) - contact.dist
         )
 
-    def _filter_to_arm(self) -> NDArray[np.int32]:
-        """Restrict MuJoCo to the pairs that involve the arm, a tenth of the work, but for those
-        within the gripper. Return contact types and affinities, (2, geoms)."""
-        m = self._model
-        solid = (m.geom_contype | m.geom_conaffinity) != 0
-        arm = np.zeros(m.ngeom, dtype=bool)
-        arm[self.cell.arm_geoms] = True
-        m.geom_contype[:] = LINK * (arm & solid)
-        m.geom_conaffinity[:] = (LINK | GRIPPER | LOAD) * solid
-        m.geom_contype[self.cell.gripper_geoms] *= GRIPPER
-        m.geom_conaffinity[self.cell.gripper_geoms] &= LINK
-        # MuJoCo adds the margins of the two geoms: two links find each other within twice the
-        # margin.
-        set_margins(m, np.where(arm, self._margin, self.clearance))
-        m.geom_gap[:] = 0.0
-        m.pair_margin[:] = self.clearance
-        return np.stack((m.geom_contype, m.geom_conaffinity))
-
-    def _required_distances(self) -> Array:
-        """Return (geoms, geoms), in m: the clearance between arm and cell, the margin between links
-        that may collide."""
-        m = self.cell.model
-        arm = self.cell.arm_geoms
-        typ = m.geom_contype
-        affinity = m.geom_conaffinity
-        collide = (typ[:, None] & affinity[None, :]) | (typ[None, :] & affinity[:, None]) != 0
-        required = np.full((m.ngeom, m.ngeom), ANY_DISTANCE)
-        required[arm, :] = self.clearance
-        required[:, arm] = self.clearance
-        own = np.union1d(arm, self._carriers())
-        for some, others in ((arm, own), (own, arm)):
-            required[np.ix_(some, others)] = np.where(
-                collide[np.ix_(some, others)], self._margin, ANY_DISTANCE
-            )
-        # Links of a gripper meet at their pins, and its motion is not planned.
-        required[np.ix_(self.cell.gripper_geoms, self.cell.gripper_geoms)] = ANY_DISTANCE
-        return required
-
-    def _ease_at_home(self) -> None:
-        """Require of links that are close to each other at home, or the first to what is fixed,
-        only half their distance there: some always are."""
-        m = self._model
-        mujoco.mj_fwdPosition(m, self._data)
-        contact = self._data.contact
-        own = np.isin(np.arange(m.ngeom), (*self.cell.arm_geoms, *self._carriers()))
-        foot = np.isin(m.body_weldid[m.geom_bodyid], (0, m.dof_bodyid[self.cell.dof[0]]))
-        for pair, distance in zip(contact.geom, contact.dist, strict=True):
-            if own[pair].all() or foot[pair].all():
-                one, other = pair
-                eased = min(self._base[one, other], max(0.5 * distance, 0.0))
-                self._base[one, other] = self._base[other, one] = eased
-
     def _longest(self) -> float | None:
         """Return the opening at which the gripper reaches farthest along the tool; None: when
         open."""
@@ -253,17 +197,6 @@ class CollisionChecker:
         self.open_gripper(gripper.open)
         reached, opening = max(found)
         return float(opening) if reached > found[0][0] + self._margin else None
-
-    def _carriers(self) -> Ints:
-        """Return the geoms of the fixed bodies that carry the arm: some links are always near
-        them."""
-        m = self.cell.model
-        body = m.body_parentid[m.dof_bodyid[self.cell.dof[0]]]
-        chain = []
-        while body > 0:
-            chain.append(body)
-            body = m.body_parentid[body]
-        return np.flatnonzero(np.isin(m.geom_bodyid, chain))
 
     def _apply(self) -> None:
         """Set the required distances for the held object and the one that may be touched."""
@@ -290,6 +223,65 @@ class CollisionChecker:
     def _require(self, some: Ints, others: Ints, distance: float) -> None:
         self._required[some[:, None], others] = distance
         self._required[others[:, None], some] = distance
+
+
+def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
+    """Return a model of the cell in which MuJoCo finds close pairs that involve the arm, a tenth of
+    the work, but for those within the gripper."""
+    model = copy.copy(cell.model)
+    solid = (model.geom_contype | model.geom_conaffinity) != 0
+    arm = np.isin(np.arange(model.ngeom), cell.arm_geoms)
+    model.geom_contype[:] = LINK * (arm & solid)
+    model.geom_conaffinity[:] = (LINK | GRIPPER | LOAD) * solid
+    model.geom_contype[cell.gripper_geoms] *= GRIPPER
+    model.geom_conaffinity[cell.gripper_geoms] &= LINK
+    # MuJoCo adds the margins of the two geoms: two links find each other within twice the margin.
+    set_margins(model, np.where(arm, margin, clearance))
+    model.geom_gap[:] = 0.0
+    model.pair_margin[:] = clearance
+    return model
+
+
+def required_distances(
+    cell: Cell, restricted: mujoco.MjModel, clearance: float, margin: float
+) -> Array:
+    """Return (geoms, geoms), in m: the clearance between arm and cell, the margin between links
+    that may collide.
+
+    Links that are close to each other at home, or the first to what is fixed, keep only half their
+    distance there: some always are. So are some to the fixed bodies that carry the arm.
+    """
+    model = cell.model
+    arm = cell.arm_geoms
+    gripper = cell.gripper_geoms
+    first = model.dof_bodyid[cell.dof[0]]
+    carriers = []
+    body = model.body_parentid[first]
+    while body > 0:
+        carriers.append(body)
+        body = model.body_parentid[body]
+    own = np.union1d(arm, np.flatnonzero(np.isin(model.geom_bodyid, carriers)))
+    kinds = model.geom_contype
+    affinity = model.geom_conaffinity
+    collide = (kinds[:, None] & affinity[None, :]) | (kinds[None, :] & affinity[:, None]) != 0
+    required = np.full((model.ngeom, model.ngeom), ANY_DISTANCE)
+    required[arm, :] = required[:, arm] = clearance
+    for some, others in ((arm, own), (own, arm)):
+        pairs = np.ix_(some, others)
+        required[pairs] = np.where(collide[pairs], margin, ANY_DISTANCE)
+    # Links of a gripper meet at their pins, and its motion is not planned.
+    required[np.ix_(gripper, gripper)] = ANY_DISTANCE
+    data = mujoco.MjData(restricted)
+    mujoco.mj_resetDataKeyframe(restricted, data, 0)
+    mujoco.mj_fwdPosition(restricted, data)
+    is_own = np.isin(np.arange(model.ngeom), own)
+    is_foot = np.isin(model.body_weldid[model.geom_bodyid], (0, first))
+    for pair, distance in zip(data.contact.geom, data.contact.dist, strict=True):
+        if is_own[pair].all() or is_foot[pair].all():
+            one, other = pair
+            eased = min(required[one, other], max(0.5 * distance, 0.0))
+            required[one, other] = required[other, one] = eased
+    return required
 
 
 def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike) -> float:

@@ -8,7 +8,7 @@ products depend on the processor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -120,7 +120,8 @@ class InverseKinematics:
         rng = np.random.default_rng(self._seed)
         found: list[Array] = []
         idle = 0
-        for start in self._starts(reference, rng, restarts):
+        start = reference
+        for _ in range(1 + restarts):
             q = self.reach(target, start, turned)
             known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in found)
             idle = idle + 1 if known else 0
@@ -128,17 +129,13 @@ class InverseKinematics:
                 found.append(q)
             if len(found) == MAX_SOLUTIONS or (found and idle >= MAX_IDLE_STARTS):
                 break
+            start = rng.uniform(self._low, self._high)
         return sorted(found, key=lambda q: self.time_between(reference, q))
 
     def time_between(self, one: Array, other: Array) -> float:
         """Return the time, in s, of the slowest joint from `one` to `other` at its velocity
         limit."""
         return float(np.max(np.abs(one - other) * self._pace))
-
-    def _starts(self, reference: Array, rng: np.random.Generator, restarts: int) -> Iterable[Array]:
-        yield reference
-        for _ in range(restarts):
-            yield rng.uniform(self._low, self._high)
 
     def _error(self, target: Pose, q: Array) -> Array:
         """Return (6,): the way, m, and the turn, rad, from the tool at `q` to `target`; world

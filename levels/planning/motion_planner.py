@@ -15,11 +15,10 @@ from rack.levels.motion import path as paths
 from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.planning import collision, path_planner
 from rack.levels.planning.collision import CollisionChecker
-from rack.levels.planning.fixed_jaw import find_fixed_jaw
 from rack.levels.planning.ik import SAME_RAD, InverseKinematics
 from rack.levels.planning.moves import VERB_NAMES, Move, Situation
 from rack.levels.planning.path_planner import MAX_SEARCHES, FirstBlocked, PathPlanner
-from rack.levels.planning.payload import Payloads
+from rack.levels.planning.payload import Payloads, find_fixed_jaw
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
@@ -104,7 +103,13 @@ class MotionPlanner:
         """Return the configuration at the end of a free motion, with the checker as it is set.
         Raises `Refused`."""
         if move.verb is Verb.MOVE_JOINTS:
-            self._check_limits(move)
+            low, high = self.cell.limits.position.T
+            beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
+            if beyond.size:
+                j = int(beyond[0])
+                where = f"joint '{self.cell.joints[j]}' to {move.joints[j]:.4g} rad"
+                valid = f"valid: {low[j]:.4g} to {high[j]:.4g}"
+                raise Refused(Error.UNREACHABLE, f"{where}; {valid}")
             return move.joints
         if move.posture:
             near = self.ik.nearby(move.tool, move.joints)
@@ -162,17 +167,6 @@ class MotionPlanner:
         arm."""
         room = self.checker.room(start)
         return self.clearance if room >= self.clearance else max(CLOSE_PART * room, 0.0)
-
-    def _check_limits(self, move: Move) -> None:
-        low, high = self.cell.limits.position.T
-        beyond = np.flatnonzero((move.joints < low) | (move.joints > high))
-        if beyond.size:
-            j = int(beyond[0])
-            name = self.cell.model.joint(self.cell.model.dof_jntid[self.cell.dof[j]]).name
-            raise Refused(
-                Error.UNREACHABLE,
-                f"joint '{name}' to {move.joints[j]:.4g} rad; valid: {low[j]:.4g} to {high[j]:.4g}",
-            )
 
 
 def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:

@@ -1,10 +1,16 @@
-"""Whether the arm can carry an object: its weight against the friction of the grip and the torques
-of the motors.
+"""Whether the arm can carry an object, and a jaw that stands still.
 
-The grip is known if a straight line through the tool's origin, along its y axis, hits the object
-and a finger on either side, as in every grasp that the task level plans. Virtual work over the
-linkage, of any kind, gives the force there from the actuator's. If the line misses, the grip is
-unknown and only the motors are checked.
+The weight of an object is compared with the friction of the grip and the torques of the motors. The
+grip is known if a straight line through the tool's origin, along its y axis, hits the object and a
+finger on either side, as in every grasp that the task level plans. Virtual work over the linkage,
+of any kind, gives the force there from the actuator's. If the line misses, the grip is unknown and
+only the motors are checked.
+
+Where one finger closes on a jaw that stands still, a grasp brings the tool so far aside that the
+jaw is next to the object, and the finger does not push it far. The jaw is that part of the gripper,
+unmoved by its joint, which the same line meets on one side. Distances are those of MuJoCo's
+contacts, which know meshes by their hulls: a jaw whose hull slants meets an object with an edge,
+and that counts.
 """
 
 from __future__ import annotations
@@ -50,10 +56,6 @@ class Payloads:
         self._dynamics = Dynamics(cell)
         self._data = cell.start()
         self._rest = np.zeros(len(cell.home))
-        model = cell.model
-        self._objects = [
-            np.flatnonzero(model.body_rootid[model.geom_bodyid] == body) for body in cell.bodies
-        ]
         self.jaws = self._closing()
 
     def check_grip(self, row: int, grip: Pose) -> None:
@@ -77,7 +79,7 @@ class Payloads:
             load = np.abs(self._dynamics.terms(q, self._rest, payload).bias)
             worst = int(np.argmax(load - limit))
             if load[worst] > limit[worst]:
-                joint = model.joint(int(model.dof_jntid[self._cell.dof[worst]])).name
+                joint = self._cell.joints[worst]
                 why = (
                     f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
                 )
@@ -103,7 +105,7 @@ class Payloads:
         most = float(model.actuator_forcerange[gripper.actuator, 1])
         force = min(most, gripper.stiffness * abs(narrow.opening - gripper.closed))
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
-        parts = self._objects[row]
+        parts = self._cell.parts(row)
         return normal * sum(
             max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms
         )
@@ -117,7 +119,7 @@ class Payloads:
         tool = pose(*site_pose(data, cell.tool))
         data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
-        parts = self._objects[row]
+        parts = self._cell.parts(row)
         return sum(
             RAY_RANGE_M - self._nearest(parts, RAY_RANGE_M * side, -side)[0] for side in SIDES
         )
@@ -195,3 +197,78 @@ def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
     if max(model.geom_condim[k] for k in mixed) == 1:
         return 0.0
     return float(max(model.geom_friction[k, 0] for k in mixed))
+
+
+GAP_M = 0.002
+"""Between jaw and object before the finger closes: at 0 the jaw could come down on its edge."""
+FARTHEST_M = 0.2
+"""From the tool: where the search begins, and where it ends on the jaw's side."""
+NEAR_M = 1e-4
+"""At this distance from the jaw the search ends."""
+STEPS = 200
+MOVED = 1e-6
+"""In a pose, from open to closed: rounding."""
+
+
+class FixedJaw:
+    """The jaw of a cell's gripper, and the geoms that stand still with it."""
+
+    def __init__(self, cell: Cell, geoms: Ints, side: float) -> None:
+        self._cell = cell
+        self._geoms = geoms
+        self._side = side  # of the tool's y axis: 1 or -1
+        self._data = cell.start()
+
+    def beside(self, tool: Pose, row: int, seen: Pose) -> Pose:
+        """Return the pose of a tool that is to take object `row`, `seen` in the world, moved along
+        its y axis until the jaw is next to the object."""
+        here = site_pose(self._data, self._cell.tool)
+        relative = here @ tool.inverse() @ seen
+        along = self._side * self._data.site_xmat[self._cell.tool].reshape(3, 3)[:, 1]
+        way = -FARTHEST_M
+        for _ in range(STEPS):
+            room = self._distance(row, Pose(relative.position + way * along, relative.quaternion))
+            way += room
+            if room < NEAR_M or way > FARTHEST_M:
+                break
+        if way > FARTHEST_M:
+            return tool
+        across = np.zeros(3)
+        mujoco.mju_rotVecQuat(across, np.array([0.0, self._side, 0.0]), tool.quaternion)
+        return Pose(tool.position - (way - GAP_M) * across, tool.quaternion)
+
+    def _distance(self, row: int, at: Pose) -> float:
+        """Return the distance of object `row` from what stands still, m; 0: they touch."""
+        model = self._cell.model
+        data = self._data
+        address = self._cell.object_qpos[row]
+        data.qpos[address : address + 7] = np.concatenate(at)
+        mujoco.mj_kinematics(model, data)
+        distances = [
+            mujoco.mj_geomDistance(model, data, int(part), int(geom), FARTHEST_M, None)
+            for part in self._cell.parts(row)
+            for geom in self._geoms
+        ]
+        return max(0.0, float(min(distances)))
+
+
+def find_fixed_jaw(cell: Cell, payloads: Payloads) -> FixedJaw | None:
+    """Return the jaw that stands still; None: both sides of the gripper move, or it has none."""
+    gripper = cell.gripper
+    if gripper is None or not payloads.jaws:
+        return None
+    data = cell.start()
+    poses = []
+    for opening in (gripper.open, gripper.closed):
+        gripper.linkage.set(data.qpos, opening)
+        mujoco.mj_kinematics(cell.model, data)
+        poses.append(np.hstack((data.geom_xpos, data.geom_xmat)))
+    is_still = np.abs(poses[0] - poses[1]).max(axis=1) < MOVED
+    still = [
+        side for side, geom in zip(SIDES, payloads.jaws[0].geoms, strict=True) if is_still[geom]
+    ]
+    if len(still) != 1:
+        return None
+    solid = (cell.model.geom_contype | cell.model.geom_conaffinity) != 0
+    geoms = cell.gripper_geoms
+    return FixedJaw(cell, geoms[is_still[geoms] & solid[geoms]], still[0])

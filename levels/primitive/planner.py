@@ -46,6 +46,7 @@ class PrimitivePlanner(Planner):
 
     def plan(self, tick: int) -> None:
         """Time the wanted segment from its point of departure, or give the reason why not."""
+        plan = self.output
         status = self.status.message
         context = self.context
         serial = status.wants
@@ -53,30 +54,26 @@ class PrimitivePlanner(Planner):
         published = tick + context.within_cycles * context.every
         self._made = (serial, begin)
         self._answered_at = published + context.every
-        self.output.segment = serial
-        self.output.begin = begin
-        self.output.duration = 0.0
-        self.output.earliest = 0.0
-        self.output.count = 0
+        plan.segment = serial
+        plan.begin = begin
+        plan.duration = 0.0
+        plan.earliest = 0.0
+        plan.count = 0
         fault: SegmentFault | None = None
         try:
             segment = read_segment(self.above.message, serial)
             trajectory = make_trajectory(self._path(segment), self._rules.limits, begin)
             start_s = max((published + context.every) * context.tick_s, status.ends)
             sections = trajectory.sections
-            self.output.duration = trajectory.duration
-            self.output.count = len(sections)
-            self.output.sections[: len(sections)] = sections
-            self.output.earliest = start_s + trajectory.duration + self._rules.latency_s
-            if trajectory.begin == 0.0 and 0.0 < segment.by < self.output.earliest:
-                fault = segment.too_late(self.output.earliest)
+            plan.duration = trajectory.duration
+            plan.count = len(sections)
+            plan.sections[: len(sections)] = sections
+            plan.earliest = start_s + trajectory.duration + self._rules.latency_s
+            if trajectory.begin == 0.0 and 0.0 < segment.by < plan.earliest:
+                fault = segment.too_late(plan.earliest)
         except (ValueError, ArithmeticError) as error:
             fault = SegmentFault(Error.LIMIT, f"segment {serial}: {error}")
-        self.output.error, self.output.reason, self.output.earliest = fault or (
-            Error.NONE,
-            "",
-            self.output.earliest,
-        )
+        plan.error, plan.reason, plan.earliest = fault or (Error.NONE, "", plan.earliest)
 
     def _path(self, segment: MotionSegment) -> BlendedPath:
         """Return the segment's path. Raises `ValueError` for one that is invalid or leaves a

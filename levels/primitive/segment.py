@@ -9,8 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.levels.algebra import Array
-from rack.levels.messages import Error, JointCommand, MoveCommand, PrimitiveStatus, SegmentKind
+from rack.levels.messages import (
+    Error,
+    JointCommand,
+    MoveCommand,
+    MoveSegment,
+    PrimitiveStatus,
+    SegmentKind,
+)
 from rack.levels.motion.path import BlendedPath
 
 
@@ -22,23 +28,12 @@ class SegmentFault(NamedTuple):
     earliest: float = 0.0  # with TOO_LATE: the simulated time that could be met, s
 
 
-@dataclass(frozen=True)
-class MotionSegment:
-    """A copy of one SEGMENT; see there for units. `object` is -1 for none."""
-
-    id: int
-    kind: SegmentKind
-    object: int
-    touch: bool
-    waypoints: Array  # (count, joints)
-    blend: Array  # (count,)
-    by: float
-    opening: float
-    force: float
+class MotionSegment(MoveSegment):
+    """A copy of one segment of a `MoveCommand`."""
 
     def path(self) -> BlendedPath:
         """Return the segment's path. Raises `ValueError` for an invalid one."""
-        return BlendedPath(self.waypoints, self.blend)
+        return BlendedPath(self.waypoints[: self.count], self.blend[: self.count])
 
     def too_late(self, earliest_s: float) -> SegmentFault:
         """Return the fault of a segment that cannot be done before `earliest_s`."""
@@ -61,23 +56,13 @@ def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
     Raises `ValueError` for an unknown kind and for numbers that are not finite.
     """
     record = command.segments[window(command).index(serial)]
-    count = int(record["count"])
-    kind = int(record["kind"])
-    if kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):
-        raise ValueError(f"segment {serial}: kind {kind}; valid: 1 (path), 2 (gripper)")
-    if not np.isfinite([record["by"], record["opening"], record["force"]]).all():
+    segment = MotionSegment(record.dtype)
+    segment.record[...] = record
+    if segment.kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):
+        raise ValueError(f"segment {serial}: kind {segment.kind}; valid: 1 (path), 2 (gripper)")
+    if not np.isfinite([segment.by, segment.opening, segment.force]).all():
         raise ValueError(f"segment {serial}: by, opening or force is not finite")
-    return MotionSegment(
-        id=serial,
-        kind=SegmentKind(kind),
-        object=int(record["object"]),
-        touch=bool(record["touch"]),
-        waypoints=record["waypoints"][:count].copy(),
-        blend=record["blend"][:count].copy(),
-        by=float(record["by"]),
-        opening=float(record["opening"]),
-        force=float(record["force"]),
-    )
+    return segment
 
 
 @dataclass

@@ -6,7 +6,7 @@ arm has settled. A gripper segment is done when the gripper rests.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,6 @@ from pydantic import Field
 from rack.levels.algebra import Array
 from rack.levels.messages import DrivenArm, Error, WorldState
 from rack.levels.motion.path import BlendedPath
-from rack.levels.motion.speed import braking_limits
 from rack.levels.motion.trajectory import Trajectory
 from rack.levels.primitive.guard import Guard
 from rack.levels.primitive.path_motion import PathMotion
@@ -75,16 +74,16 @@ class WorkRules:
 
     @property
     def braking(self) -> Limits:
-        """Limits of a hold."""
-        return braking_limits(self.limits, self.params.braking)
+        """Limits of a hold: planned motion on a curve may use all of its own."""
+        planned = self.limits
+        factor = self.params.braking
+        return replace(
+            planned, acceleration=factor * planned.acceleration, jerk=factor * planned.jerk
+        )
 
     def cycles(self, time_s: float) -> int:
         """Return the cycles that fill `time_s`."""
         return max(1, round(time_s / self.period_s))
-
-    def quiet(self) -> Quiet:
-        """Return a new count of settled cycles."""
-        return Quiet(self.params.settled_cycles, self.cycles(self.params.settling))
 
     @property
     def latency_s(self) -> float:
@@ -96,9 +95,9 @@ class Quiet:
     """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it
     will never settle."""
 
-    def __init__(self, wanted_cycles: int, most_cycles: int) -> None:
-        self._wanted_cycles = wanted_cycles
-        self._most_cycles = most_cycles
+    def __init__(self, rules: WorkRules) -> None:
+        self._wanted_cycles = rules.params.settled_cycles
+        self._most_cycles = rules.cycles(rules.params.settling)
         self._quiet = 0
         self._cycles = 0
 
@@ -140,7 +139,7 @@ class PathWork:
         self.unplanned_cycles = 0  # consecutive cycles in which the motion waits for a trajectory
         self._guard = guard
         self._rules = rules
-        self._quiet = rules.quiet()
+        self._quiet = Quiet(rules)
         self._clear_cycles = 0
         self._fresh = True
 
@@ -159,7 +158,7 @@ class PathWork:
         """
         self._fresh = False
         self._clear_cycles = 0
-        self._quiet = self._rules.quiet()
+        self._quiet = Quiet(self._rules)
         away = self.motion.rest_near(position, progress)
         self.astray = self.blocked = away > self._rules.params.astray
         self.obstacle = f"the arm is {away:.3f} rad off its path"
@@ -262,7 +261,7 @@ class GripperWork:
         """Start waiting until the gripper rests: at the start, and when the servo is back in
         step."""
         self._cycles = 0
-        self._quiet = self._rules.quiet()
+        self._quiet = Quiet(self._rules)
 
     @property
     def held_after(self) -> int:

@@ -14,7 +14,7 @@ from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.level import LevelContext
 from rack.levels.robot import lookup
-from rack.levels.robot.engine import set_margins
+from rack.levels.robot.engine import set_margins, state_size
 from rack.levels.robot.hand import Hand, find_hand, fit_tendons
 from rack.levels.robot.limits import (
     Bounds,
@@ -27,7 +27,6 @@ from rack.levels.robot.limits import (
 )
 from rack.levels.robot.linkage import Linkage, check_couplings, solve_linkage
 from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
-from rack.levels.robot.state import state_size
 from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
@@ -56,6 +55,7 @@ class Cell:
     model: mujoco.MjModel
     """Torque motors on every joint of an arm, a force motor on the gripper; of a hand, its tendons.
     Keyframe 0 is the start, the gripper open."""
+    joints: tuple[str, ...]  # their names
     qpos: Ints  # (joints,), the arm's joints in qpos
     dof: Ints  # (joints,), the same in qvel
     actuators: Ints  # (joints,), their motors in ctrl; of a hand, its flexors
@@ -85,6 +85,11 @@ class Cell:
         mujoco.mj_resetDataKeyframe(self.model, data, 0)
         mujoco.mj_forward(self.model, data)
         return data
+
+    def parts(self, row: int) -> Ints:
+        """Return the geoms of an object or obstacle, by its row in `bodies`."""
+        model = self.model
+        return np.flatnonzero(model.body_rootid[model.geom_bodyid] == self.bodies[row])
 
 
 def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
@@ -165,11 +170,10 @@ def index(
     moved = lookup.below(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
     tool = lookup.tool_site(model, robot.tool_name, moved if hand is None else None)
-    joint = lookup.gripper_joint(model, robot, moved)
+    gripper, linked = find_gripper(model, robot, moved, joints)
     bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects = bodies[: len(scene.objects)]
     obstacles = bodies[len(scene.objects) :]
-    linked = lookup.hand(model, joint, joints)
     if hand is not None:  # the palm, which its joints do not move, is a part of a hand
         linked = moved = lookup.below(model, model.site_bodyid[[tool]]) | moved
     arm_geoms = lookup.geoms_of(model, moved)
@@ -182,16 +186,6 @@ def index(
     if wrist is not None:  # contacts of a support and what hangs on the sensor are measured
         pressed = lookup.geoms_of(model, lookup.below(model, model.site_bodyid[[wrist.site]]))
         touch[np.ix_(pressed, supports)] = touch[np.ix_(supports, pressed)] = False
-    gripper = None
-    if robot.gripper is not None and joint is not None:
-        gripper = Gripper(
-            dof=int(model.jnt_dofadr[joint]),
-            actuator=int(model.actuator(robot.gripper.actuator).id),
-            open=robot.gripper.open,
-            closed=robot.gripper.closed,
-            stiffness=robot.gripper.gains[0],
-            linkage=solve_linkage(model, robot.gripper, linked, joints),
-        )
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = robot.home
     data.qvel[model.jnt_dofadr[joints]] = robot.velocity
@@ -199,6 +193,7 @@ def index(
     mujoco.mj_energyVel(model, data)
     return Cell(
         model=model,
+        joints=robot.joints,
         qpos=model.jnt_qposadr[joints].astype(int),
         dof=model.jnt_dofadr[joints].astype(int),
         actuators=np.array([model.actuator(name).id for name in motors]),
@@ -222,6 +217,55 @@ def index(
         patience=patience_of(robot, bounds, data.energy[1]),
         interface=robot.interface,
     )
+
+
+def find_gripper(
+    model: mujoco.MjModel, robot: RobotConfig, moved: Mask, arm: Ints
+) -> tuple[Gripper | None, Mask]:
+    """Return the gripper, and mark its bodies.
+
+    These are the body that carries its linkage, and all below it: the driven joint may be anywhere
+    in the linkage.
+
+    Args:
+        model: The compiled model.
+        robot: The config.
+        moved: (nbody,), the bodies that the arm moves.
+        arm: The joints of the arm, none of which is part of the linkage.
+
+    Returns:
+        None and no body, if the arm has no gripper.
+
+    Raises:
+        RobotError: The arm does not carry the gripper's joint, or its linkage cannot be solved.
+    """
+    config = robot.gripper
+    if config is None:
+        return None, np.zeros(model.nbody, dtype=bool)
+    name = config.joint
+    joint = lookup.find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
+    if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
+        raise RobotError(
+            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the"
+            " arm's own"
+        )
+    body = model.jnt_bodyid[joint]
+    while (
+        (parent := model.body_parentid[body])
+        and model.body_jntnum[parent]
+        and parent not in model.jnt_bodyid[arm]
+    ):
+        body = parent
+    linked = lookup.below(model, model.body_parentid[[body]])
+    gripper = Gripper(
+        dof=int(model.jnt_dofadr[joint]),
+        actuator=int(model.actuator(config.actuator).id),
+        open=config.open,
+        closed=config.closed,
+        stiffness=config.gains[0],
+        linkage=solve_linkage(model, config, linked, arm),
+    )
+    return gripper, linked
 
 
 def unintended_pairs(
@@ -258,40 +302,30 @@ def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -
 def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float) -> bool:
     """Change in `spec` what would keep the gripper from moving; return whether something did.
 
-    Its overlapping links do not touch. A drive lighter than what the damping of its loop stops
-    within one tick would swing: it gets that inertia, as `min_armature` does for the arm's joints.
+    Its links that overlap before its fingers meet, open or half open, do not touch: links meet at
+    their pins, and meshes are simulated by their hulls. A drive lighter than what the damping of
+    its loop stops within one tick would swing: it gets that inertia, as `min_armature` does for the
+    arm's joints.
     """
-    pairs = overlapping_links(cell)
-    for first, second in pairs:
-        spec.add_exclude(bodyname1=first, bodyname2=second)
-    assert cell.gripper is not None, "the config has one"
-    lacks = config.gains[1] * tick_s - float(cell.model.dof_M0[cell.gripper.dof])
-    if lacks > 0.0:
-        spec.joint(config.joint).armature += lacks
-    return bool(pairs) or lacks > 0.0
-
-
-def overlapping_links(cell: Cell) -> list[tuple[str, str]]:
-    """Return pairs of bodies of the gripper that overlap before its fingers meet, open or half
-    open.
-
-    Links meet at their pins, and meshes are simulated by their hulls: in contact they would hold
-    the gripper.
-    """
-    gripper = cell.gripper
-    if gripper is None:
-        return []
     model = cell.model
+    gripper = cell.gripper
+    assert gripper is not None, "the config has one"
     data = mujoco.MjData(model)
-    found = set()
+    overlaps = set()
     for opening in (gripper.open, half_open(gripper)):
         gripper.linkage.set(data.qpos, opening)
         mujoco.mj_fwdPosition(model, data)
         contact = data.contact
         ours = np.isin(contact.geom, cell.gripper_geoms).all(axis=1) & (contact.dist < 0.0)
-        found |= {tuple(sorted(pair)) for pair in model.geom_bodyid[contact.geom[ours]].tolist()}
-    named = [(model.body(one).name, model.body(other).name) for one, other in sorted(found)]
-    return [(one, other) for one, other in named if one and other]
+        overlaps |= {tuple(sorted(pair)) for pair in model.geom_bodyid[contact.geom[ours]].tolist()}
+    names = [[model.body(body).name for body in pair] for pair in sorted(overlaps)]
+    named = [pair for pair in names if all(pair)]
+    for first, second in named:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+    lacks = config.gains[1] * tick_s - float(model.dof_M0[gripper.dof])
+    if lacks > 0.0:
+        spec.joint(config.joint).armature += lacks
+    return bool(named) or lacks > 0.0
 
 
 def start_qpos(cell: Cell, position: Array) -> Array:

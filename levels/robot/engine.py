@@ -7,6 +7,11 @@ ctypes.
 
 Of an error that MuJoCo calls fatal (its memory is exhausted) the bindings would make an exception;
 here it ends the process, as the exception would have ended the board.
+
+The state of a simulation is everything that its next step depends on. MuJoCo's integration state
+does not say which bodies sleep, so that follows it. What lies at rest sleeps until something awake
+touches it: in `nasrem` its blocks take two thirds of the time of a step while they are awake. A
+simulation restored from this state continues bit for bit, asleep or awake.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ from rack.levels.algebra import Array
 from rack.levels.compiled import compiled
 
 INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+SLEEP = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 LIBRARY = Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionString()}")
 
 
@@ -72,6 +78,17 @@ mju_mat_to_quat = native("mju_mat2Quat", 2)
 mju_mul_quat = native("mju_mulQuat", 3)
 mj_set_state = native("mj_setState", 4)
 mj_update_sleep = native("mj_updateSleep", 2)
+
+
+def state_size(model: mujoco.MjModel) -> int:
+    """Return the length of a state."""
+    return int(mujoco.mj_stateSize(model, INTEGRATION)) + int(model.ntree)
+
+
+def view_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
+    """Set `data`, of which nothing sleeps, to a state but for sleep: enough to look at it."""
+    end = mujoco.mj_stateSize(model, INTEGRATION)
+    mujoco.mj_setState(model, data, np.ascontiguousarray(state[:end]), INTEGRATION)
 
 
 def one_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:

@@ -311,19 +311,15 @@ def tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
     if kind == mujoco.mjtEq.mjEQ_JOINT:
         return set(ends.tolist())
     if kind == mujoco.mjtEq.mjEQ_TENDON:
-        return set[int]().union(*(tendon_joints(model, tendon) for tendon in ends))
+        # The joints that change the tendons' lengths.
+        data = mujoco.MjData(model)
+        mujoco.mj_fwdPosition(model, data)
+        moving = (np.abs(tendon_jacobian(model, data)[ends]) > ROUNDING).any(axis=0)
+        return set(model.dof_jntid[moving].tolist())
     if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
         ends = model.site_bodyid[ends]
     moving = [below(model, model.jnt_bodyid[[joint]])[ends] for joint in range(model.njnt)]
     return {joint for joint, moved in enumerate(moving) if 0 < moved.sum() < len(ends)}
-
-
-def tendon_joints(model: mujoco.MjModel, tendon: int) -> set[int]:
-    """Return the joints that change a tendon's length."""
-    data = mujoco.MjData(model)
-    mujoco.mj_fwdPosition(model, data)
-    moving = np.abs(tendon_jacobian(model, data)[tendon]) > ROUNDING
-    return set(model.dof_jntid[moving].tolist())
 
 
 def tendon_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> Array:

@@ -49,12 +49,14 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     broken model."""
     model = compile_spec(load_spec(robot.model), robot.model)
     kind = mujoco.mjtObj
-    wanted = [(kind.mjOBJ_JOINT, robot.joints, "robot.joints")]
-    if mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) < 0:
-        wanted.append((kind.mjOBJ_SITE, (robot.tool,), "robot.tool"))
-    wanted.append((kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"))
-    if robot.gripper is not None:
-        wanted.append((kind.mjOBJ_JOINT, (robot.gripper.joint,), "robot.gripper.joint"))
+    is_body = mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) >= 0
+    gripper = robot.gripper
+    wanted = [
+        (kind.mjOBJ_JOINT, robot.joints, "robot.joints"),
+        (kind.mjOBJ_SITE, () if is_body else (robot.tool,), "robot.tool"),
+        (kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"),
+        (kind.mjOBJ_JOINT, () if gripper is None else (gripper.joint,), "robot.gripper.joint"),
+    ]
     if robot.hand is not None:
         tips = tuple(finger.tip for finger in robot.hand.finger)
         wanted += [
@@ -85,37 +87,6 @@ def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
     if moved is not None and not moved[model.site_bodyid[tool]]:
         raise RobotError(f"robot.tool: '{name}' is on a body that the arm does not move")
     return tool
-
-
-def gripper_joint(model: mujoco.MjModel, robot: RobotConfig, moved: Mask) -> int | None:
-    """Return the id of the gripper's joint; None: the arm has no gripper. Raises `RobotError`."""
-    if robot.gripper is None:
-        return None
-    name = robot.gripper.joint
-    joint = find(model, mujoco.mjtObj.mjOBJ_JOINT, name, "robot.gripper.joint")
-    if name in robot.joints or not moved[model.jnt_bodyid[joint]]:
-        raise RobotError(
-            f"robot.gripper.joint: '{name}' must be a joint that the arm carries, not one of the"
-            " arm's own"
-        )
-    return joint
-
-
-def hand(model: mujoco.MjModel, gripper: int | None, arm: Ints) -> Mask:
-    """Mark (nbody,) the body that carries the gripper's linkage, and its descendants.
-
-    The driven joint may be anywhere in the linkage; the joints `arm` are not part of it.
-    """
-    if gripper is None:
-        return np.zeros(model.nbody, dtype=bool)
-    body = model.jnt_bodyid[gripper]
-    while (
-        (parent := model.body_parentid[body])
-        and model.body_jntnum[parent]
-        and parent not in model.jnt_bodyid[arm]
-    ):
-        body = parent
-    return below(model, model.body_parentid[[body]])
 
 
 def free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:

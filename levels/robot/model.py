@@ -10,8 +10,8 @@ import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
+from rack.levels.robot.engine import SLEEP
 from rack.levels.robot.model_file import ModelReader
-from rack.levels.robot.state import SLEEP
 from rack.levels.tables import (
     MOST,
     MOST_JOINTS,

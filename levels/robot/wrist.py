@@ -13,8 +13,11 @@ from rack.levels.errors import RobotError
 from rack.levels.robot.model import listed
 from rack.levels.tables import WristConfig
 
-KINDS = {"force": mujoco.mjtSensor.mjSENS_FORCE, "torque": mujoco.mjtSensor.mjSENS_TORQUE}
-UNITS = {"force": "N", "torque": "N m"}
+KINDS = {
+    "force": (mujoco.mjtSensor.mjSENS_FORCE, "N"),
+    "torque": (mujoco.mjtSensor.mjSENS_TORQUE, "N m"),
+}
+"""Kind of sensor and unit of both halves."""
 
 
 class Wrist(NamedTuple):
@@ -47,7 +50,9 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
         )
     most = (config.most_force, config.most_torque)
     reaches = model.sensor_cutoff[sensors].tolist()
-    for (key, unit), name, reach, limit in zip(UNITS.items(), names, reaches, most, strict=True):
+    for (key, (_, unit)), name, reach, limit in zip(
+        KINDS.items(), names, reaches, most, strict=True
+    ):
         if not reach > 0.0:
             raise RobotError(
                 f"robot.wrist.{key}: sensor '{name}' has no range; give it a cutoff, {unit}"
@@ -70,11 +75,10 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
 def _sensor(model: mujoco.MjModel, key: str, name: str) -> int:
     """Return the id of a sensor of kind `key`. Raises `RobotError`."""
     found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
-    if found >= 0 and model.sensor_type[found] == KINDS[key]:
+    is_kind = model.sensor_type == KINDS[key][0]
+    if found >= 0 and is_kind[found]:
         return int(found)
-    have = listed(
-        [model.sensor(k).name for k in range(model.nsensor) if model.sensor_type[k] == KINDS[key]]
-    )
+    have = listed([model.sensor(int(k)).name for k in np.flatnonzero(is_kind)])
     why = (
         f"sensor '{name}' is no {key} sensor" if found >= 0 else f"no sensor '{name}' in the model"
     )

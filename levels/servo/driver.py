@@ -13,12 +13,9 @@ from rack.backplane.message import Message, State
 from rack.backplane.watch.alarms import BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
-from rack.levels.arm import Arm, DriveState, Sensed, find_arm, preload
-from rack.levels.arm.arm import Link
-from rack.levels.arm.faulty import STEPS, FaultyLink
-from rack.levels.arm.guard import GuardedArm, kept_bounds
-from rack.levels.arm.present import PresentLink
-from rack.levels.errors import RobotError
+from rack.levels.arm import DrivableArm, DriveState, Sensed, find_arm, preload
+from rack.levels.arm.drivable import Link
+from rack.levels.faults import ARM_STEPS
 from rack.levels.level import (
     Executor,
     Fault,
@@ -66,7 +63,7 @@ class ArmDriver(Executor):
     A subclass reads its last state as "before", and writes "status", "state" and "scene".
     """
 
-    faults = STEPS
+    faults = ARM_STEPS
     params: ClassVar[type[ArmParams]] = ArmParams
     gives_set_points: ClassVar[bool] = False
     """Whether it can drive an arm by set points, too: its `torques` are then those predicted."""
@@ -86,22 +83,10 @@ class ArmDriver(Executor):
         kind = find_arm(params.arm)
         cell = sensed_by(cell_of(context), robot, kind.sensors)
         self.cell = cell
-        self.arm: Arm = kind(cell, context.scene, context.clock_ns, every, context.seed)
+        self.arm: DrivableArm = kind(cell, context.scene, context.clock_ns, every, context.seed)
         self.part = robot.bring_up or 1.0  # of full speed, until the operator's release
-        # The path to the arm; through `_faulty` while faults are injected.
-        link: Link = self.arm
-        if cell.encoders.offset is not None or robot.latency_ticks:
-            link = PresentLink(self.arm, cell, context.tick_s)
-        self._guard = None
-        if not self.arm.keeps_limits:
-            link = self._guard = GuardedArm(
-                self.arm, cell, robot.joints, context.tick_s, link, self.part
-            )
-        self._sound = link
-        self._link: Link = self._sound
-        self._faulty = FaultyLink(
-            self.arm, cell, every, self.acted, self._sound, lambda: self.holds
-        )
+        self._path = self.arm.connect(context.tick_s, self.part, self.acted, lambda: self.holds)
+        self._link: Link = self._path.sound
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
@@ -138,12 +123,10 @@ class ArmDriver(Executor):
         robot = context.robot
         given = context.params.get("arm")
         if given is not None and not find_arm(given).keeps_limits:
-            cell = cell_of(context)
-            try:
-                own = sensed_by(cell, robot, find_arm(given).sensors)
-                kept_bounds(own, robot.joints, robot.bring_up or 1.0)
-            except RobotError as error:
-                yield "params.arm", given, str(error)
+            kind = find_arm(given)
+            cell = sensed_by(cell_of(context), robot, kind.sensors)
+            if why := kind.misfit(cell, robot.bring_up or 1.0):
+                yield "params.arm", given, why
         if robot.hand is not None:
             yield (
                 "executor",
@@ -162,8 +145,8 @@ class ArmDriver(Executor):
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults between this level and the arm."""
-        self._faulty.inject(faults)
-        self._link = self._faulty if faults else self._sound
+        self._path.faulty.inject(faults)
+        self._link = self._path.faulty if faults else self._path.sound
 
     @abstractmethod
     def take_messages(self) -> None:
@@ -210,8 +193,7 @@ class ArmDriver(Executor):
         if command.what != Operation.RELEASE:
             return self.enabling.obey(command)
         self.part = 1.0
-        if self._guard is not None:
-            self._guard.permit(self.part)
+        self.arm.permit(self.part)
         return ""
 
     def feel(self, tick: int) -> None:
@@ -238,8 +220,8 @@ class ArmDriver(Executor):
         if contact is not None:
             blow = Cause(Error.TOUCHED, f"unintended contact: {self.arm.named(contact)}")
             self.stopping.stop_for(blow, Finding(Alarm.COLLISION, *contact), tick)
-        if self._adopted and self._guard is not None and self._guard.exceeded is not None:
-            finding, text = self._guard.exceeded
+        if self._adopted and self.arm.exceeded is not None:
+            finding, text = self.arm.exceeded
             cause = Cause(Error.LIMIT, text, finding.subject, finding.value)
             self.stopping.stop_for(cause, finding, tick)
         self.feel(tick)

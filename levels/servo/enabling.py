@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from rack.levels.arm import Arm, DriveState
+from rack.levels.arm import DrivableArm, DriveState
 from rack.levels.level import LevelContext
 from rack.levels.operator import Operation, OperatorCommand
 
@@ -17,7 +17,7 @@ class Enabling:
     it must be enabled again. A restarted board finds the arm as it is, and asks for nothing.
     """
 
-    def __init__(self, arm: Arm, context: LevelContext) -> None:
+    def __init__(self, arm: DrivableArm, context: LevelContext) -> None:
         robot = context.robot
         self._arm = arm
         self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)

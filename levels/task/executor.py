@@ -10,6 +10,7 @@ from rack.levels.messages import Error, MoveStatus, TaskCommand, TaskPlan, TaskS
 from rack.levels.operator import (
     BELOW_LOST,
     HELD_FROM_ABOVE,
+    HOLDABLE,
     Goal,
     Operation,
     OperatorCommand,
@@ -35,8 +36,7 @@ class TaskExecutor(Executor):
     command = Output(TaskCommand)
     status = Output(TaskStatus, rests_on=below)
     commands = {
-        Operation.HOLD: (),
-        Operation.RESUME: (),
+        **HOLDABLE,
         Operation.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
     }
     params: ClassVar[type[TaskParams]] = TaskParams

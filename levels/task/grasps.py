@@ -15,7 +15,7 @@ from rack.levels.planning.collision import farthest, place_bodies
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.lookup import below, geom_name, geoms_of
+from rack.levels.robot.lookup import geom_name
 from rack.levels.task.program import DOWN, Transfer
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -127,10 +127,9 @@ def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) ->
             Error.UNREACHABLE,
             f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}",
         )
-    parts = geoms_of(model, below(model, cell.bodies[[row]]))
     gap = min(
         mujoco.mj_geomDistance(model, data, int(part), support, MAX_DISTANCE_M, None)
-        for part in parts
+        for part in cell.parts(row)
     )
     if abs(gap) > MAX_STANDING_GAP_M:
         side = "above" if gap > 0 else "deep in"
@@ -162,8 +161,6 @@ def _lay_out(cell: Cell, data: mujoco.MjData, situation: Situation) -> None:
 
 def _top(cell: Cell, situation: Situation, row: int) -> float:
     """Return the height of the highest point of object `row`, from its bounding boxes, in m."""
-    model = cell.model
     data = cell.start()
     _lay_out(cell, data, situation)
-    parts = geoms_of(model, below(model, cell.bodies[[row]]))
-    return farthest(model, data, parts, UP)
+    return farthest(cell.model, data, cell.parts(row), UP)

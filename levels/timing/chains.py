@@ -16,11 +16,7 @@ def spanned(names: Sequence[str]) -> str:
             rows[-1].append(name)
         else:
             rows.append([name])
-    return ", ".join(map(_shortened, rows))
-
-
-def _shortened(row: Sequence[str]) -> str:
-    return f"{row[0]} ... {row[-1]}" if len(row) > 2 else ", ".join(row)
+    return ", ".join(f"{row[0]} ... {row[-1]}" if len(row) > 2 else ", ".join(row) for row in rows)
 
 
 def _following(name: str) -> str:

@@ -1,8 +1,7 @@
 """Times from a trace: the measured side of the timing model.
 
-Report, analysis, charts, viewer, snapshots and benchmarks all derive their times here. `rows` are
-trace records of one task, oldest first, shape (n,), of dtype `rack.backplane.trace.RECORD`. Times
-are ns of the wall clock, shape (n,), unless a function says otherwise.
+Report, analysis, charts, viewer, snapshots and benchmarks all derive their times here. Times are ns
+of the wall clock, unless a function says otherwise.
 
 A trace measures a unit function in two ways. Its borders are stamped by the wall clock; processor
 time is counted for the cycle as a whole. Where a cycle was preempted the two differ, and
@@ -35,69 +34,73 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9}
 UNDISTURBED = 10.0
 """Percentile of a part's times taken for its undisturbed time: on a host that takes the machine
 away in nearly every plan, their median is not."""
+Rows = np.ndarray
+"""Trace records of one task, oldest first, (n,), of dtype `rack.backplane.trace.RECORD`."""
+Values = np.ndarray
+"""One value per record, (n,), unless a function says otherwise."""
 Distribution = dict[str, float]
 
 
-def lateness_ns(rows: np.ndarray) -> np.ndarray:
+def lateness_ns(rows: Rows) -> Values:
     """Return the time from release to start."""
     return np.asarray(rows["start_ns"] - rows["release_ns"])
 
 
-def response_ns(rows: np.ndarray) -> np.ndarray:
+def response_ns(rows: Rows) -> Values:
     """Return the time from release to end."""
     return np.asarray(rows["end_ns"] - rows["release_ns"])
 
 
-def lasted_ns(rows: np.ndarray) -> np.ndarray:
+def lasted_ns(rows: Rows) -> Values:
     """Return the time from start to end, preemption included."""
     return np.asarray(rows["end_ns"] - rows["start_ns"])
 
 
-def execution_ns(rows: np.ndarray) -> np.ndarray:
+def execution_ns(rows: Rows) -> Values:
     """Return t_exec of eq. 3.5 (of a planner: its planning), preemption included."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
-def communication_ns(rows: np.ndarray) -> np.ndarray:
+def communication_ns(rows: Rows) -> Values:
     """Return t_comm of eq. 3.5: everything between start and end that is not execution."""
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 
-def residual_ns(rows: np.ndarray, slice_ns: int) -> np.ndarray:
+def residual_ns(rows: Rows, slice_ns: int) -> Values:
     """Return t_residual: the part of a time slice left when the cycle ended; negative after a
     miss."""
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
-def gaps_ns(rows: np.ndarray, stretches: np.ndarray | None = None) -> np.ndarray:
+def gaps_ns(rows: Rows, stretches: Values | None = None) -> Values:
     """Return the time from each start to the next one, shape (n - 1,); less with the number of the
     recording's stretch for each row: what was between two stretches is unknown."""
     gaps = np.diff(rows["start_ns"])
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
 
-def is_missed(rows: np.ndarray) -> np.ndarray:
+def is_missed(rows: Rows) -> Values:
     """Return which cycles missed their deadline, or wrote a message too late; bool."""
     return np.asarray((rows["flags"] & Flag.MISSED) > 0)
 
 
-def skipped(rows: np.ndarray) -> np.ndarray:
+def skipped(rows: Rows) -> Values:
     """Return the number of releases skipped just before each cycle."""
     return np.asarray(rows["flags"] >> SKIPPED_SHIFT)
 
 
-def counts(rows: np.ndarray) -> tuple[int, int]:
+def counts(rows: Rows) -> tuple[int, int]:
     """Return the number of cycles missed and of releases skipped."""
     return int(np.count_nonzero(is_missed(rows))), int(skipped(rows).sum())
 
 
-def plans(rows: np.ndarray) -> np.ndarray:
+def plans(rows: Rows) -> Values:
     """Return the records of a planner that made a plan: a release that passed without one may leave
     a record too."""
     return rows[(rows["flags"] & Flag.PLANNED) > 0]
 
 
-def newest_visible(ticks: np.ndarray, visible_at: np.ndarray) -> np.ndarray:
+def newest_visible(ticks: Values, visible_at: Values) -> Values:
     """Return the index of the newest message visible at each tick, -1 before the first.
 
     `visible_at` holds the ticks from which messages are visible, in the order of their writing.
@@ -106,7 +109,7 @@ def newest_visible(ticks: np.ndarray, visible_at: np.ndarray) -> np.ndarray:
     return np.asarray(np.searchsorted(np.maximum.accumulate(visible_at), ticks, side="right") - 1)
 
 
-def plan_ages(executor: np.ndarray, made: np.ndarray, visible_at: np.ndarray) -> np.ndarray:
+def plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
     """Return the age in ticks of the plan that each cycle of an executor could read, without cycles
     before the first.
 
@@ -117,7 +120,7 @@ def plan_ages(executor: np.ndarray, made: np.ndarray, visible_at: np.ndarray) ->
     return np.asarray(executor[seen] - made[newest[seen]])
 
 
-def distribution(values: np.ndarray) -> Distribution | None:
+def distribution(values: Values) -> Distribution | None:
     """Return min, p50, p99, p99.9 and max of values of any unit, shape (n,); None when there are
     none."""
     if not len(values):
@@ -131,7 +134,7 @@ class Occupation:
     """When a core was occupied: a union of intervals. `starts` and `ends` are those of the union,
     ns, shape (n,)."""
 
-    def __init__(self, starts: np.ndarray, ends: np.ndarray) -> None:
+    def __init__(self, starts: Values, ends: Values) -> None:
         """Take intervals from `starts` to `ends`, each of shape (n,), in any order."""
         order = np.argsort(starts, kind="stable")
         starts, ends = starts[order], np.maximum.accumulate(np.maximum(starts, ends)[order])
@@ -143,7 +146,7 @@ class Occupation:
         self._sums = np.cumsum(self.ends - self.starts)
 
     @classmethod
-    def of(cls, rows: np.ndarray) -> Occupation:
+    def of(cls, rows: Rows) -> Occupation:
         """Return when a task needed its core: from waking up to closing the cycle."""
         half = overhead_ns(rows) // 2
         return cls(rows["start_ns"] - half, rows["end_ns"] + half)
@@ -157,11 +160,11 @@ class Occupation:
             np.concatenate([none, *(each.ends for each in many)]),
         )
 
-    def within(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    def within(self, starts: Values, ends: Values) -> Values:
         """Return the occupied time in each interval from `starts` to `ends`, shape as given."""
         return np.asarray(self._until(ends) - self._until(starts))
 
-    def _until(self, times: np.ndarray) -> np.ndarray:
+    def _until(self, times: Values) -> Values:
         """Return the occupied time before each of `times`."""
         begun = np.searchsorted(self.starts, times, side="right")
         if not len(self.starts):
@@ -171,12 +174,12 @@ class Occupation:
         return np.asarray(np.where(begun > 0, self._sums[newest] - beyond, 0))
 
 
-def waking_ns(rows: np.ndarray) -> np.ndarray:
+def waking_ns(rows: Rows) -> Values:
     """Return the processor time used between release and start, to wake up."""
     return np.asarray(np.clip(_beyond_stamps(rows), 0, np.maximum(lateness_ns(rows), 0)))
 
 
-def overhead_ns(rows: np.ndarray) -> int:
+def overhead_ns(rows: Rows) -> int:
     """Return the median processor time of waking up for a cycle and closing it; 0 where every cycle
     was disturbed."""
     beyond = _beyond_stamps(rows)
@@ -184,13 +187,13 @@ def overhead_ns(rows: np.ndarray) -> int:
     return int(np.median(undisturbed)) if len(undisturbed) else 0
 
 
-def _beyond_stamps(rows: np.ndarray) -> np.ndarray:
+def _beyond_stamps(rows: Rows) -> Values:
     """Return processor time less the time from start to end: negative where others had the core
     meanwhile."""
     return np.asarray(rows["processor_ns"] - lasted_ns(rows))
 
 
-def unit_times(rows: np.ndarray, above: Occupation) -> np.ndarray:
+def unit_times(rows: Rows, above: Occupation) -> Values:
     """Return the processor time of each part of a cycle, shape (n, 4): C, R, X, W; of a planner 0,
     reading, P, U.
 
@@ -211,7 +214,7 @@ def unit_times(rows: np.ndarray, above: Occupation) -> np.ndarray:
     return np.asarray(np.rint(parts - _shared_out(rest, parts)), np.int64)
 
 
-def _undisturbed(parts: np.ndarray, processor_ns: np.ndarray) -> np.ndarray:
+def _undisturbed(parts: Values, processor_ns: Values) -> Values:
     """Return the undisturbed time of each part, shape (4,).
 
     A short part is undisturbed in many cycles. The longest may be disturbed in all of them: of it,
@@ -225,7 +228,7 @@ def _undisturbed(parts: np.ndarray, processor_ns: np.ndarray) -> np.ndarray:
     return usual
 
 
-def _shared_out(total: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _shared_out(total: Values, weights: Values) -> Values:
     """Return `total`, shape (n,), distributed by `weights`, shape (n, 4), none more than its
     weight."""
     sums = weights.sum(axis=1)

@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 
 from rack.levels.errors import RobotError
-from rack.levels.planning.fixed_jaw import find_fixed_jaw
-from rack.levels.planning.payload import Payloads
+from rack.levels.planning.payload import Payloads, find_fixed_jaw
 from rack.levels.robot.abilities import Abilities, Statics, abilities
 from rack.levels.robot.cell import Cell, check_fingers, unchecked_cell
 from rack.levels.robot.model import load_spec

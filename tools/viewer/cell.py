@@ -13,7 +13,7 @@ from rack.boards.events import Event
 from rack.levels.algebra import Array, Ints
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.state import view_state
+from rack.levels.robot.engine import view_state
 from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import worded
 from rack.tools.viewer.shapes import shape_of, xyzw

@@ -41,6 +41,8 @@ BROKEN_OFF = (Response.CANCELLED, Response.STOPPED, Response.ENDED)
 BEGUN = (Response.DOING, Response.DONE)
 VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLING: OrderVerb.CANCEL}
 """What to say to the arms of a step."""
+KEPT = ("phase", "step", "attempt", "error", "reason", "ending", "begun")
+"""Attributes of an agreement that its `CellProgress` keeps."""
 
 
 class Agreement:
@@ -65,28 +67,18 @@ class Agreement:
         self.error = Error.NONE
         self.reason = ""
         # When every arm was there: the origin of the program's times, simulated time; 0: not yet
-        self.begun_s = 0.0
-        self.ending_s = 0.0  # since when the arms are ended, simulated time; 0: not yet
+        self.begun = 0.0
+        self.ending = 0.0  # since when the arms are ended, simulated time; 0: not yet
 
     def recall(self, last: CellProgress) -> None:
         """Continue from a `CellProgress`."""
-        self.phase = last.phase
-        self.step = last.step
-        self.attempt = last.attempt
-        self.error = last.error
-        self.reason = last.reason
-        self.ending_s = last.ending
-        self.begun_s = last.begun
+        for name in KEPT:
+            setattr(self, name, getattr(last, name))
 
     def write_to(self, progress: CellProgress) -> None:
         """Fill a `CellProgress`, but for the count of moves."""
-        progress.phase = self.phase
-        progress.step = self.step
-        progress.attempt = self.attempt
-        progress.error = self.error
-        progress.reason = self.reason
-        progress.ending = self.ending_s
-        progress.begun = self.begun_s
+        for name in KEPT:
+            setattr(progress, name, getattr(self, name))
 
     @property
     def order(self) -> int:
@@ -122,7 +114,7 @@ class Agreement:
         if self.phase is Phase.ENDING:
             said = self._said(self._arms)
             is_confirmed = all(response is Response.ENDED for response in said.values())
-            if is_confirmed or now_s - self.ending_s > self._farewell_s:
+            if is_confirmed or now_s - self.ending > self._farewell_s:
                 self.phase = Phase.OVER
 
     def _said(self, arms: Collection[str]) -> dict[str, Response]:
@@ -151,7 +143,7 @@ class Agreement:
         if ended:
             self.end(Error(ended[0].error), ended[0].reason)
         elif self._are_there(self._arms):
-            self.begun_s = self._now_s
+            self.begun = self._now_s
             self._go_on()
         if self.phase is Phase.ASKING:
             # At once: an arm that has forgotten its promise must not be asked for it again.
@@ -220,7 +212,7 @@ class Agreement:
             self.phase = Phase.ENDING
             self.error = error
             self.reason = reason
-            self.ending_s = self._now_s
+            self.ending = self._now_s
 
 
 TAKEN = {

@@ -279,7 +279,7 @@ class Coordinator(Executor):
         if what in (OrderVerb.ASK, OrderVerb.DO, OrderVerb.CANCEL):
             write_action(self._steps[agreement.step][arm], order)
             if order.by:
-                order.by += agreement.begun_s
+                order.by += agreement.begun
         is_spoken_to = what is not OrderVerb.NONE
         order.id = agreement.order if is_spoken_to else 0
         order.program = agreement.program if is_spoken_to else 0

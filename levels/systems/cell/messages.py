@@ -9,11 +9,11 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Annotated
 
-import numpy as np
+from numpy import ndarray
 from pydantic import StringConstraints
 
-from rack.backplane.message import Command, Message, Status, field
-from rack.levels.messages import OPERATED, Error
+from rack.backplane.message import Command, Message, Status, field, integer
+from rack.levels.messages import OPERATED, Error, per_joint
 from rack.levels.operator import MAX_JOINTS, Goal
 
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
@@ -71,23 +71,23 @@ class CellAction(Message):
     action: OrderAction = field(doc="what to do")
     object: str = field(f"S{OBJECT_BYTES}", doc="object of a transfer")
     goal: Goal = field(doc="form of a goto's goal: joints, pose or direction")
-    position: np.ndarray = field(
+    position: ndarray = field(
         unit="m", doc="where a transfer takes the object's origin, or a goto the tool", shape=3
     )
     turned: bool = field(doc="1: a transfer turns the object to `yaw`; 0: any turn")
     yaw: float = field(unit="rad", doc="turn of the object's x axis about the vertical")
     lift: float = field(unit="m", doc="height of a transfer's straight motions")
-    quaternion: np.ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
-    direction: np.ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
-    count: int = field("u1", unit="1", doc="joints that follow")
-    joints: np.ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
+    quaternion: ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
+    direction: ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
+    count: int = integer("joints that follow", "u1")
+    joints: ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
     by: float = field(unit="s", doc="simulated time by which it must be done; 0: any time")
 
 
 class OrderHead(Command):
     """What is said of an order, without its action."""
 
-    program: int = field("u4", unit="1", doc="checksum of the program that the order is of")
+    program: int = integer("checksum of the program that the order is of")
     what: OrderVerb = field(doc="ask, do, cancel: all of the order `id`; end")
     hold: bool = field(doc="1: the arm rests on its path while it does an order")
     reason: str = field(doc="with `hold` why; with END why the program failed, empty: it is done")
@@ -101,7 +101,7 @@ class CellReport(Status, version=1):
     """From a task level to the rack that orders its actions."""
 
     error: Error = field("u2", doc="error code of the level; 0: none")
-    program: int = field("u4", unit="1", doc="as in the order that is echoed")
+    program: int = integer("as in the order that is echoed")
     response: Response = field(
         doc="the answer to it; `reason`: of a refusal or failure, else of waiting"
     )
@@ -112,8 +112,8 @@ class CellReport(Status, version=1):
         unit="s",
         doc="in that time, when DO must be read for an answer POSSIBLE to hold; 0: any time",
     )
-    moves_done: int = field("u2", unit="1", doc="elemental moves of the order done")
-    moves: int = field("u2", unit="1", doc="elemental moves of the order; 0 before it begins")
+    moves_done: int = integer("elemental moves of the order done", "u2")
+    moves: int = integer("elemental moves of the order; 0 before it begins", "u2")
     halted: bool = field(
         doc="1: moves were withdrawn, the arm is held until it begins another order"
     )
@@ -123,9 +123,9 @@ class CellReport(Status, version=1):
 class RequestHead(Message):
     """For what a plan is wanted, without the action."""
 
-    id: int = field("u4", unit="1", doc="serial of the plan wanted; 0: none yet")
-    program: int = field("u4", unit="1", doc="as in the order that it serves")
-    order: int = field("u4", unit="1", doc="that order")
+    id: int = integer("serial of the plan wanted; 0: none yet")
+    program: int = integer("as in the order that it serves")
+    order: int = integer("that order")
     begin: float = field(
         unit="s", doc="simulated time at which it must be possible to begin; 0: at once"
     )
@@ -133,8 +133,8 @@ class RequestHead(Message):
         unit="s",
         doc=("simulated time of the rack that gave the order, in which `by` is, less that here"),
     )
-    revision: int = field("u4", unit="1", doc="of the world model then")
-    start: np.ndarray = field(unit="rad", doc="where the arm rested then", shape="joints")
+    revision: int = integer("of the world model then")
+    start: ndarray = per_joint("rad", "where the arm rested then")
 
 
 class CellRequest(RequestHead, CellAction, version=1):
@@ -145,10 +145,10 @@ class CellProgress(Message, version=2):
     """A coordinator's memory, from which it continues after a restart of its board."""
 
     phase: Phase = field(doc="of the present step")
-    step: int = field("u2", unit="1", doc="steps done")
-    attempt: int = field("u2", unit="1", doc="times that the present step was asked for before")
+    step: int = integer("steps done", "u2")
+    attempt: int = integer("times that the present step was asked for before", "u2")
     error: Error = field("u2", doc="why the program ends early; 0: it does not")
     reason: str = field(doc="the error, readable")
     ending: float = field(unit="s", doc="simulated time since when the arms are ended; 0: not yet")
     begun: float = field(unit="s", doc="simulated time from which `by` counts; 0: not yet")
-    moves: int = field("u2", unit="1", doc="elemental moves of the steps done")
+    moves: int = integer("elemental moves of the steps done", "u2")

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import Message, field, integer
 from rack.levels.algebra import Array
 
 MOST_SHARED = 4
@@ -36,11 +36,7 @@ class SharedBodyEntry(Message, version=1, message="shared_body"):
     """One body that several racks share."""
 
     name: str = field(f"S{NAME_BYTES}", doc="body, by its name in the model; empty: none")
-    claim: int = field(
-        "u4",
-        unit="1",
-        doc="number of the claim that stands, as far as this rack knows; 0: none yet",
-    )
+    claim: int = integer("number of the claim that stands, as far as this rack knows; 0: none yet")
     owner: str = field(
         f"S{NAME_BYTES}", doc="rack whose claim that is: its simulation moves the body"
     )

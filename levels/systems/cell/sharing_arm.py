@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.levels.algebra import Array, Mask
+from rack.levels.algebra import Array
 from rack.levels.arm.simulated import SimulatedArm
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.lookup import below, geoms_of
 from rack.levels.tables import SceneConfig
 
 POSE = 7
@@ -30,17 +29,10 @@ class SharingArm(SimulatedArm):
     ) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
         self._kept: dict[int, Array] = {}  # row of a copy: where it stays, (7,)
-        self._in_hand = np.isin(np.arange(cell.model.ngeom), cell.gripper_geoms)
-        self._parts: dict[int, Mask] = {}  # (ngeom,), by row: geoms of the object
 
     def is_touched(self, row: int) -> bool:
         """Return whether the gripper touches an object."""
-        if row not in self._parts:
-            model = self._model
-            parts = geoms_of(model, below(model, self.cell.bodies[[row]]))
-            self._parts[row] = np.isin(np.arange(model.ngeom), parts)
-        pairs = self._data.contact.geom
-        return bool((self._in_hand[pairs].any(axis=1) & self._parts[row][pairs].any(axis=1)).any())
+        return bool(self._held()[self.cell.parts(row)].any())
 
     def pose(self, row: int) -> Array:
         """Return the pose of an object, (7,), m and quaternion, as simulated."""

@@ -7,7 +7,7 @@ from typing import cast
 
 from pydantic import Field, field_validator
 
-from rack.levels.arm.arm import find_arm
+from rack.levels.arm import find_arm
 from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output
 from rack.levels.servo.control import ServoParams
 from rack.levels.servo.executor import ServoExecutor

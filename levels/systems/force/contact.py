@@ -75,10 +75,6 @@ class Contact:
         self.frame[:] = frame / norm(frame)
         self.guard[:] = guard
 
-    def unguard(self) -> None:
-        """End the guards."""
-        self.watch(self.frame, np.zeros(AXES))
-
     def relax(self) -> None:
         """Want no force on the axes of force."""
         self.id += 1

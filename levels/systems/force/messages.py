@@ -10,10 +10,11 @@ wrench is what the surroundings exert on the tool.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Any
 
-import numpy as np
+from numpy import ndarray
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import Message, field, integer
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 from rack.levels.systems.trajectory.messages import HELD, MotionRequest, MotionState, MotionStatus
 
@@ -21,71 +22,69 @@ AXES = 6
 """Axes of a task frame: translations along x, y, z, then rotations about them."""
 
 
+def per_axis(unit: str, doc: str, kind: str = "f8") -> Any:
+    """Declare a field with one number for each axis of a task frame."""
+    return field(kind, unit=unit, doc=doc, shape=AXES)
+
+
 class Wrench(Message, version=1):
     """From the board of an arm with a wrist sensor, in every cycle."""
 
     tick: int = field(unit="tick", doc="tick at which it was sensed")
-    wrench: np.ndarray = field(
-        unit="N, N m",
-        doc="of the contact, at the tool, in the world's frame, without weights",
-        shape=AXES,
+    wrench: ndarray = per_axis(
+        "N, N m", "of the contact, at the tool, in the world's frame, without weights"
     )
-    sample: np.ndarray = field(
-        unit="N, N m", doc="as the sensor gives it, in the sensor's frame", shape=AXES
-    )
+    sample: ndarray = per_axis("N, N m", "as the sensor gives it, in the sensor's frame")
     saturated: bool = field(doc="1: the sensor is at the end of its range")
-    exceeded: int = field(
-        "u4", unit="1", doc="cycles in which the contact was beyond the arm's force limits"
-    )
+    exceeded: int = integer("cycles in which the contact was beyond the arm's force limits")
 
 
-class Compliance(RelayedCommand, version=1):
-    """From the motion server to the level of hybrid control. `id` rises with every change; a guard
-    strikes once an id."""
+class TaskContact(Message):
+    """What is wanted of a contact, by axis of the task frame."""
 
-    active: bool = field(doc="1: some axis is one of force, or guarded; 0: motion alone")
-    frame: np.ndarray = field(
+    frame: ndarray = field(
         unit="1", doc="orientation of the task frame in the world, w, x, y, z", shape=4
     )
-    selected: np.ndarray = field(
-        "u1", unit="1", doc="1: an axis of force; 0: of motion", shape=AXES
+    selected: ndarray = per_axis("1", "1: an axis of force; 0: of motion", "u1")
+    wrench: ndarray = per_axis(
+        "N, N m", "wanted of the tool on the surroundings, on the axes of force"
     )
-    wrench: np.ndarray = field(
-        unit="N, N m",
-        doc="wanted of the tool on the surroundings, on the axes of force",
-        shape=AXES,
+    speed: ndarray = per_axis(
+        "m/s, rad/s", "most on the axes of force, both ways; 0 in a request: the level's default"
     )
-    speed: np.ndarray = field(
-        unit="m/s, rad/s", doc="most on the axes of force, both ways", shape=AXES
+    guard: ndarray = per_axis(
+        "N, N m", "wrench, either way, at which motion ends; 0: the axis is not guarded"
     )
-    guard: np.ndarray = field(
-        unit="N, N m",
-        doc="wrench, either way, at which motion ends; 0: the axis is not guarded",
-        shape=AXES,
-    )
+
+
+class ComplianceHead(RelayedCommand):
+    """The state of a contact, without what is wanted of it."""
+
+    active: bool = field(doc="1: some axis is one of force, or guarded; 0: motion alone")
+
+
+class Compliance(ComplianceHead, TaskContact, version=1):
+    """From the motion server to the level of hybrid control. `id` rises with every change; a guard
+    strikes once an id."""
 
 
 class ForceStatus(AnsweringStatus, version=1):
     """From the level of hybrid control to the motion server."""
 
     sensed: int = field(unit="tick", doc="tick of the wrench; -1: none yet")
-    wrench: np.ndarray = field(
-        unit="N, N m", doc="of the contact, at the tool, in the task frame", shape=AXES
-    )
-    wanted: np.ndarray = field(unit="N, N m", doc="on the axes of force; others 0", shape=AXES)
-    selected: np.ndarray = field("u1", unit="1", doc="1: an axis of force", shape=AXES)
-    offset: np.ndarray = field(
+    wrench: ndarray = per_axis("N, N m", "of the contact, at the tool, in the task frame")
+    wanted: ndarray = per_axis("N, N m", "on the axes of force; others 0")
+    selected: ndarray = per_axis("1", "1: an axis of force", "u1")
+    offset: ndarray = field(
         unit="m",
         doc="from where the motion alone would have the tool to where it is commanded",
         shape=3,
     )
-    struck: int = field(
-        "u4", unit="1", doc="id of the newest command whose guard was struck; 0: none"
-    )
-    axis: int = field("i2", unit="1", doc="axis on which that was; -1: none")
+    struck: int = integer("id of the newest command whose guard was struck; 0: none")
+    axis: int = integer("axis on which that was; -1: none", "i2")
 
 
-class ServerRequest(MotionRequest, version=1):
+class ServerRequest(MotionRequest, TaskContact, version=1):
     """From a client to a server of force and motion: a `MotionRequest`, or
 
     - COMPLY: what follows is done with these axes of force. It is done when their forces are as
@@ -97,38 +96,15 @@ class ServerRequest(MotionRequest, version=1):
     lost.
     """
 
-    frame: np.ndarray = field(
-        unit="1", doc="task frame of COMPLY and GUARD, as in COMPLIANCE", shape=4
-    )
-    selected: np.ndarray = field(
-        "u1",
-        unit="1",
-        doc="of COMPLY, 1: an axis of force; none: motion alone, no guard",
-        shape=AXES,
-    )
-    wrench: np.ndarray = field(
-        unit="N, N m", doc="of COMPLY: wanted of the tool on the surroundings", shape=AXES
-    )
-    speed: np.ndarray = field(
-        unit="m/s, rad/s",
-        doc="of COMPLY: most on the axes of force; 0: the level's default",
-        shape=AXES,
-    )
-    guard: np.ndarray = field(
-        unit="N, N m",
-        doc="of GUARD: wrench, either way, that ends a segment; 0: not guarded",
-        shape=AXES,
-    )
-
 
 class ServerState(MotionState, version=1):
     """As `MotionState`; what is in force says the level's own `Compliance`."""
 
-    goal: np.ndarray = field(
+    goal: ndarray = field(
         ServerRequest,
         doc="the request at whose goal the arm is, or to which it goes; id 0: none",
     )
-    requests: np.ndarray = field(ServerRequest, doc="taken and not ended, oldest first", shape=HELD)
+    requests: ndarray = field(ServerRequest, doc="taken and not ended, oldest first", shape=HELD)
 
 
 class Mode(IntEnum):
@@ -147,15 +123,11 @@ class ServerStatus(MotionStatus, version=1):
     """Requests as the server keeps them, from taking to end, and the contact."""
 
     mode: Mode = field(doc="motion, force, or what is left of it without a client")
-    place: np.ndarray = field(unit="m", doc="tool position as sensed", shape=3)
-    quaternion: np.ndarray = field(unit="1", doc="tool orientation as sensed, w, x, y, z", shape=4)
-    frame: np.ndarray = field(unit="1", doc="orientation of the task frame, w, x, y, z", shape=4)
-    wrench: np.ndarray = field(
-        unit="N, N m", doc="of the tool on the surroundings, in the task frame", shape=AXES
-    )
-    wanted: np.ndarray = field(
-        unit="N, N m", doc="the same as wanted, on the axes of force; others 0", shape=AXES
-    )
-    selected: np.ndarray = field("u1", unit="1", doc="1: an axis of force", shape=AXES)
-    guarded: int = field("u4", unit="1", doc="newest request that a guard has ended; 0: none yet")
-    axis: int = field("i2", unit="1", doc="axis on which that was; -1: none yet")
+    place: ndarray = field(unit="m", doc="tool position as sensed", shape=3)
+    quaternion: ndarray = field(unit="1", doc="tool orientation as sensed, w, x, y, z", shape=4)
+    frame: ndarray = field(unit="1", doc="orientation of the task frame, w, x, y, z", shape=4)
+    wrench: ndarray = per_axis("N, N m", "of the tool on the surroundings, in the task frame")
+    wanted: ndarray = per_axis("N, N m", "the same as wanted, on the axes of force; others 0")
+    selected: ndarray = per_axis("1", "1: an axis of force", "u1")
+    guarded: int = integer("newest request that a guard has ended; 0: none yet")
+    axis: int = integer("axis on which that was; -1: none yet", "i2")

@@ -18,6 +18,7 @@ from rack.levels.systems.force.contact import (
     misfit,
 )
 from rack.levels.systems.force.messages import (
+    AXES,
     Compliance,
     ForceStatus,
     Mode,
@@ -94,7 +95,7 @@ class ServerWork(RequestWork):
             self.guarded = current.id
             self.axis = axis
             self.agenda.end(RequestEnd.GUARDED)
-        self.contact.unguard()
+        self.contact.watch(self.contact.frame, np.zeros(AXES))
         self._begin_anew(f"the arm comes to rest: guard of axis {AXIS_NAMES[axis]}")
 
     def drop(self, how: RequestEnd, reason: str, code: Error) -> None:

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-import numpy as np
+from numpy import ndarray
 
-from rack.backplane.message import field
+from rack.backplane.message import field, integer
 from rack.backplane.words import Demand
+from rack.levels.messages import per_joint
 from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 FLEXOR = 0
@@ -54,26 +55,22 @@ class TensionCommand(SampledCommand, version=1):
         unit="tick",
         doc="tick of the hand's status on which the tensions depend, -1 if there are none",
     )
-    tension: np.ndarray = field(
+    tension: ndarray = field(
         unit="N", doc="tensions of the tendons of this board's joints", shape=(2, "joints")
     )
-    driven: np.ndarray = DRIVEN
+    driven: ndarray = DRIVEN
 
 
 class HandStatus(AnsweringStatus, version=1):
     """From the board of the hand: 16 angles and 32 tensions of the Utah/MIT hand."""
 
     tick: int = field(unit="tick", doc="tick at which the hand was sensed")
-    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    torque: np.ndarray = field(
-        unit="N m", doc="torques of the tendons on the joints", shape="joints"
-    )
-    tension: np.ndarray = field(unit="N", doc="sensed tensions of the tendons", shape=(2, "joints"))
-    wanted: np.ndarray = field(
-        unit="N", doc="tensions commanded of the valves", shape=(2, "joints")
-    )
-    force: np.ndarray = field(
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    torque: ndarray = per_joint("N m", "torques of the tendons on the joints")
+    tension: ndarray = field(unit="N", doc="sensed tensions of the tendons", shape=(2, "joints"))
+    wanted: ndarray = field(unit="N", doc="tensions commanded of the valves", shape=(2, "joints"))
+    force: ndarray = field(
         unit="N", doc="sensed forces of the environment on the fingertips", shape=("fingers", 3)
     )
     holding: bool = field(
@@ -83,14 +80,10 @@ class HandStatus(AnsweringStatus, version=1):
         doc="1 if tensions are ignored because of a demand, an operator, or a lost board"
     )
     demand: Demand = field(doc="safety demand in this cycle")
-    clipped: int = field("u4", unit="1", doc="cycles in which a tension was limited")
-    touches: int = field("u4", unit="1", doc="unintended contacts, counted at every substep")
-    violations: int = field(
-        "u4", unit="1", doc="substeps in which a tendon drove a joint beyond a limit"
-    )
-    pushed: int = field(
-        "u4", unit="1", doc="substeps in which a blow pushed a joint beyond a limit"
-    )
+    clipped: int = integer("cycles in which a tension was limited")
+    touches: int = integer("unintended contacts, counted at every substep")
+    violations: int = integer("substeps in which a tendon drove a joint beyond a limit")
+    pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
 
 
 class TendonTorque(RelayedCommand, version=1):
@@ -99,24 +92,20 @@ class TendonTorque(RelayedCommand, version=1):
     sampled: int = field(
         unit="tick", doc="tick of the hand's status on which it depends, -1 without one"
     )
-    torque: np.ndarray = field(unit="N m", doc="torques of the joints", shape="joints")
+    torque: ndarray = per_joint("N m", "torques of the joints")
 
 
 class FingerTarget(RelayedCommand, version=1):
     """From the fingertip loop to the joint loop."""
 
     active: bool = field(doc="0 until there is a target")
-    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    stiff: np.ndarray = field(
-        unit="1",
-        doc="scale of the joint loop's stiffness, 0 to 1; its damping is not scaled",
-        shape="joints",
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    stiff: ndarray = per_joint(
+        "1", "scale of the joint loop's stiffness, 0 to 1; its damping is not scaled"
     )
-    torque: np.ndarray = field(
-        unit="N m", doc="additional torques, from forces of the tips", shape="joints"
-    )
-    spring: np.ndarray = field(
+    torque: ndarray = per_joint("N m", "additional torques, from forces of the tips")
+    spring: ndarray = field(
         unit="N m/rad",
         doc="additional joint stiffness, from springs at the tips",
         shape=("joints", "joints"),
@@ -127,21 +116,19 @@ class GraspTarget(RelayedCommand, version=1):
     """From the grasp loop to the fingertip loop, or to the boards of fingers."""
 
     active: bool = field(doc="0 until there is a target")
-    mode: np.ndarray = field("u1", unit=FingerMode, doc="mode of each finger", shape="fingers")
-    position: np.ndarray = field(unit="rad", doc="joint positions in mode JOINTS", shape="joints")
-    velocity: np.ndarray = field(
-        unit="rad/s", doc="joint velocities in mode JOINTS", shape="joints"
-    )
-    tip: np.ndarray = field(
+    mode: ndarray = field("u1", unit=FingerMode, doc="mode of each finger", shape="fingers")
+    position: ndarray = per_joint("rad", "joint positions in mode JOINTS")
+    velocity: ndarray = per_joint("rad/s", "joint velocities in mode JOINTS")
+    tip: ndarray = field(
         unit="m", doc="points of the tips in modes POINT and FORCE", shape=("fingers", 3)
     )
-    tip_velocity: np.ndarray = field(
+    tip_velocity: ndarray = field(
         unit="m/s", doc="velocities of these points", shape=("fingers", 3)
     )
-    stiffness: np.ndarray = field(
+    stiffness: ndarray = field(
         unit="N/m", doc="stiffness of each tip about its point in mode FORCE", shape="fingers"
     )
-    force: np.ndarray = field(
+    force: ndarray = field(
         unit="N",
         doc="force of each tip on the environment in mode FORCE",
         shape=("fingers", 3),
@@ -151,11 +138,9 @@ class GraspTarget(RelayedCommand, version=1):
 class LoopStatus(AnsweringStatus, version=1):
     """From the tendon loop to the joint loop, and from that to the fingertip loop."""
 
-    driven: np.ndarray = DRIVEN
+    driven: ndarray = DRIVEN
     sensed: int = SENSED
-    clipped: int = field(
-        "u4", unit="1", doc="cycles in which a torque was limited to what the tendons can exert"
-    )
+    clipped: int = integer("cycles in which a torque was limited to what the tendons can exert")
     holding: bool = field(doc="1 if the last command stays in force for lack of a fresh one")
     stopped: bool = field(
         doc="1 if commands are ignored because the hand is stopped or an operator holds the loop"
@@ -166,14 +151,12 @@ class FingerStatus(AnsweringStatus, version=1):
     """From the fingertip loop, or from a board that runs all loops of a finger, to the grasp
     loop."""
 
-    driven: np.ndarray = field("u1", unit="1", doc="1 for fingers of this board", shape="fingers")
+    driven: ndarray = field("u1", unit="1", doc="1 for fingers of this board", shape="fingers")
     sensed: int = SENSED
-    position: np.ndarray = field(
-        unit="rad", doc="joint positions, from the hand's status", shape="joints"
-    )
-    target: np.ndarray = field(unit="rad", doc="joint targets", shape="joints")
-    tip: np.ndarray = field(unit="m", doc="positions of the tips", shape=("fingers", 3))
-    force: np.ndarray = field(
+    position: ndarray = per_joint("rad", "joint positions, from the hand's status")
+    target: ndarray = per_joint("rad", "joint targets")
+    tip: ndarray = field(unit="m", doc="positions of the tips", shape=("fingers", 3))
+    force: ndarray = field(
         unit="N", doc="forces of the environment on the tips", shape=("fingers", 3)
     )
     holding: bool = field(doc="1 if the fingers stay for lack of a fresh target")
@@ -185,39 +168,35 @@ class FingerStatus(AnsweringStatus, version=1):
 class GraspStatus(AnsweringStatus, version=1):
     """From the grasp loop. Points and forces are in the frame of the palm."""
 
-    step: int = field("u2", unit="1", doc="number of completed steps")
-    steps: int = field("u2", unit="1", doc="number of steps of the program")
+    step: int = integer("number of completed steps", "u2")
+    steps: int = integer("number of steps of the program", "u2")
     kind: GraspKind = field(doc="kind of the current step")
     passed: float = field(unit="s", doc="execution time of the current step")
-    object: int = field(
-        "i2", unit="1", doc="row of the gripped object in the world model, -1 without one"
-    )
-    touching: np.ndarray = field(
+    object: int = integer("row of the gripped object in the world model, -1 without one", "i2")
+    touching: ndarray = field(
         "u1", unit="1", doc="1 for fingers that touch the object", shape="fingers"
     )
     grip: float = field(unit="N", doc="internal force of the opposing finger, shared by the others")
-    load: np.ndarray = field(unit="N", doc="force of the grasp against weight and pull", shape=3)
-    anchor: np.ndarray = field(unit="m", doc="target position of the object", shape=3)
+    load: ndarray = field(unit="N", doc="force of the grasp against weight and pull", shape=3)
+    anchor: ndarray = field(unit="m", doc="target position of the object", shape=3)
     moved: float = field(unit="m", doc="distance of the object from its target position")
     farthest: float = field(unit="m", doc="largest such distance since the object was gripped")
-    plan: int = field("u4", unit="1", doc="id of the grasp plan in use, 0 without one")
+    plan: int = integer("id of the grasp plan in use, 0 without one")
 
 
 class GraspPlan(RelayedCommand, version=1):
-    """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on
-    an object, and the posture from which they close. The newest with an `id` above 0 is used."""
+    """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on an
+    object, and the posture from which they close. The newest plan with an `id` above 0 is used."""
 
-    object: int = field("i2", unit="1", doc="row of the object in the world model")
+    object: int = integer("row of the object in the world model", "i2")
     sensed: int = field(unit="tick", doc="tick of the world model on which it depends")
-    posture: np.ndarray = field(
-        unit="rad", doc="joint positions from which the fingers close", shape="joints"
-    )
-    contact: np.ndarray = field(
+    posture: ndarray = per_joint("rad", "joint positions from which the fingers close")
+    contact: ndarray = field(
         unit="m",
         doc="contact of each tip on the object's surface, in the object's frame",
         shape=("fingers", 3),
     )
-    normal: np.ndarray = field(
+    normal: ndarray = field(
         unit="1",
         doc="unit vector of each tip's force, in the object's frame",
         shape=("fingers", 3),

@@ -13,7 +13,7 @@ from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.level import Executor, Input, LevelContext, Misfits, Output
 from rack.levels.messages import Error
-from rack.levels.operator import Goal, Operation, OperatorCommand
+from rack.levels.operator import HOLDABLE, Goal, Operation, OperatorCommand
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import cell_of
 from rack.levels.servo import curves, reference
@@ -61,8 +61,7 @@ class JointServo(Executor):
     command = Output(JointTorque, rests_on=above)
     status = Output(JointStatus, rests_on=below)
     commands = {
-        Operation.HOLD: (),
-        Operation.RESUME: (),
+        **HOLDABLE,
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
         Operation.SET: (),

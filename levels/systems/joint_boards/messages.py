@@ -18,10 +18,10 @@ begins again where they hold the arm.
 
 from __future__ import annotations
 
-import numpy as np
+from numpy import ndarray
 
 from rack.backplane.message import field
-from rack.levels.messages import DrivenArm, JointCommand, ServoStatus
+from rack.levels.messages import DrivenArm, JointCommand, ServoStatus, per_joint
 from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 
@@ -32,23 +32,17 @@ class JointReference(RelayedCommand, version=1):
     due: int = field(
         unit="tick", doc="tick at which the arm should be there; 0: no set point, hold"
     )
-    position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
-    velocity: np.ndarray = field(unit="rad/s", doc="joint velocities", shape="joints")
-    acceleration: np.ndarray = field(unit="rad/s2", doc="joint accelerations", shape="joints")
-    inertia: np.ndarray = field(
-        unit="kg m2", doc="diagonal of the joint-space inertia there", shape="joints"
-    )
-    load: np.ndarray = field(
-        unit="N m", doc="torques of gravity and motion there, without acceleration", shape="joints"
-    )
+    position: ndarray = per_joint("rad", "joint positions")
+    velocity: ndarray = per_joint("rad/s", "joint velocities")
+    acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
+    inertia: ndarray = per_joint("kg m2", "diagonal of the joint-space inertia there")
+    load: ndarray = per_joint("N m", "torques of gravity and motion there, without acceleration")
     opening: float = field(unit="m", doc="gripper joint position to go to")
     force: float = field(unit="N", doc="largest gripper force")
     payload_mass: float = field(
         unit="kg", doc="mass in the gripper, which `inertia` and `load` include"
     )
-    payload_offset: np.ndarray = field(
-        unit="m", doc="its centre, in the frame of the tool", shape=3
-    )
+    payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
 
 class JointTorque(SampledCommand, version=1):
@@ -59,42 +53,30 @@ class JointTorque(SampledCommand, version=1):
     sampled: int = field(
         unit="tick", doc="tick of the arm's status that it rests on; -1: none yet, so no torque"
     )
-    torque: np.ndarray = field(
-        unit="N m", doc="of the board's own joints; others 0", shape="joints"
+    torque: ndarray = per_joint("N m", "of the board's own joints; others 0")
+    target: ndarray = per_joint(
+        "rad", "where the board wants its own joints when the torque acts; others 0"
     )
-    target: np.ndarray = field(
-        unit="rad",
-        doc="where the board wants its own joints when the torque acts; others 0",
-        shape="joints",
-    )
-    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
+    target_velocity: ndarray = per_joint("rad/s", "likewise")
     grip_force: float = field(
         unit="N", doc="of the gripper, from the board that drives it; others 0"
     )
     payload_mass: float = field(
         unit="kg", doc="mass in the gripper, from the board that drives it; others 0"
     )
-    payload_offset: np.ndarray = field(
-        unit="m", doc="its centre, in the frame of the tool", shape=3
-    )
+    payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
 
 class JointStatus(AnsweringStatus, version=1):
     """From a board that servoes joints to the trajectory level."""
 
-    position: np.ndarray = field(
-        unit="rad", doc="joint positions, from the arm's status", shape="joints"
+    position: ndarray = per_joint("rad", "joint positions, from the arm's status")
+    target: ndarray = per_joint(
+        "rad", "set point of the board's own joints in this cycle; others 0"
     )
-    target: np.ndarray = field(
-        unit="rad",
-        doc="set point of the board's own joints in this cycle; others 0",
-        shape="joints",
-    )
-    target_velocity: np.ndarray = field(unit="rad/s", doc="likewise", shape="joints")
-    torque: np.ndarray = field(
-        unit="N m", doc="of the board's own joints; others 0", shape="joints"
-    )
-    driven: np.ndarray = field(
+    target_velocity: ndarray = per_joint("rad/s", "likewise")
+    torque: ndarray = per_joint("N m", "of the board's own joints; others 0")
+    driven: ndarray = field(
         "u1", unit="1", doc="1: the joint is one of this board's", shape="joints"
     )
     holding: bool = field(doc="1: no fresh set point, the joints ramp to rest and stay")

@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import field
+from rack.backplane.message import field, integer
 from rack.levels.algebra import Array, norm
 from rack.levels.level import Input, Inputs, LevelContext, Output
 from rack.levels.messages import WorldState
@@ -43,9 +43,9 @@ STILL_M_S = 0.005
 class MoveTableStatus(TableStatus, version=1):
     """Status of the elemental move level of state tables."""
 
-    sent: int = field("u4", unit="1", doc="serial of the newest command sent down; 0: none")
+    sent: int = integer("serial of the newest command sent down; 0: none")
     reached: bool = field(doc="1: the newest pose has joint positions")
-    put: int = field("i2", unit="1", doc="row of the object put down last; -1: none")
+    put: int = integer("row of the object put down last; -1: none", "i2")
     resting: bool = field(doc="1: the arm rests")
 
 

@@ -15,12 +15,13 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field as Key
 
-from rack.backplane.message import State, field
+from rack.backplane.message import State, field, integer
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
     HELD_FROM_ABOVE,
+    HOLDABLE,
     AnsweringStatus,
     Commands,
     Operation,
@@ -67,17 +68,15 @@ class TableStatus(AnsweringStatus, version=1):
     on."""
 
     table: str = field(f"S{NAME_BYTES}", doc="state table in force")
-    checksum: int = field("u4", unit="1", doc="CRC-32 of its file")
+    checksum: int = integer("CRC-32 of its file")
     in_state: str = field(f"S{NAME_BYTES}", doc="state after this cycle")
-    row: int = field("u2", unit="1", doc="row that fired in this cycle, from 1; 0: none")
+    row: int = integer("row that fired in this cycle, from 1; 0: none", "u2")
     fired: str = field(f"S{ROW_NAME_BYTES}", doc="its name")
     words: str = field(f"S{PHRASE_BYTES}", doc="command in force; empty: none")
-    ordered: int = field(
-        "u4",
-        unit="1",
-        doc="serial of an operator's command, if it is in force; 0: it is the level above's",
+    ordered: int = integer(
+        "serial of an operator's command, if it is in force; 0: it is the level above's"
     )
-    done: int = field("u4", unit="1", doc="newest command of the level above that is done; 0: none")
+    done: int = integer("newest command of the level above that is done; 0: none")
 
 
 YES_NO = ("no", "yes")
@@ -119,7 +118,7 @@ class WordCommand(NamedTuple):
     words: str
 
 
-OPERATIONS: Commands = {Operation.HOLD: (), Operation.RESUME: (), Operation.TABLE: ()}
+OPERATIONS: Commands = {**HOLDABLE, Operation.TABLE: ()}
 """An operator's commands to every level of this kind."""
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rack.backplane.message import field
+from rack.backplane.message import field, integer
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.level import Input, Inputs, LevelContext, Output
+from rack.levels.messages import per_joint
 from rack.levels.operator import OperatorCommand
 from rack.levels.robot.cell import cell_of
 from rack.levels.robot.dynamics import Dynamics, Payload
@@ -47,11 +48,9 @@ GRIP_MARGIN_M = 0.001
 class JointMove(TableCommand, version=1):
     """From the elemental move level of state tables to its primitive level."""
 
-    joints: np.ndarray = field(unit="rad", doc="where a motion ends", shape="joints")
+    joints: np.ndarray = per_joint("rad", "where a motion ends")
     speed: float = field(unit="1", doc="part of the joints' limits")
-    object: int = field(
-        "i2", unit="1", doc="row of the object concerned in the world model; -1: none"
-    )
+    object: int = integer("row of the object concerned in the world model; -1: none", "i2")
     aim: np.ndarray = field(
         unit="m", doc="where the object, or the place, was for this command", shape=3
     )
@@ -61,12 +60,12 @@ class JointMove(TableCommand, version=1):
 class JointMoveStatus(TableStatus, version=1):
     """Status of the primitive level of state tables."""
 
-    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
-    end: np.ndarray = field(unit="rad", doc="where the newest motion ends", shape="joints")
+    position: np.ndarray = per_joint("rad", "joint positions commanded last")
+    end: np.ndarray = per_joint("rad", "where the newest motion ends")
     moving: bool = field(doc="1: they still change")
     closed: bool = field(doc="1: the gripper is commanded to close")
     held: bool = field(doc="1: it holds something")
-    object: int = field("i2", unit="1", doc="row of the object that it holds; -1: none")
+    object: int = integer("row of the object that it holds; -1: none", "i2")
 
 
 class PrimitivePlanConfig(Table):

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import field
+from rack.backplane.message import integer
 from rack.levels.level import Input, LevelContext, Misfits, Output
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.systems.state_table.elemental_move import MoveTable, MoveTableStatus
@@ -32,11 +32,11 @@ COMMANDS_A_STEP = 2
 class TaskTableStatus(TableStatus, version=1):
     """Status of the task level of state tables."""
 
-    action: int = field("u2", unit="1", doc="steps done")
-    actions: int = field("u2", unit="1", doc="steps of the plan")
-    moves_done: int = field("u2", unit="1", doc="commands done by the level below")
-    moves: int = field("u2", unit="1", doc="commands of the plan")
-    sent: int = field("u4", unit="1", doc="serial of the newest command sent down; 0: none")
+    action: int = integer("steps done", "u2")
+    actions: int = integer("steps of the plan", "u2")
+    moves_done: int = integer("commands done by the level below", "u2")
+    moves: int = integer("commands of the plan", "u2")
+    sent: int = integer("serial of the newest command sent down; 0: none")
 
 
 class StepConfig(Table):

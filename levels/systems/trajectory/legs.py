@@ -153,7 +153,9 @@ class TimeLaw:
         self.segment_s = segment_s
         self.half_blend_s = half_blend_s
         self.least_s = least_s  # least half blend time in which it may slow down
-        self.leaving_s = half_blend_s  # half the time in which the speed falls at the end
+        # Half the time in which the speed falls at the end: at most the leg's own half blend time,
+        # and more than none.
+        self.leaving_s = half_blend_s
 
     @property
     def nominal_s(self) -> float:
@@ -165,11 +167,6 @@ class TimeLaw:
     def ends_s(self) -> float:
         """Time at which the leg rests at its goal."""
         return self.nominal_s + self.leaving_s
-
-    def leave_within(self, half_blend_s: float) -> None:
-        """Slow down over twice `half_blend_s`; at most the leg's own half blend time, and more than
-        none."""
-        self.leaving_s = min(half_blend_s, self.half_blend_s)
 
     def part(self, time_s: float) -> float:
         """Return the part done after `time_s`."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-import numpy as np
+from numpy import ndarray
 
-from rack.backplane.message import Message, field
+from rack.backplane.message import Message, field, integer
+from rack.levels.messages import per_joint
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
 HELD = 16
@@ -50,17 +51,15 @@ class MotionRequest(RelayedCommand, version=1):
     is a repetition."""
 
     kind: MotionKind = field(doc="what to do")
-    joints: np.ndarray = field(unit="rad", doc="goal of JOINTS", shape="joints")
-    position: np.ndarray = field(
+    joints: ndarray = per_joint("rad", "goal of JOINTS")
+    position: ndarray = field(
         unit="m", doc="goal of POSE: tool position, in the frame of `body`", shape=3
     )
-    quaternion: np.ndarray = field(
+    quaternion: ndarray = field(
         unit="1", doc="goal of POSE: tool orientation, in the frame of `body`", shape=4
     )
-    body: int = field(
-        "i2",
-        unit="1",
-        doc="row of the body in the world model in whose frame the goal is; -1: the world",
+    body: int = integer(
+        "row of the body in the world model in whose frame the goal is; -1: the world", "i2"
     )
     live: bool = field(
         doc="1: the goal follows the body; 0: its frame is copied when the request begins"
@@ -85,33 +84,31 @@ class MotionState(Message, version=1):
 
     begun: bool = field(doc="1: the first of `requests` is under way")
     passed: float = field(unit="s", doc="time that it has stayed or gripped")
-    goal: np.ndarray = field(
+    goal: ndarray = field(
         MotionRequest,
         doc="the request at whose goal the arm is, or to which it goes; id 0: none",
     )
-    count: int = field("u2", unit="1", doc="requests that follow")
-    requests: np.ndarray = field(MotionRequest, doc="taken and not ended, oldest first", shape=HELD)
+    count: int = integer("requests that follow", "u2")
+    requests: ndarray = field(MotionRequest, doc="taken and not ended, oldest first", shape=HELD)
 
 
 class MotionStatus(AnsweringStatus, version=1):
     """Status of a trajectory level."""
 
-    taken: int = field("u4", unit="1", doc="newest request taken from the queue; 0: none yet")
-    current: int = field("u4", unit="1", doc="request under way; 0: none")
-    done: int = field("u4", unit="1", doc="newest request ended, however; 0: none yet")
-    ended: np.ndarray = field(
+    taken: int = integer("newest request taken from the queue; 0: none yet")
+    current: int = integer("request under way; 0: none")
+    done: int = integer("newest request ended, however; 0: none yet")
+    ended: ndarray = field(
         "u4", unit="1", doc="ids of the last requests ended, newest first; 0: none", shape=ENDED
     )
-    ends: np.ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
+    ends: ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
     progress: float = field(
         unit="1", doc="part of the current request's time that has passed, 0 to 1"
     )
     resting: bool = field(doc="1: commanded velocity is zero")
-    position: np.ndarray = field(unit="rad", doc="joint positions commanded last", shape="joints")
-    velocity: np.ndarray = field(
-        unit="rad/s", doc="joint velocities commanded last", shape="joints"
-    )
-    tool: np.ndarray = field(unit="m", doc="tool position commanded last", shape=3)
+    position: ndarray = per_joint("rad", "joint positions commanded last")
+    velocity: ndarray = per_joint("rad/s", "joint velocities commanded last")
+    tool: ndarray = field(unit="m", doc="tool position commanded last", shape=3)
     astray: float = field(
         unit="m", doc="distance of that from a live goal, once reached; 0: there is none"
     )

@@ -7,11 +7,11 @@ are the differences of those around it, so they always fit the positions, howeve
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from rack.levels.algebra import Array
+from rack.levels.primitive.path_motion import JointSetPoint
 from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling, Unfit
 
@@ -25,14 +25,6 @@ EXCESS = 1.04
 velocity limits are 5 % below those of the arm."""
 MAX_REST_RAD = 1e-7
 """Samples that differ by less are the same."""
-
-
-class JointState(NamedTuple):
-    """A sample; (joints,) each."""
-
-    position: Array  # rad
-    velocity: Array  # rad/s
-    acceleration: Array  # rad/s2
 
 
 class SampledMotion:
@@ -75,15 +67,15 @@ class SampledMotion:
         except Unfit:
             # The sample ahead cannot be made: go on from the state before this one.
             velocity = velocity + self._period_s * acceleration
-            self._stop_from(JointState(here, velocity, acceleration))
+            self._stop_from(JointSetPoint(here, velocity, acceleration))
             raise
 
     @property
-    def state(self) -> JointState:
+    def state(self) -> JointSetPoint:
         """The present sample."""
         before, here, after = self._samples
         h = self._period_s
-        return JointState(
+        return JointSetPoint(
             here, (after - before) / (2.0 * h), (after - 2.0 * here + before) / (h * h)
         )
 
@@ -113,7 +105,7 @@ class SampledMotion:
         """Ramp to rest from the present sample."""
         self._stop_from(self.state)
 
-    def _stop_from(self, state: JointState) -> None:
+    def _stop_from(self, state: JointSetPoint) -> None:
         self._settle(state, STOP_PART)
         self.leg = None
         self._look_ahead()
@@ -136,7 +128,7 @@ class SampledMotion:
         finally:
             self._look_ahead()
 
-    def _settle(self, state: JointState, part: float, least_s: float = 0.0) -> None:
+    def _settle(self, state: JointSetPoint, part: float, least_s: float = 0.0) -> None:
         least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
         self._settling = Settling(state, part * self._limits.acceleration, least_s)
         self._settles_s = self.time_s

@@ -185,7 +185,7 @@ class RequestWork:
             return max(0.5 * (law.ends_s - passed_s), 0.0)  # it slows down already
         wanted_s = max(request.acceleration or self._tools.params.acceleration, law.least_s)
         half_s = min(wanted_s, law.segment_s - law.half_blend_s)
-        law.leave_within(half_s)
+        law.leaving_s = min(half_s, law.half_blend_s)
         left_s = law.nominal_s - passed_s
         return left_s if left_s < half_s + self._tools.period_s else None
 

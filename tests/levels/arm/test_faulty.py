@@ -19,7 +19,7 @@ from tests.levels.arms import CLOCK_NS, cell, config
 def linked(*faults: Fault) -> tuple[FaultyLink, SimulatedArm, dict[int, bool]]:
     made, acted = cell("puma560"), dict[int, bool]()
     arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
-    link = FaultyLink(arm, made, 1, acted)
+    link = FaultyLink(arm, acted)
     link.inject(faults)
     return link, arm, acted
 
@@ -112,7 +112,7 @@ def test_a_motor_that_is_off_acts_at_once_and_shows_later_where_a_resting_arm_be
     arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
     lay_against_a_finger(made, arm, blocks)
     assert (arm.holds, arm.leans) == (blocks > 0, blocks > 1)
-    link = FaultyLink(arm, made, 1, acted, holds=lambda: says_held)
+    link = FaultyLink(arm, acted, holds=lambda: says_held)
     link.inject([fault("actuator-off", joint=1)])
     link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)
     # Its level may take a part for held that the arm does not hold.

@@ -93,7 +93,7 @@ def test_as_coarse_as_its_encoders_may_be_it_keeps_them_too(tmp_path: Path) -> N
     cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
     assert cell.encoders.off.min() > 2e-3
     arm = CoarseArm(cell, SceneConfig(), CLOCK_NS)
-    guard = GuardedArm(arm, cell, robot.joints, TICK_S)
+    guard = GuardedArm(arm, TICK_S)
     assert max(excess(cell, driven(guard, arm, random_torques(cell, 0, 800)))) <= 0.0
     assert arm.clipped > 50
     assert arm.violations == 0
@@ -107,7 +107,7 @@ def test_missed_cycles_lead_beyond_no_limit_either(tmp_path: Path) -> None:
 
     def moved(is_guarded: bool) -> float:
         arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
-        link = GuardedArm(arm, cell, robot.joints, TICK_S) if is_guarded else arm
+        link = GuardedArm(arm, TICK_S) if is_guarded else arm
         arm.enable()
         worst = -np.inf
         for torque in random_torques(cell, 0, 800):
@@ -134,7 +134,7 @@ def test_nothing_is_driven_on_a_sample_that_is_not_finite(
     FarArm.jumps = {1: sample}
     arm = FarArm(cell, SceneConfig(), CLOCK_NS)
     arm.enable()
-    guard = GuardedArm(arm, cell, robot.joints, TICK_S)
+    guard = GuardedArm(arm, TICK_S)
     guard.sense()
     assert guard.drive(np.zeros(2), 0.0) is None
     arm.step(1)
@@ -227,7 +227,7 @@ def test_during_bring_up_no_torques_lead_beyond_its_part_of_the_speed(tmp_path: 
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     arm = IdealArm(cell, SceneConfig(), CLOCK_NS)
-    guard = GuardedArm(arm, cell, robot.joints, TICK_S, part=0.1)
+    guard = GuardedArm(arm, TICK_S, part=0.1)
     _, slow = driven(guard, arm, random_torques(cell, 0, 800))
     assert (np.abs(slow) / cell.bounds.velocity).max() <= 0.1
     assert (arm.violations, arm.clipped > 50) == (0, True)

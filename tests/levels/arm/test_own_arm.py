@@ -111,7 +111,10 @@ def test_a_restarted_board_restores_it(rig: ServoRig) -> None:
             "tests.levels.arm.test_own_arm:Missing",
             "module 'tests.levels.arm.test_own_arm' has no class 'Missing'",
         ),
-        ("rack.levels.arm:Sensed", "module 'rack.levels.arm' has no Arm named 'Sensed'; it has: "),
+        (
+            "rack.levels.arm:Sensed",
+            "module 'rack.levels.arm' has no DrivableArm named 'Sensed'; it has: ",
+        ),
         ("tests.levels.arm.test_own_arm:HalfAnArm", "class 'HalfAnArm' lacks: brake, step"),
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Sensed, SimulatedArm
-from rack.levels.arm.arm import copied
+from rack.levels.arm.drivable import copied
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.present import PresentLink
 from rack.levels.messages import Error
@@ -89,7 +89,7 @@ def test_a_sample_is_brought_to_the_present_if_it_is_not_too_old(
     _, cell = late(tmp_path, ticks)
     arm.late = age
     own = arm(cell, SceneConfig(), CLOCK_NS)
-    link = PresentLink(own, cell, TICK_S)
+    link = PresentLink(own, TICK_S)
     brought, as_sensed = [], []
     for torque in random_torques(cell, 3, 400):
         raw, sample, _ = link.look()
@@ -146,10 +146,10 @@ def test_samples_older_than_the_config_permits_are_a_finding_with_their_age(
 
 @pytest.mark.slow
 def test_late_samples_lead_beyond_no_limit(tmp_path: Path, arm: type[LateArm]) -> None:
-    robot, cell = late(tmp_path, 4)
+    _, cell = late(tmp_path, 4)
     arm.late = 4
     own = arm(cell, SceneConfig(), CLOCK_NS)
-    guard = GuardedArm(own, cell, robot.joints, TICK_S, PresentLink(own, cell, TICK_S))
+    guard = GuardedArm(own, TICK_S, PresentLink(own, TICK_S))
     assert max(excess(cell, driven(guard, own, random_torques(cell, 0, 800)))) <= 0.0
     assert own.clipped > 50
     assert own.violations == 0

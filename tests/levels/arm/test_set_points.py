@@ -71,7 +71,7 @@ def simulated(name: str, interface: Interface) -> tuple[SimulatedArm, Cell]:
 def own(folder: Path, interface: Interface) -> tuple[ServoArm, GuardedArm]:
     robot = pendulum(folder, interface=interface)
     arm = ServoArm(build_cell(robot, SceneConfig(), CLOCK_NS), SceneConfig(), CLOCK_NS)
-    return arm, GuardedArm(arm, arm.cell, robot.joints, TICK_S)
+    return arm, GuardedArm(arm, TICK_S)
 
 
 def link_of(folder: Path, interface: Interface, is_own: bool) -> tuple[Arm, Arm | GuardedArm]:

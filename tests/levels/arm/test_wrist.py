@@ -12,7 +12,7 @@ from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ArmState
 from rack.levels.robot.cell import build_cell, sizes
-from rack.levels.systems.force.contact_wrench import ContactWrench
+from rack.levels.systems.force.arm_executor import ContactWrench
 from tests.levels.systems.force.pad import pad
 
 CLOCK_NS = 1_000_000

@@ -3,19 +3,23 @@ stopping."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from rack.levels.messages import SECTIONS, WAYPOINTS
 from rack.levels.motion.path import BlendedPath, PathBounds
-from rack.levels.motion.speed import (
+from rack.levels.motion.trajectory import (
+    PathState,
     SpeedLimits,
+    Trajectory,
     boundary_speeds,
-    braking_limits,
+    make_stop,
+    make_trajectory,
     reachable_speed,
     speed_limits,
 )
-from rack.levels.motion.trajectory import PathState, Trajectory, make_stop, make_trajectory
 from tests.levels.arms import cell
 
 EXACT = 1e-6
@@ -158,7 +162,7 @@ def test_curve_that_leaves_no_acceleration_is_followed_at_constant_speed() -> No
 def test_stop_keeps_the_joint_limits_and_stays_on_the_path(corners: int) -> None:
     path = random_path(10 + corners, corners, stops=corners == 3)
     trajectory = make_trajectory(path, ARM)
-    braking = braking_limits(ARM, 1.5)
+    braking = replace(ARM, acceleration=1.5 * ARM.acceleration, jerk=1.5 * ARM.jerk)
     stops = 0
     for time_s in np.linspace(0.0, trajectory.duration, 40):
         motion = trajectory.at(time_s)

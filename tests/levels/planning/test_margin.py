@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from rack.levels.planning.collision import CollisionChecker
-from rack.levels.planning.fixed_jaw import GAP_M, FixedJaw, find_fixed_jaw
 from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner
 from rack.levels.planning.moves import Situation
-from rack.levels.planning.payload import Payloads
+from rack.levels.planning.payload import GAP_M, FixedJaw, Payloads, find_fixed_jaw
 from rack.levels.planning.pose import Pose, pointing
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import SceneConfig

@@ -95,9 +95,9 @@ class Watched:
             self.world.quaternion[row] = start.xquat[body]
         self.path = BlendedPath(waypoints, np.zeros(len(waypoints)))
         self.trajectory = make_trajectory(self.path, self.cell.limits)
-        self.segment = MotionSegment(
-            1, SegmentKind.PATH, held, False, waypoints, np.zeros(2), 0.0, 0.0, 0.0
-        )
+        self.segment = MotionSegment.zeros({"joints": len(self.cell.qpos)})
+        self.segment.kind = SegmentKind.PATH
+        self.segment.object = held
 
     def watch(self) -> None:
         self.guard.watch(self.segment, self.path, 0.04, self.world)

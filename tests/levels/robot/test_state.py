@@ -11,7 +11,7 @@ from rack.levels.arm import SimulatedArm
 from rack.levels.arm.simulation import sleeping
 from rack.levels.messages import ArmState
 from rack.levels.robot.cell import sizes
-from rack.levels.robot.state import SLEEP
+from rack.levels.robot.engine import SLEEP
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
 

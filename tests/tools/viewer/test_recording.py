@@ -9,7 +9,7 @@ from rerun.chunk import RrdReader
 
 from rack.boards.config import load, loads
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.robot.state import view_state
+from rack.levels.robot.engine import view_state
 from rack.tools.recording.recording import Recording
 from rack.tools.viewer.pictures import NoViewerError, opened
 from rack.tools.viewer.reading import read

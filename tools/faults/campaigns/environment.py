@@ -89,7 +89,7 @@ def examine(config: RackConfig) -> None:
     from numpy import isfinite
 
     from rack.levels.arm import SimulatedArm
-    from rack.levels.arm.simulation import save_state
+    from rack.levels.arm.substeps import copy_state
     from rack.levels.messages import ArmState
     from rack.levels.robot.cell import build_cell, sizes
 
@@ -104,7 +104,7 @@ def examine(config: RackConfig) -> None:
         state = ArmState.zeros(sizes(cell))
         arm.save(state)
         data.qvel[dof] = FACTOR * limit
-        save_state(cell.model, data, state.state)
+        copy_state(cell.model._address, data._address, data.tree_asleep, state.state)
         arm.restore(state)
         arm.step(1)
         if not arm.violations:
