@@ -107,10 +107,10 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 
 class Poses:
-    """Writes an `ArmState` as poses of all moving bodies, by MuJoCo's own kinematics, and the path
-    of the tool."""
+    """Writes an `ArmState` as poses of all moving bodies, by MuJoCo's own kinematics, the path of
+    the tool, and, with `has_pushes`, the forces that the scene exerts on its objects."""
 
-    def __init__(self, stream: Stream, cell: Cell) -> None:
+    def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
         self._stream = stream
         self._cell = cell
         self._data = cell.start()
@@ -120,9 +120,13 @@ class Poses:
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._frames += [stream.frame(contact.frame) for contact in self._contacts]
         self._sampled = Sampled(stream.times.clock_ns)
+        self._has_pushes = has_pushes
+        self._is_pushed = False
         stream.static(
             TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD)
         )
+        if has_pushes:
+            stream.static(PUSHES, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write poses, one every 20 ms of simulated time."""
@@ -143,6 +147,8 @@ class Poses:
             for at, contact in enumerate(self._contacts, len(bodies)):
                 positions[row, at], quaternions[row, at] = contact.pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
+            if self._has_pushes:
+                self._push(block.when(chosen[row]))
         self._stream.columns(TOOL, block.times_of(chosen), rr.Points3D.columns(positions=tool))
         poses = rr.Transform3D.columns(
             translation=positions.reshape(-1, 3),
@@ -152,37 +158,20 @@ class Poses:
         )
         self._stream.columns((FRAMES,), block.times_of(np.repeat(chosen, count)), poses)
 
-
-class Pushes:
-    """Writes the forces that the scene exerts on its objects, as an `ArmState` has them."""
-
-    def __init__(self, stream: Stream, cell: Cell) -> None:
-        self._stream = stream
-        self._cell = cell
-        self._data = cell.start()
-        self._sampled = Sampled(stream.times.clock_ns)
-        self._is_empty = True
-        stream.static(PUSHES, stream.within(WORLD))
-
-    def write(self, block: RowBlock) -> None:
-        """Write the newest pushes, one set every 20 ms of simulated time."""
-        data = self._data
-        bodies = self._cell.bodies
-        for row in self._sampled.rows(block.ticks):
-            view_state(self._cell.model, data, block.messages["state"][row])
-            forces = data.xfrc_applied[bodies, :3]
-            pushed = forces.any(axis=1)
-            if self._is_empty and not pushed.any():
-                continue
-            self._is_empty = not pushed.any()
-            mujoco.mj_kinematics(self._cell.model, data)
+    def _push(self, when: Moment) -> None:
+        """Write the forces that act on the objects now, and that they have ended."""
+        objects = self._cell.bodies
+        forces = self._data.xfrc_applied[objects, :3]
+        pushed = forces.any(axis=1)
+        if self._is_pushed or pushed.any():
+            self._is_pushed = bool(pushed.any())
             arrows = rr.Arrows3D(
-                origins=data.xipos[bodies][pushed],
+                origins=self._data.xipos[objects][pushed],
                 vectors=PUSH_M * forces[pushed],
                 radii=PUSH_RADIUS_M,
                 colors=[FORCE],
             )
-            self._stream.at(block.when(row), PUSHES, arrows)
+            self._stream.at(when, PUSHES, arrows)
 
 
 class Marks:

@@ -3,6 +3,8 @@ messages."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
@@ -14,13 +16,14 @@ from rack.levels.timing.trace_times import (
     response_ns,
 )
 from rack.tools.viewer.levels import LEVELS
-from rack.tools.viewer.stream import Ints, RowBlock, Stream
+from rack.tools.viewer.stream import Ints, RowBlock, Stream, ViewPart
 from rack.tools.viewer.style import (
     COMMANDED,
     LETTERS,
     LIMIT,
     PHASES,
     Colour,
+    curves,
     dimmed,
     of_joint,
     style_curves,
@@ -81,42 +84,36 @@ def colours_of(layout: Layout) -> dict[str, Colour]:
     return {name: dimmed(colour) if "." in name else colour for name, colour in own.items()}
 
 
-class Load:
-    """Writes trace records as curves: lateness, execution and deadline in ms, and the used part of
-    the time slice.
+def load_curves(
+    stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
+) -> Iterator[ViewPart]:
+    """Yield the parts that write trace records as curves: lateness, execution and deadline in ms,
+    and the used part of the time slice, whose 100 % are the deadline.
 
     In lockstep a tick lasts as long as its tasks take: there is only execution, without anything to
     compare it with.
     """
+    slice_ns = task.slice * period_ns
 
-    def __init__(
-        self, stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
-    ) -> None:
-        self._stream = stream
-        self._task = task.name
-        self._is_lockstep = is_lockstep
-        self._slice_ns = task.slice * period_ns
-        curves = [
-            f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")
-        ]
-        style_curves(stream, (TIMES, task.name), curves, [COMMANDED, colour, LIMIT])
-        style_curves(stream, (LOAD, task.name), [f"{task.name}, %"], [colour])
-
-    def write(self, block: RowBlock) -> None:
-        """Write every cycle; 100 % is the deadline."""
+    def times_ms(block: RowBlock) -> np.ndarray:
         rows = block.rows
-        curves = (
-            np.column_stack(
-                (lateness_ns(rows), execution_ns(rows), np.full(len(rows), self._slice_ns))
-            )
-            * 1e-6
+        found = np.full((len(rows), 3), np.nan)
+        found[:, 1] = execution_ns(rows) * 1e-6
+        if not is_lockstep:
+            found[:, 0] = lateness_ns(rows) * 1e-6
+            found[:, 2] = slice_ns * 1e-6
+        return found
+
+    names = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
+    yield curves(stream, (TIMES, task.name), times_ms, names, [COMMANDED, colour, LIMIT])
+    if not is_lockstep:
+        yield curves(
+            stream,
+            (LOAD, task.name),
+            lambda block: response_ns(block.rows) * (100.0 / slice_ns),
+            [f"{task.name}, %"],
+            [colour],
         )
-        if self._is_lockstep:
-            curves[:, [0, 2]] = np.nan
-        self._stream.scalars((TIMES, self._task), block.times, curves)
-        if not self._is_lockstep:
-            used = response_ns(rows) * (100.0 / self._slice_ns)
-            self._stream.scalars((LOAD, self._task), block.times, used)
 
 
 class Misses:
