@@ -14,7 +14,6 @@ from typing import TypeVar
 from rack.backplane.layout import Protocol
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
 from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Document
 from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
@@ -188,18 +187,21 @@ def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None
     on the age of plans, a plan may then get fewer cycles."""
     every = rack.timing.boards[board].every
     timing = rack.timing if place is None else rack.timing.changed(board, coupling="loose")
+    level = timing.level(board)
     step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
     longest = min(MAX_FACTOR * every, LONGEST_EVERY)
-    tried = (
-        _lengthened(timing, board, longer) for longer in range(every + step, longest + 1, step)
-    )
-    # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the other
-    # levels less well, or leave plans too few cycles.
-    return [
-        {**(place or {}), **settings}
-        for changed, settings in tried
-        if rack.is_sound(changed, board)
-    ]
+    found: list[Settings] = []
+    for longer in range(every + step, longest + 1, step):
+        cycles = timing.boards[board].within_cycles
+        changed: Settings = {}
+        if level.within_cycles is not None and level.plan_within_ns is not None:
+            cycles = max(min(cycles, level.plan_within_ns // (longer * timing.tick_ns)), 1)
+            changed = {"within_cycles": cycles}
+        # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the
+        # other levels less well, or leave plans too few cycles.
+        if rack.is_sound(timing.changed(board, every=longer, within_cycles=cycles), board):
+            found.append({**(place or {}), "every": longer, "rate_hz": None, **changed})
+    return found
 
 
 def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
@@ -221,17 +223,6 @@ def _cycles(level: LevelTiming) -> range:
     if level.plan_within_ns is not None:
         longest = min(level.plan_within_ns // level.cycle_ns, longest)
     return range(level.within_cycles + 1, longest + 1)
-
-
-def _lengthened(timing: RackTiming, board: str, every: int) -> tuple[RackTiming, Settings]:
-    """Return a rack with another cycle of a board, and the settings that make it."""
-    level = timing.level(board)
-    settings = {"every": every, "rate_hz": None}
-    if level.within_cycles is not None and level.plan_within_ns is not None:
-        cycles = level.plan_within_ns // (every * timing.tick_ns)
-        settings["within_cycles"] = max(min(level.within_cycles, cycles), 1)
-    cycles = settings.get("within_cycles") or timing.boards[board].within_cycles
-    return timing.changed(board, every=every, within_cycles=cycles), settings
 
 
 def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:

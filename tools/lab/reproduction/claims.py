@@ -8,9 +8,6 @@ from functools import partial
 
 from rack.tools.lab.reproduction import predictions, rules
 from rack.tools.lab.reproduction.experiments import (
-    deadline,
-    determinism,
-    losses,
     partition,
     response,
     sharing,
@@ -31,7 +28,15 @@ from rack.tools.lab.reproduction.experiments.figures import (
     SHORT_3,
     settings_of,
 )
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    DEADLINE,
+    DETERMINISM,
+    KILLS,
+    NAME,
+    NASREM,
+    SENSORS,
+    NasremRun,
+)
 from rack.tools.lab.reproduction.page import PaperClaim, Section
 from rack.tools.lab.reproduction.verdict import ClaimVerdict
 
@@ -84,7 +89,7 @@ SECTIONS = (
                 "Determinism is the measure",
                 "Determinism, not performance, is the key element in assessing a control model.",
                 "Two runs in lockstep and one in real time wrote the same messages, bit for bit.",
-                (determinism.DETERMINISM,),
+                (DETERMINISM,),
                 rules.judge_determinism,
             ),
         ),
@@ -174,7 +179,7 @@ SECTIONS = (
                 "A dead board or sensor does not stall the system",
                 "A level awaiting a reading from a failed sensor could loop forever.",
                 "Every loss was detected and over within its bounds, and the tasks were done.",
-                (losses.KILLS, losses.SENSORS),
+                (KILLS, SENSORS),
                 rules.judge_losses,
             ),
             PaperClaim(
@@ -198,7 +203,7 @@ SECTIONS = (
                 "GOTO A BY t_i, GOTO B BY t_i+1 ... demands real time handling.",
                 "A time that is too early is refused before anything moves; one that is promised"
                 " is met.",
-                (deadline.DEADLINE,),
+                (DEADLINE,),
                 rules.judge_goto,
             ),
         ),

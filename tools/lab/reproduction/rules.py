@@ -8,9 +8,6 @@ from math import ceil, inf
 from rack.boards.config import load, rack_timing, wire
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.lab.reproduction.experiments import (
-    deadline,
-    determinism,
-    losses,
     partition,
     response,
     tables,
@@ -25,7 +22,13 @@ from rack.tools.lab.reproduction.experiments.figures import (
     FigureRun,
     settings_of,
 )
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    NAME,
+    ComparedRuns,
+    GotoRuns,
+    LossesRun,
+    NasremRun,
+)
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
 from rack.tools.lab.reproduction.experiments.tasks import LATER_MS, NetworkRun, TaskRun
@@ -66,7 +69,7 @@ def check_done(*runs: TaskRun) -> list[Check]:
     return check_none(tasks_not_done=sum(run.ended != DONE for run in runs))
 
 
-def judge_determinism(found: determinism.ComparedRuns) -> ClaimVerdict:
+def judge_determinism(found: ComparedRuns) -> ClaimVerdict:
     """Compare digests, and where runs diverge with where they first missed a deadline."""
     digest = found.runs[0].digest
     lockstep = [run for run in found.runs if run.mode == "lockstep"]
@@ -156,7 +159,7 @@ def judge_loop(found: NasremRun) -> ClaimVerdict:
     return rule_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
-def judge_losses(*runs: losses.LossesRun) -> ClaimVerdict:
+def judge_losses(*runs: LossesRun) -> ClaimVerdict:
     """Compare when each loss was detected and over with its bounds."""
     faults = [fault for run in runs for fault in run.faults]
     lacking = check_none(
@@ -168,7 +171,7 @@ def judge_losses(*runs: losses.LossesRun) -> ClaimVerdict:
     return rule_on(compare("losses", struck, "=", len(faults)), *lacking)
 
 
-def judge_goto(found: deadline.GotoRuns) -> ClaimVerdict:
+def judge_goto(found: GotoRuns) -> ClaimVerdict:
     """Compare when A was done with the time by which it was promised, s."""
     early, met = found.early, found.met
     begun = early.moved + (early.done_s is not None)

@@ -11,11 +11,16 @@ import pytest
 
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
-from rack.tools.lab.reproduction.experiments.deadline import GotoRun, GotoRuns
-from rack.tools.lab.reproduction.experiments.determinism import ComparedRun, ComparedRuns
 from rack.tools.lab.reproduction.experiments.experiment import Kept
 from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
-from rack.tools.lab.reproduction.experiments.nasrem import MeasuredVerdict, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    ComparedRun,
+    ComparedRuns,
+    GotoRun,
+    GotoRuns,
+    MeasuredVerdict,
+    NasremRun,
+)
 from rack.tools.lab.reproduction.experiments.partition import (
     Partition,
     PartitionFigures,
