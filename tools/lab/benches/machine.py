@@ -26,6 +26,7 @@ from rack.boards.config import RackConfig, load
 from rack.boards.config.layout import obtained_core
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
+from rack.tools.console.tables import Blocks
 from rack.tools.lab.benches.cyclictest import (
     CYCLICTEST,
     WakeGrid,
@@ -179,11 +180,11 @@ class Machine(Comparison):
             "rates": rates,
         }
 
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield the verdict, then the lateness as a table, fitted to `width`."""
+    def blocks(self) -> Blocks:
+        """Yield the verdict, then the lateness as a table."""
         yield from self.verdict
         yield ""
-        yield from super().lines(width)
+        yield from super().blocks()
 
 
 def _case(rate_hz: float) -> str:
