@@ -26,7 +26,7 @@ import numpy as np
 
 from rack.backplane.process import pin, set_priority
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.tables import Blocks, TextTable, decimal, print_blocks
+from rack.tools.console.tables import Blocks, Cell, TextTable, decimal, print_blocks
 
 if TYPE_CHECKING:
     from rack.tools.console.progress import Progress
@@ -215,7 +215,7 @@ class Comparison:
     def blocks(self) -> Blocks:
         """Yield the figures as text for people: a table, the absent contestants, the conclusion."""
         yield self.title
-        rows = [
+        rows: list[dict[str, Cell]] = [
             {
                 "case": sample.case,
                 "who": sample.who,

@@ -12,7 +12,6 @@ from rack.tools.lab.reproduction.experiments import (
     response,
     sharing,
     switch,
-    tables,
     tasks,
 )
 from rack.tools.lab.reproduction.experiments.figures import (
@@ -75,7 +74,7 @@ def _system(
     return PaperClaim(name, title, quote, why, experiments, partial(judge, rates_hz))
 
 
-SYSTEMS = (NAME, tables.NAME, *tasks.TASKS)
+SYSTEMS = (NAME, tasks.STATE_TABLES, *tasks.TASKS)
 """The racks that model systems."""
 HURRIED = ("timing.response_ms=1000",)
 """A response within 1 s is demanded of NASREM's four levels."""
@@ -413,7 +412,7 @@ SECTIONS = (
                 "The earlier controller: executors and state tables",
                 "The flow of control featured state-table transitions.",
                 "The task was done with and without a disturbance; own transitions answered it.",
-                (tables.TABLES,),
+                (tasks.TABLES,),
                 rules.judge_tables,
             ),
             PaperClaim(
@@ -462,7 +461,7 @@ SECTIONS = (
                 "These architectures share common characteristics with the concurrent,"
                 " hierarchical control model.",
                 "All systems do their tasks on one set of mechanisms, within their bounds.",
-                (NASREM, tables.TABLES, *tasks.TASKS.values()),
+                (NASREM, tasks.TABLES, *tasks.TASKS.values()),
                 partial(rules.judge_systems, SYSTEMS),
             ),
             PaperClaim(

@@ -139,14 +139,8 @@ class ComparedRun:
     difference: Difference | None
 
 
-@dataclass(frozen=True)
-class ComparedRuns:
-    """Runs in lockstep, then in real time."""
-
-    runs: tuple[ComparedRun, ...]
-
-
-def _compare_modes(workshop: Workshop) -> ComparedRuns:
+def _compare_modes(workshop: Workshop) -> tuple[ComparedRun, ...]:
+    """Return runs in lockstep, then in real time."""
     first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
     runs = [_compared(first, None), _compared(second, first.recording)]
     for attempt in range(1, ATTEMPTS + 1):
@@ -154,14 +148,14 @@ def _compare_modes(workshop: Workshop) -> ComparedRuns:
         runs.append(_compared(run, first.recording))
         if runs[-1].first_miss is None:
             break
-    return ComparedRuns(tuple(runs))
+    return tuple(runs)
 
 
 DETERMINISM = Experiment(
     "determinism",
     "nasrem twice in lockstep, then in real time",
     2 * LAUNCH_S + 2 * (COMPARED_S + LAUNCH_S),
-    ComparedRuns,
+    tuple[ComparedRun, ...],
     _compare_modes,
     cores=0,
 )
