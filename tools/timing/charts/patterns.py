@@ -74,28 +74,23 @@ class Lane:
 
 def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
     """Return the lanes of `tasks`, by core, then by falling priority."""
-    places = dict.fromkeys((task.core, task.board) for task in tasks)
-    lanes = [
-        _lane(core, [t for t in tasks if (t.core, t.board) == (core, board)])
-        for core, board in places
-    ]
+    lanes = []
+    for core, board in dict.fromkeys((task.core, task.board) for task in tasks):
+        own = [task for task in tasks if (task.core, task.board) == (core, board)]
+        planner = next((task for task in own if task.role == "planner"), None)
+        lanes.append(
+            Lane(
+                core=core,
+                board=board,
+                executor=next((task.name for task in own if task.role != "planner"), None),
+                planner=None if planner is None else planner.name,
+                priority=max(task.priority for task in own),
+                cycle_ns=own[0].every_ns,
+                slice_ns=(planner or own[0]).period_ns,
+                phase_ns=own[0].phase_ns,
+            )
+        )
     return tuple(sorted(lanes, key=lambda lane: (lane.core, -lane.priority, lane.cycle_ns)))
-
-
-def _lane(core: int, tasks: list[TimedTask]) -> Lane:
-    planner = next((task for task in tasks if task.role == "planner"), None)
-    executor = next((task.name for task in tasks if task.role != "planner"), None)
-    planner_name = None if planner is None else planner.name
-    return Lane(
-        core=core,
-        board=tasks[0].board,
-        executor=executor,
-        planner=planner_name,
-        priority=max(task.priority for task in tasks),
-        cycle_ns=tasks[0].every_ns,
-        slice_ns=(planner or tasks[0]).period_ns,
-        phase_ns=tasks[0].phase_ns,
-    )
 
 
 class Patterns(NamedTuple):
