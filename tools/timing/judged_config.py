@@ -5,14 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import chain
 from typing import Any
 
 from rack.backplane.layout import Layout, Protocol
 from rack.boards.config import RackConfig, loads, rack_timing, resolve
 from rack.boards.config.layout import obtained_core
-from rack.boards.config.schema import BoardConfig
 from rack.boards.errors import ConfigError
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
@@ -29,18 +27,6 @@ from rack.tools.console.answer import Document
 
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values; None removes a key."""
-CHANGEABLE = (
-    "priority",
-    "planner_priority",
-    "within_cycles",
-    "coupling",
-    "planner_slot",
-    "planner_core",
-    "core",
-    "every",
-    "rate_hz",
-)
-"""Keys of a board's table that a change may set."""
 
 
 @dataclass(frozen=True)
@@ -68,25 +54,26 @@ class JudgedConfig:
             if board.budget is not None
         }
 
-    def changed(
-        self, board: str, settings: Settings, mailboxes: Mapping[str, Protocol] | None = None
-    ) -> JudgedConfig | None:
-        """Return the config with other settings of a board, loaded anew and judged; None if it is
-        invalid.
-
-        `mailboxes` are those that get another protocol.
-        """
+    def change(self, board: str, settings: Settings) -> Change | None:
+        """Return the change to other settings of a board, with the config loaded anew and judged;
+        None if that is invalid."""
         config = self.config
-        boards = {**config.board, board: config.board[board].model_copy(update=dict(settings))}
+        table = config.board[board]
+        boards = {**config.board, board: table.model_copy(update=dict(settings))}
         update: dict[str, Any] = {"board": boards}
-        if mailboxes:
-            protocols = {**config.protocol.mailbox, **mailboxes}
-            update["protocol"] = config.protocol.model_copy(update={"mailbox": protocols})
+        protocols: dict[str, Protocol] = {}
+        if settings.get("coupling") == "loose" and self.timing.boards[board].is_critical:
+            # Between two processors the paper uses time slices or double buffers (section 3.3).
+            protocols = {f"{board}.plan": "time-slice"}
+            mailboxes = {**config.protocol.mailbox, **protocols}
+            update["protocol"] = config.protocol.model_copy(update={"mailbox": mailboxes})
         try:
             # Copying validates nothing: only the loader finds mistakes.
-            return JudgedConfig.of(loads(config.model_copy(update=update).text()), self.budgets)
+            after = JudgedConfig.of(loads(config.model_copy(update=update).text()), self.budgets)
         except ConfigError:
             return None
+        own = {key: value for key, value in settings.items() if value != getattr(table, key)}
+        return Change(board, own, protocols, self, after)
 
     @property
     def failing(self) -> tuple[EquationVerdict, ...]:
@@ -124,25 +111,21 @@ class JudgedConfig:
 
 @dataclass(frozen=True)
 class Change:
-    """Other settings for a board: the rack `before` and `after`."""
+    """Other settings for a board.
+
+    Attributes:
+        board: Name of the board.
+        settings: Keys of its table that change, with their new values; None removes a key.
+        protocols: Mailboxes whose protocol changes, with the new one.
+        before: The rack before.
+        after: The rack after.
+    """
 
     board: str
+    settings: Settings
+    protocols: Mapping[str, Protocol]
     before: JudgedConfig
     after: JudgedConfig
-
-    @cached_property
-    def settings(self) -> dict[str, Any]:
-        """The keys of the board's table that change, with their new values; None: the key is
-        removed."""
-        old, new = self._tables
-        return {
-            key: getattr(new, key) for key in CHANGEABLE if getattr(old, key) != getattr(new, key)
-        }
-
-    @property
-    def _tables(self) -> tuple[BoardConfig, BoardConfig]:
-        """The board's table, before and after."""
-        return self.before.config.board[self.board], self.after.config.board[self.board]
 
     @property
     def _levels(self) -> tuple[LevelTiming, LevelTiming]:
@@ -176,11 +159,11 @@ class Change:
             "board": self.board,
             "text": self.text,
             "settings": self.settings,
-            "protocols": self._protocols,
+            "protocols": self.protocols,
         }
 
     def _parts(self) -> Iterator[str]:
-        old, new = self._tables
+        old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
         changed = self.settings
         for key in ("priority", "planner_priority"):
             if key in changed:
@@ -191,7 +174,7 @@ class Change:
             if (core := changed.get(key)) is not None:
                 was = "" if getattr(old, key) is None else f"{getattr(old, key)} -> "
                 yield f"{key} {was}{core} ({self._sharing(core)})"
-        yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self._protocols.items())
+        yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self.protocols.items())
         yield from self._cycles()
         if changed.get("coupling") == "loose" and not self._levels[1].exchange_ns:
             yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
@@ -226,11 +209,3 @@ class Change:
         if obtained == core:
             return sharing
         return f"{sharing}; this machine has no core {core}, uses core {obtained}"
-
-    @property
-    def _protocols(self) -> dict[str, str]:
-        """The mailboxes whose protocol changes, with the new one."""
-        old, new = (rack.config.protocol.mailbox for rack in (self.before, self.after))
-        return {
-            mailbox: protocol for mailbox, protocol in new.items() if old.get(mailbox) != protocol
-        }

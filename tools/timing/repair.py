@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from rack.backplane.layout import Protocol
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
 from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.verdicts import EquationVerdict
@@ -126,7 +125,7 @@ def _own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
     planner = _any(rack, board, places)
     if planner is None:
         # Another place is not enough: with more cycles for a plan it may be.
-        moved = (_first(rack, board, [{**place, **d} for d in older]) for place in places)
+        moved = (_first(rack, board, [{**d, **place} for d in older]) for place in places)
         planner = _cheapest(moved)
     kinds = (
         _any(rack, board, _priorities(rack, board)),
@@ -200,7 +199,7 @@ def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None
         # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the
         # other levels less well, or leave plans too few cycles.
         if rack.is_sound(timing.changed(board, every=longer, within_cycles=cycles), board):
-            found.append({**(place or {}), "every": longer, "rate_hz": None, **changed})
+            found.append({**changed, **(place or {}), "every": longer, "rate_hz": None})
     return found
 
 
@@ -255,14 +254,8 @@ def _attempt(
     rack: JudgedConfig, board: str, settings: Settings, cures: str | None
 ) -> Change | None:
     """Return the change of a board if it cures the board, or the board `cures`."""
-    mailboxes: dict[str, Protocol] = {}
-    if settings.get("coupling") == "loose" and rack.timing.boards[board].is_critical:
-        # Between two processors the paper uses time slices or double buffers (section 3.3).
-        mailboxes = {f"{board}.plan": "time-slice"}
-    after = rack.changed(board, settings, mailboxes)
-    if after is not None and after.cures(cures or board, rack):
-        return Change(board, rack, after)
-    return None
+    change = rack.change(board, settings)
+    return change if change is not None and change.after.cures(cures or board, rack) else None
 
 
 def _any(

@@ -17,7 +17,7 @@ from rack.levels.robot.state import view_state
 from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import worded
 from rack.tools.viewer.shapes import shape_of, xyzw
-from rack.tools.viewer.stream import Changes, Moment, RowBlock, Sampled, Stream
+from rack.tools.viewer.stream import Changes, Moment, RowBlock, Sampled, Stream, ViewPart
 from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, packed
 
 CELL = "cell"
@@ -240,36 +240,31 @@ def floor_of(cell: Cell) -> float:
     return float(cell.start().geom_xpos[floors, 2].min(initial=0.0))
 
 
-class PlannedPath:
-    """Writes a `MovePlan` as a line of the tool point with its way points, from the tick at which
-    they are visible."""
+def planned_path(stream: Stream, cell: Cell) -> ViewPart:
+    """Return the part that writes a `MovePlan` as a line of the tool point with its way points,
+    from the tick at which they are visible; a plan for the gripper clears the path."""
+    data = cell.start()
+    for entity in (PATH, WAYPOINTS):
+        stream.static(entity, stream.within(WORLD))
 
-    def __init__(self, stream: Stream, cell: Cell) -> None:
-        self._stream = stream
-        self._cell = cell
-        self._data = cell.start()
-        for entity in (PATH, WAYPOINTS):
-            stream.static(entity, stream.within(WORLD))
+    def tool_at(joints: Array) -> Array:
+        """Return the position of the tool at joint positions, (3,), m."""
+        data.qpos[cell.qpos] = joints
+        mujoco.mj_kinematics(cell.model, data)
+        return np.array(data.site_xpos[cell.tool])
 
-    def write(self, block: RowBlock) -> None:
-        """Write every plan; a plan for the gripper clears the path."""
+    def write(block: RowBlock) -> None:
         for row, plan in enumerate(block.messages):
             corners = plan["waypoints"][: plan["count"]]
             if plan["kind"] != SegmentKind.PATH or plan["error"]:
                 corners = corners[:0]
-            points = [self._tool(joints) for joints in corners]
-            lines = [[self._tool(joints) for joints in in_pieces(corners)]] if points else []
+            points = [tool_at(joints) for joints in corners]
+            lines = [[tool_at(joints) for joints in in_pieces(corners)]] if points else []
             when = block.visible(row)
-            strips = rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED])
-            self._stream.at(when, PATH, strips)
-            marks = rr.Points3D(points, radii=POINT_M, colors=[PLANNED])
-            self._stream.at(when, WAYPOINTS, marks)
+            stream.at(when, PATH, rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED]))
+            stream.at(when, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED]))
 
-    def _tool(self, joints: Array) -> Array:
-        """Return the position of the tool at joint positions, (3,), m."""
-        self._data.qpos[self._cell.qpos] = joints
-        mujoco.mj_kinematics(self._cell.model, self._data)
-        return np.array(self._data.site_xpos[self._cell.tool])
+    return write
 
 
 def in_pieces(corners: Array) -> Array:

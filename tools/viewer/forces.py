@@ -65,34 +65,29 @@ def contacts_of(cell: Cell) -> list[ContactPlace]:
     return [] if cell.wrist is None else [ContactPlace("tool", cell.tool, None)]
 
 
-class ContactArrows:
-    """Writes the forces of the surroundings on tool or fingertips as arrows."""
+def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
+    """Return the part that writes the forces of the surroundings on tool or fingertips as arrows,
+    one every 20 ms of simulated time; the numbers of `field` begin with three for each place."""
+    scale, shaft = TIP_M, TIP_SHAFT_M
+    if cell.wrist is not None:
+        scale, shaft = LONGEST_M / cell.wrist.most[0], TOOL_SHAFT_M
+    places = contacts_of(cell)
+    for place in places:
+        arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
+        stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
+    sampled = Sampled(stream.times.clock_ns)
 
-    def __init__(self, stream: Stream, cell: Cell, field: str) -> None:
-        """Take the forces from `field`, whose numbers begin with three for each place."""
-        self._stream = stream
-        self._field = field
-        self._places = contacts_of(cell)
-        self._scale = TIP_M
-        shaft = TIP_SHAFT_M
-        if cell.wrist is not None:
-            self._scale = LONGEST_M / cell.wrist.most[0]
-            shaft = TOOL_SHAFT_M
-        self._sampled = Sampled(stream.times.clock_ns)
-        for place in self._places:
-            arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
-            stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
-
-    def write(self, block: RowBlock) -> None:
-        """Write an arrow every 20 ms of simulated time."""
-        chosen = self._sampled.rows(block.ticks)
+    def write(block: RowBlock) -> None:
+        chosen = sampled.rows(block.ticks)
         if not len(chosen):
             return
         times = block.times_of(chosen)
-        forces = block.messages[self._field][chosen].reshape(len(chosen), -1)
-        for at, place in enumerate(self._places):
-            vectors = self._scale * forces[:, 3 * at : 3 * at + 3]
-            self._stream.columns((*ARROWS, place.name), times, rr.Arrows3D.columns(vectors=vectors))
+        forces = block.messages[field][chosen].reshape(len(chosen), -1)
+        for at, place in enumerate(places):
+            vectors = scale * forces[:, 3 * at : 3 * at + 3]
+            stream.columns((*ARROWS, place.name), times, rr.Arrows3D.columns(vectors=vectors))
+
+    return write
 
 
 def task_forces(stream: Stream) -> Iterator[ViewPart]:

@@ -32,10 +32,10 @@ from rack.levels.systems.joint_boards.messages import DRIVING, STREAMED, JointSt
 from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.recording.occasions import Retention
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
-from rack.tools.viewer.cell import Goals, Marks, PlannedPath, Poses, write_geometry
+from rack.tools.viewer.cell import Goals, Marks, Poses, planned_path, write_geometry
 from rack.tools.viewer.curves import field_curves, joint_curves
-from rack.tools.viewer.events import Events, Losses, RecorderLoad
-from rack.tools.viewer.forces import ContactArrows, contact_forces, task_forces
+from rack.tools.viewer.events import Events, recorder_load, row_losses
+from rack.tools.viewer.forces import contact_arrows, contact_forces, task_forces
 from rack.tools.viewer.hand import hand_curves
 from rack.tools.viewer.levels import (
     FIRED,
@@ -54,11 +54,11 @@ from rack.tools.viewer.style import write_legend
 from rack.tools.viewer.timing import (
     LOAD,
     Age,
-    CycleLanes,
-    Misses,
     boards_of,
     colours_of,
+    cycle_lane,
     load_curves,
+    missed_cycles,
 )
 
 SHOWN_OTHERWISE = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
@@ -132,9 +132,9 @@ class RackWriter:
         self._of_task: dict[str, list[ViewPart]] = {
             task.name: [
                 partial(self._hierarchy.write, task.name),
-                CycleLanes(stream, task, speed, lockstep).write,
+                cycle_lane(stream, task, speed, lockstep),
                 *load_curves(stream, task, colours[task.name], slice_ns, lockstep),
-                Misses(stream, task).write,
+                missed_cycles(stream, task),
             ]
             for task in layout.tasks
         }
@@ -149,7 +149,7 @@ class RackWriter:
             of_mailbox[mailbox].append(age.write)
         self._parts = self._of_task | of_mailbox
         self._events = Events(stream, ran.events, self._hierarchy, marks)
-        self._losses = Losses(stream)
+        self._write_losses = row_losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
     def write(self, taken: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]) -> None:
@@ -166,7 +166,7 @@ class RackWriter:
             age.advance(tick)
         self._events.advance()
         self._hierarchy.advance()
-        self._losses.advance(tick, lost)
+        self._write_losses(tick, lost)
 
     def skip(self, tick: int) -> None:
         """Go on at a tick: nothing is recorded of what was before."""
@@ -194,7 +194,7 @@ class ViewSink:
         recording = new_recording(folder.name, run, file, view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
         self._writer = RackWriter(self._stream, ran)
-        self._load = RecorderLoad(self._stream)
+        self._write_load = recorder_load(self._stream)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = block_of(layout)
         self._written = segment.words[System.TICK]
@@ -233,7 +233,7 @@ class ViewSink:
         self._writer.write(
             {ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost
         )
-        self._load.advance(tick)
+        self._write_load(tick)
 
 
 def block_of(layout: Layout) -> int:
@@ -271,16 +271,16 @@ def _of_arm(
             yield Poses(stream, cell, bool(config.scene.push)).write
         case HandStatus.message_type.name if cell.hand is not None:
             yield from hand_curves(stream, robot.joints, cell.hand)
-            yield ContactArrows(stream, cell, "force").write
+            yield contact_arrows(stream, cell, "force")
         case driving if driving in DRIVING:
             yield from joint_curves(stream, robot.joints, cell, robot.gripper is not None)
         case Wrench.message_type.name if cell.wrist is not None:
-            yield ContactArrows(stream, cell, "wrench").write
+            yield contact_arrows(stream, cell, "wrench")
             yield from contact_forces(stream, cell.wrist.most)
         case ForceStatus.message_type.name:
             yield from task_forces(stream)
         case MovePlan.message_type.name:
-            yield PlannedPath(stream, cell).write
+            yield planned_path(stream, cell)
         case TaskPlan.message_type.name:
             yield goals.write
         case MoveStatus.message_type.name:

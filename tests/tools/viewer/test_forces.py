@@ -13,7 +13,7 @@ from rack.backplane.message import Message
 from rack.backplane.segment import Launch
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.systems.force.messages import ForceStatus, Wrench
-from rack.tools.viewer.forces import ContactArrows, contact_forces, contacts_of, task_forces
+from rack.tools.viewer.forces import contact_arrows, contact_forces, contacts_of, task_forces
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from tests.levels.systems.force.pad import pad
@@ -58,7 +58,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     force = np.zeros((ROWS, 6))
     force[:, 2] = np.arange(ROWS)
     written = Written(tmp_path)
-    written.write(Wrench, cell, [ContactArrows(written.stream, cell, "wrench").write], wrench=force)
+    written.write(Wrench, cell, [contact_arrows(written.stream, cell, "wrench")], wrench=force)
     arrows = read(written.file, "/cell/forces/tool", "Arrows3D:vectors")
     assert arrows.ticks.tolist() == [0, 20, 40]
     assert arrows.values[:, 0] == pytest.approx(
