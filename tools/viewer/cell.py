@@ -269,16 +269,11 @@ def planned_path(stream: Stream, cell: Cell) -> ViewPart:
 
 def in_pieces(corners: Array) -> Array:
     """Return the points of a joint path, (points, joints), with no piece longer than `STEP_RAD`."""
-    if len(corners) < 2:
-        return corners
-    counts = [
-        max(1, int(np.ceil(np.abs(step).max() / STEP_RAD))) for step in np.diff(corners, axis=0)
-    ]
-    pieces = [
-        np.linspace(a, b, n, endpoint=False)
-        for a, b, n in zip(corners, corners[1:], counts, strict=False)
-    ]
-    return np.concatenate((*pieces, corners[-1:]))
+    longest = np.abs(np.diff(corners, axis=0)).max(axis=1)
+    counts = np.maximum(np.ceil(longest / STEP_RAD), 1)
+    numbers = np.concatenate(([0], np.cumsum(counts)))  # of the corners, among all points
+    points = np.arange(numbers[-1] + 1)
+    return np.column_stack([np.interp(points, numbers, joint) for joint in corners.T])
 
 
 class Goals:
