@@ -122,18 +122,16 @@ class RackWriter:
                     of_mailbox[box.name].append(marks.write)
                 of_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
-        period_ns = config.tick_ns
-        speed = 1.0 if lockstep else layout.clock_ns / period_ns
+        tick_ns = layout.clock_ns if lockstep else config.tick_ns  # of what traces measure
         colours = colours_of(layout)
         boards = boards_of(layout)
         write_legend(stream, LOAD, boards, [colours[board] for board in boards])
-        slice_ns = layout.clock_ns if lockstep else period_ns
         self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
-        self._of_task: dict[str, list[ViewPart]] = {
+        of_task: dict[str, list[ViewPart]] = {
             task.name: [
                 partial(self._hierarchy.write, task.name),
-                cycle_lane(stream, task, speed, lockstep),
-                *load_curves(stream, task, colours[task.name], slice_ns, lockstep),
+                cycle_lane(stream, task, layout.clock_ns / tick_ns, lockstep),
+                *load_curves(stream, task, colours[task.name], tick_ns, lockstep),
                 missed_cycles(stream, task),
             ]
             for task in layout.tasks
@@ -147,7 +145,7 @@ class RackWriter:
         }
         for mailbox, age in self._ages.items():
             of_mailbox[mailbox].append(age.write)
-        self._parts = self._of_task | of_mailbox
+        self._parts = of_task | of_mailbox
         self._events = Events(stream, ran.events, self._hierarchy, marks)
         self._write_losses = row_losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
@@ -158,8 +156,7 @@ class RackWriter:
         if (fastest := taken.get(self._fastest)) is not None:
             self._times.learn(fastest["tick"], fastest["start_ns"])
         for ring, rows in taken.items():
-            stamp = "start_ns" if ring in self._of_task else "stamp_ns"
-            block = RowBlock(rows, stamp, self._times)
+            block = RowBlock(rows, self._times)
             for write in self._parts[ring]:
                 write(block)
         for age in self._ages.values():

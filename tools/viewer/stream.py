@@ -112,7 +112,8 @@ class RowBlock:
     trace the fields of `rack.backplane.trace.RECORD`.
     """
 
-    def __init__(self, rows: np.ndarray, stamp: str, timelines: Timelines) -> None:
+    def __init__(self, rows: np.ndarray, timelines: Timelines) -> None:
+        stamp = "stamp_ns" if "stamp_ns" in (rows.dtype.names or ()) else "start_ns"
         self.rows = rows  # (rows,)
         self.ticks: Ints = rows["tick"].astype(np.int64)  # (rows,)
         self.stamps_ns: Ints = rows[stamp].astype(np.int64)  # (rows,), CLOCK_MONOTONIC

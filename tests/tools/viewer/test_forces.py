@@ -50,7 +50,7 @@ class Written:
         for name, values in fields.items():
             rows["message"][name] = values
         for write in parts:
-            write(RowBlock(rows, "stamp_ns", self._times))
+            write(RowBlock(rows, self._times))
         self.stream.close()
 
 

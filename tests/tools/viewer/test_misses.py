@@ -31,7 +31,7 @@ def recorded(folder: Path, missed: list[list[int]]) -> Path:
         rows["tick"] = np.arange(400) + 400 * number
         rows["start_ns"] = rows["tick"] * TICK_NS
         rows["flags"][np.array(ticks, dtype=int) - 400 * number] = Flag.MISSED
-        write(RowBlock(rows, "start_ns", times))
+        write(RowBlock(rows, times))
     stream.flush()
     stream.close()
     return folder / "run.rrd"

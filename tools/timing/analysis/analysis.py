@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import TaskSpec
-from rack.boards.config import RackConfig, rack_timing
+from rack.boards.config import rack_timing
 from rack.boards.config.timing import without_interrupts
 from rack.levels.timing import trace_times
 from rack.levels.timing.rack import RackTiming
@@ -57,18 +57,15 @@ class Analysis:
     """A run compared with the timing model.
 
     `predicted` is the rack with the budgets of its config, `measured` the rack with those of the
-    run. `cycles` are by task, `loads` by core, as parts of its time; `response` is that of the
-    system, None without a hierarchy. `pairs` are of the `percentile`, `mostly` of the longest of
-    `MOSTLY` in 100 cycles: a level that does not fit fails in most of its cycles, a machine that
-    stalls now and then does not.
+    run. `cycles` are by task, `loads` by core, as parts of its time. `pairs` are of the
+    `percentile`, `mostly` of the longest of `MOSTLY` in 100 cycles: a level that does not fit fails
+    in most of its cycles, a machine that stalls now and then does not.
     """
 
     recording: Recording
-    config: RackConfig
     percentile: float
     cycles: Mapping[str, Cycles]
     loads: Mapping[int, float]
-    response: Mapping[str, Any] | None
     predicted: RackTiming
     measured: RackTiming
     pairs: tuple[Pair, ...]
@@ -95,31 +92,17 @@ class Analysis:
         loads = core_loads(recording, cycles, predicted)
         response = system_response(recording)
 
-        def measured(percent: float) -> RackTiming:
-            return rack_timing(
-                config, layout, without_interrupts(predicted, budgets_of(cycles, percent))
-            )
-
-        def pairs(percent: float) -> tuple[Pair, ...]:
-            rack = measured(percent)
+        def judged(percent: float) -> tuple[RackTiming, tuple[Pair, ...]]:
+            budgets = without_interrupts(predicted, budgets_of(cycles, percent))
+            rack = rack_timing(config, layout, budgets)
             directly = [*_system(response, rack), *_tasks(cycles, rack, percent), *_cores(loads)]
             derived = [verdict for verdict in verdicts(rack) if verdict.equation not in OBSERVED]
-            return tuple(_paired(verdicts(predicted), [*derived, *directly]))
+            return rack, tuple(_paired(verdicts(predicted), [*derived, *directly]))
 
-        found = pairs(percentile)
+        measured, pairs = judged(percentile)
         progress(0.7)
-        return cls(
-            recording=recording,
-            config=config,
-            percentile=percentile,
-            cycles=cycles,
-            loads=loads,
-            response=response,
-            predicted=predicted,
-            measured=measured(percentile),
-            pairs=found,
-            mostly=pairs(min(percentile, MOSTLY)),
-        )
+        _, mostly = judged(min(percentile, MOSTLY))
+        return cls(recording, percentile, cycles, loads, predicted, measured, pairs, mostly)
 
     @property
     def holds(self) -> bool:

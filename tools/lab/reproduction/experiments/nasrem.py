@@ -4,7 +4,7 @@ lockstep and in real time; losses and how soon they are over; and moves by a pro
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from math import ceil
 
@@ -86,7 +86,6 @@ class NasremRun(TaskRun):
 def _measure(workshop: Workshop) -> NasremRun:
     result, recording = workshop.run(NAME, workshop.config(NAME))
     analysis = Analysis.of(recording)
-    analysis = replace(analysis, config=analysis.config.model_copy(update={"name": NAME}))
     ticks = result.outcome.ticks
     layout = recording.layout
     return NasremRun(
