@@ -17,7 +17,7 @@ from rack.levels.robot.state import view_state
 from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import worded
 from rack.tools.viewer.shapes import shape_of, xyzw
-from rack.tools.viewer.stream import Changes, Moment, RowBlock, Sampled, Stream, ViewPart
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, change_finder, row_sampler
 from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, packed
 
 CELL = "cell"
@@ -119,7 +119,7 @@ class Poses:
         self._world = stream.frame(WORLD)
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._frames += [stream.frame(contact.frame) for contact in self._contacts]
-        self._sampled = Sampled(stream.times.clock_ns)
+        self._sampled_rows = row_sampler(stream.times.clock_ns)
         self._has_pushes = has_pushes
         self._is_pushed = False
         stream.static(
@@ -130,7 +130,7 @@ class Poses:
 
     def write(self, block: RowBlock) -> None:
         """Write poses, one every 20 ms of simulated time."""
-        chosen = self._sampled.rows(block.ticks)
+        chosen = self._sampled_rows(block.ticks)
         data = self._data
         bodies = self._bodies
         if not len(bodies) or not len(chosen):
@@ -180,7 +180,7 @@ class Marks:
 
     def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
         self._stream = stream
-        self._braked = Changes()
+        self._braking_rows = change_finder()
         self._faults: dict[int, tuple[str, str]] = {}  # joint and text, by entry of the fault table
         self._joints = {name: cell.model.joint(name).pos for name in joints}
         self._radius = MARK_PART * extent_of(cell)[1]
@@ -192,7 +192,7 @@ class Marks:
     def write(self, block: RowBlock) -> None:
         """Mark every joint from when the brakes are engaged until they are released."""
         braked = block.messages["braked"]
-        for row in self._braked.rows(braked):
+        for row in self._braking_rows(braked):
             texts = dict.fromkeys(self._joints, "") if braked[row] else {}
             if texts:
                 texts[list(texts)[-1]] = "brakes engaged"
@@ -284,14 +284,14 @@ class Goals:
         self._stream = stream
         self._objects = objects
         self._goals: dict[int, tuple[list[float], str]] = {}  # place and label, by move
-        self._plans = Changes()
-        self._current = Changes()
+        self._planned_rows = change_finder()
+        self._current_rows = change_finder()
         for entity in (GOALS, CURRENT_GOAL):
             stream.static(entity, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the goals of every new plan."""
-        for row in self._plans.rows(block.messages["id"]):
+        for row in self._planned_rows(block.messages["id"]):
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
             self._goals |= {
@@ -309,7 +309,7 @@ class Goals:
 
     def write_status(self, block: RowBlock) -> None:
         """Write the goal of the move that each `MoveStatus` names."""
-        for row in self._current.rows(block.messages["current"]):
+        for row in self._current_rows(block.messages["current"]):
             current = int(block.messages["current"][row])
             goals = [self._goals[current]] if current in self._goals else []
             point = rr.Points3D(

@@ -14,7 +14,7 @@ import rerun as rr
 from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
 from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
-from rack.tools.viewer.stream import RowBlock, Sampled, Stream, ViewPart
+from rack.tools.viewer.stream import RowBlock, Stream, ViewPart, row_sampler
 from rack.tools.viewer.style import COMMANDED, LIMIT, OVERLAID, curves, of_joint
 
 ARROWS = ("cell", "forces")
@@ -75,10 +75,10 @@ def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
     for place in places:
         arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
         stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
-    sampled = Sampled(stream.times.clock_ns)
+    sampled_rows = row_sampler(stream.times.clock_ns)
 
     def write(block: RowBlock) -> None:
-        chosen = sampled.rows(block.ticks)
+        chosen = sampled_rows(block.ticks)
         if not len(chosen):
             return
         times = block.times_of(chosen)

@@ -17,7 +17,7 @@ from rack.levels.messages import Verb
 from rack.levels.systems.hand.messages import GraspKind
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
-from rack.tools.viewer.stream import Changes, Moment, RowBlock, Stream, ViewPart
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, change_finder
 from rack.tools.viewer.style import STATES, packed, style_lane, write_spans
 
 LEVELS = "levels"
@@ -43,11 +43,11 @@ def value_lane(
         fields: The field with the value; of several, the value is their tuple.
         name: Returns the name of a value.
     """
-    changes = Changes()
+    changed_rows = change_finder()
 
     def write(block: RowBlock) -> None:
         values = block.messages[fields]
-        rows = changes.rows(values)
+        rows = changed_rows(values)
         if len(rows):
             names = [name(value) for value in values[rows].tolist()]
             write_spans(stream, (LEVELS, *lane), block.times_of(rows), names)
@@ -82,11 +82,11 @@ def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     lane = board, "state" if port == "status" else port
     style_lane(stream, (LEVELS, *lane), STATES)
     yield value_lane(stream, lane, "state", partial(worded, State))
-    errors = Changes()
+    changed_rows = change_finder()
 
     def write_errors(block: RowBlock) -> None:
         messages = block.messages
-        for row in errors.rows(messages["error"]):
+        for row in changed_rows(messages["error"]):
             if error := messages["error"][row]:
                 reason = text_of(messages["reason"][row])
                 text = f"{board}: {reason or f'error {error}'}"
@@ -99,10 +99,10 @@ def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
     """Return the part that writes which row of a state table fires, as a lane, and every change to
     the log."""
     board = mailbox.name.partition(".")[0]
-    changes = Changes()
+    changed_rows = change_finder()
 
     def write(block: RowBlock) -> None:
-        changed = changes.rows(block.messages[FIRED])
+        changed = changed_rows(block.messages[FIRED])
         names = []
         for at in changed:
             table, row, fired, state = block.messages[FIRED][at]
