@@ -3,6 +3,7 @@ measured."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -176,17 +177,7 @@ def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
 def core_loads(
     recording: Recording, found: Mapping[str, Cycles], rack: RackTiming
 ) -> dict[int, float]:
-    """Return by core the part of its time that tasks used, as `task_loads`."""
-    loads: dict[int, float] = {}
-    for name, load in task_loads(recording, found, rack).items():
-        loads[found[name].core] = loads.get(found[name].core, 0.0) + load
-    return dict(sorted(loads.items()))
-
-
-def task_loads(
-    recording: Recording, found: Mapping[str, Cycles], rack: RackTiming
-) -> dict[str, float]:
-    """Return by task the part of its core's time that it used, without the clock's own.
+    """Return by core the part of its time that tasks used, without the clock's own.
 
     An executor counts at all its releases, skipped ones too: so the load of an overloaded core
     exceeds 1.
@@ -194,14 +185,14 @@ def task_loads(
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())
     lasted_ns = (last - first + 1) * rack.tick_ns
-    loads: dict[str, float] = {}
+    loads: defaultdict[int, float] = defaultdict(float)
     for name, cycles in found.items():
         used_ns = recording.cycles[name]["processor_ns"]
         if cycles.task.role == "executor":
-            loads[name] = float(used_ns.mean()) / cycle_ns(rack, cycles.task)
+            loads[cycles.core] += float(used_ns.mean()) / cycle_ns(rack, cycles.task)
         else:
-            loads[name] = int(used_ns.sum()) / lasted_ns
-    return loads
+            loads[cycles.core] += int(used_ns.sum()) / lasted_ns
+    return dict(sorted(loads.items()))
 
 
 def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
