@@ -66,7 +66,13 @@ def joint_curves(
                 both = [COMMANDED, colours[at]]
                 yield curves(stream, entity, values, labels, both, OVERLAID)
     labels = [f"{name}, mrad" for name in names]
-    yield curves(stream, (ERROR,), _tracking_error, labels, colours)
+    yield curves(
+        stream,
+        (ERROR,),
+        lambda block: (block.messages["position"] - block.messages["target"]) * 1e3,
+        labels,
+        colours,
+    )
     if cell.gripper is not None and has_gripper:
         opening, grip = gripper_units(cell)
         yield curves(
@@ -92,10 +98,6 @@ def _limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
 
 def _of_joint(at: int, fields: Sequence[str], block: RowBlock) -> Array:
     return np.stack([block.messages[field][:, at] for field in fields], axis=-1)
-
-
-def _tracking_error(block: RowBlock) -> Array:
-    return np.asarray((block.messages["position"] - block.messages["target"]) * 1e3)
 
 
 def gripper_units(cell: Cell) -> tuple[str, str]:

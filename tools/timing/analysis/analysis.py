@@ -91,12 +91,17 @@ class Analysis:
         progress(0.4)
         predicted = rack_timing(config, layout)
         loads = core_loads(recording, cycles, predicted)
+        meaning = "time used by its tasks"
+        used = [
+            EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
+            for core, load in loads.items()
+        ]
         response = system_response(recording)
 
         def judged(percent: float) -> tuple[RackTiming, tuple[Pair, ...]]:
             budgets = without_interrupts(predicted, budgets_of(cycles, percent))
             rack = rack_timing(config, layout, budgets)
-            directly = [*_system(response, rack), *_tasks(cycles, rack, percent), *_cores(loads)]
+            directly = [*_system(response, rack), *_tasks(cycles, rack, percent), *used]
             derived = [verdict for verdict in verdicts(rack) if verdict.equation not in OBSERVED]
             return rack, tuple(_paired(verdicts(predicted), [*derived, *directly]))
 
@@ -157,21 +162,23 @@ def _tasks(
     found: Mapping[str, Cycles], rack: RackTiming, percentile: float
 ) -> Iterator[EquationVerdict]:
     for name, cycles in found.items():
+        rows = cycles.rows
         if cycles.task.role == "executor":
-            step = worst_of(_steps_ns(cycles, rack)[cycles.is_judged], percentile)
             every_ns = cycle_ns(rack, cycles.task)
-            yield EquationVerdict("3.7", name, step, "=", every_ns, "t_(k+1) - t_k = R_i")
+            # By the releases skipped as traced: a restart, or a row lost by the recorder, is not a
+            # skipped release.
+            steps_ns = (1 + trace_times.skipped(rows)) * every_ns
+            step_ns = worst_of(steps_ns[cycles.is_judged], percentile)
+            yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
-            worst = worst_of(_response_ns(cycles, rack)[cycles.is_judged], percentile)
             deadline_ns = slice_ns(rack, cycles.task)
+            # A cycle whose message came too late, as its trace says, has missed its deadline
+            # whenever it ended.
+            least_ns = np.where(trace_times.is_missed(rows), deadline_ns + 1, 0)
+            response_ns = np.maximum(trace_times.response_ns(rows), least_ns)
+            worst_ns = worst_of(response_ns[cycles.is_judged], percentile)
             meaning = "measured response <= deadline"
-            yield EquationVerdict(RESPONSE_TIME, name, worst, "<=", deadline_ns, meaning)
-
-
-def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
-    for core, load in loads.items():
-        meaning = "time used by its tasks"
-        yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
+            yield EquationVerdict(RESPONSE_TIME, name, worst_ns, "<=", deadline_ns, meaning)
 
 
 def core_loads(
@@ -203,23 +210,3 @@ def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
 def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
     """Return the time available to one cycle of a task; d R_i, the time slice, of a planner."""
     return task.slice * rack.tick_ns
-
-
-def _response_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
-    """Return the time from the release to the end of each cycle, shape (n,).
-
-    A cycle whose message came too late, as its trace says, has missed its deadline whenever it
-    ended.
-    """
-    least = np.where(trace_times.is_missed(cycles.rows), slice_ns(rack, cycles.task) + 1, 0)
-    return np.asarray(np.maximum(trace_times.response_ns(cycles.rows), least))
-
-
-def _steps_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
-    """Return the time from the previous release to that of each cycle, t_(k+1) - t_k of eq. 3.7,
-    shape (n,).
-
-    It follows from the releases skipped as traced: a restart, or a row lost by the recorder, is not
-    a skipped release.
-    """
-    return np.asarray((1 + trace_times.skipped(cycles.rows)) * cycle_ns(rack, cycles.task))

@@ -3,7 +3,6 @@ lockstep and in real time; losses and how soon they are over; and moves by a pro
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
@@ -86,12 +85,17 @@ class NasremRun(TaskRun):
 def _measure(workshop: Workshop) -> NasremRun:
     result, recording = workshop.run(NAME, workshop.config(NAME))
     analysis = Analysis.of(recording)
+    failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.fails}
     ticks = result.outcome.ticks
     layout = recording.layout
     return NasremRun(
         **vars(task_run(result, recording)),
         ticks=ticks,
-        verdicts=tuple(measured_verdicts(analysis)),
+        verdicts=tuple(
+            MeasuredVerdict(pair.measured, pair.measured.key not in failing)
+            for pair in analysis.pairs
+            if pair.measured
+        ),
         executors={
             name: _executor(cycles, analysis.predicted)
             for name, cycles in analysis.cycles.items()
@@ -102,14 +106,6 @@ def _measure(workshop: Workshop) -> NasremRun:
 
 
 NASREM = Experiment(NAME, "nasrem in real time, its whole task", TASK_S, NasremRun, _measure)
-
-
-def measured_verdicts(analysis: Analysis) -> Iterator[MeasuredVerdict]:
-    """Yield every equation on every subject, as measured in the worst cycle."""
-    failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.fails}
-    for pair in analysis.pairs:
-        if pair.measured:
-            yield MeasuredVerdict(pair.measured, pair.measured.key not in failing)
 
 
 def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
