@@ -206,8 +206,12 @@ def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None
 def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield settings for each place where the board's planner could be loosely coupled; none
     without a planner."""
-    table = rack.config.board[board]
-    slot = _free_slot(rack) if table.planner_slot is None else table.planner_slot
+    slot = rack.config.board[board].planner_slot
+    if slot is None:
+        tables = rack.config.board.values()
+        taken = {slot for table in tables for slot in (table.slot, table.planner_slot)}
+        free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
+        slot = next(free, None)
     if rack.timing.level(board).within_cycles is not None and slot is not None:
         for other in _other_cores(rack, rack.timing.boards[board].planner_core):
             yield {"coupling": "loose", "planner_slot": slot, "planner_core": other}
@@ -241,13 +245,6 @@ def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
         used - unknown - {core}, key=lambda other: (timing.loads.get(other, 0.0), other)
     )
     yield next(free for free in range(len(used) + 1) if free not in used)
-
-
-def _free_slot(rack: JudgedConfig) -> int | None:
-    taken = {
-        slot for table in rack.config.board.values() for slot in (table.slot, table.planner_slot)
-    }
-    return next((slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken), None)
 
 
 def _attempt(

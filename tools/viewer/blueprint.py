@@ -72,13 +72,9 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
 
 
 def together(racks: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view of several racks, by name: all at once, and in further tabs each by itself.
-
-    All at once are a column for each rack, its cell above what its levels do, and below them the
-    log of all.
-    """
-    shown = rrb.Vertical(_columns(racks), _log(racks, "racks"), row_shares=[4, 1], name="all racks")
-    return rrb.Tabs(shown, *(views.everything(name) for name, views in racks.items()), active_tab=0)
+    """Return the view of several racks, by name: all at once above the log of all, and in further
+    tabs each by itself."""
+    return _all_and_each(racks, "all racks", _log(racks, "racks"), [4, 1])
 
 
 def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
@@ -92,12 +88,17 @@ def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
         for (title, grey), coloured in both
     ]
     below = rrb.Horizontal(_log(runs, "runs"), rrb.Tabs(*plots, active_tab=0), column_shares=[2, 5])
-    shown = rrb.Vertical(_columns(runs), below, row_shares=[5, 3], name="both runs")
-    return rrb.Tabs(shown, *(views.everything(name) for name, views in runs.items()), active_tab=0)
+    return _all_and_each(runs, "both runs", below, [5, 3])
 
 
-def _columns(racks: Mapping[str, RackViews]) -> rrb.Container:
-    return rrb.Horizontal(*(views.column(name) for name, views in racks.items()))
+def _all_and_each(
+    racks: Mapping[str, RackViews], name: str, below: rrb.Container | rrb.View, shares: list[float]
+) -> rrb.Container:
+    """Return a column for each rack, its cell above what its levels do, and `below` them something
+    of all; in further tabs each rack by itself."""
+    columns = rrb.Horizontal(*(views.column(rack) for rack, views in racks.items()))
+    shown = rrb.Vertical(columns, below, row_shares=shares, name=name)
+    return rrb.Tabs(shown, *(views.everything(rack) for rack, views in racks.items()), active_tab=0)
 
 
 def _log(racks: Mapping[str, RackViews], what: str) -> rrb.View:

@@ -8,7 +8,6 @@ from functools import cached_property, partial
 import numpy as np
 
 from rack.boards.config import RackConfig, load, wire
-from rack.boards.config.schema import BudgetConfig
 from rack.levels.timing.trace_times import plans
 from rack.tools.lab.reproduction.experiments import storing
 from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Workshop
@@ -85,18 +84,12 @@ class FigureRack:
         return "\n".join((self.label, *lines(panel, column_ns)))
 
 
-def budget_of(config: RackConfig) -> BudgetConfig:
-    """Return the budget of a figure's only level."""
-    budget = config.board[LEVEL].budget
-    assert budget is not None, "every figure has a budget"
-    return budget
-
-
 def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
     """Return the settings with which the executor of a figure takes this X, ms, in its budget and
     on its board."""
-    config = load(name)
-    own_ms = budget_of(config).process_ms - config.board[LEVEL].params["process_ms"]
+    board = load(name).board[LEVEL]
+    assert board.budget is not None, "every figure has a budget"
+    own_ms = board.budget.process_ms - board.params["process_ms"]
     computed_ms = max(process_ms - own_ms, 0.0)
     return (
         f"board.{LEVEL}.budget.process_ms={process_ms:g}",
