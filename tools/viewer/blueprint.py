@@ -32,7 +32,7 @@ from rack.tools.viewer.curves import (
     gripper_units,
 )
 from rack.tools.viewer.events import EVENTS, RECORDER
-from rack.tools.viewer.forces import AXES, CONTACT, FORCES, TASK
+from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
 from rack.tools.viewer.hand import BY_FINGER, HAND, TENSIONS, TIPS
 from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
@@ -249,12 +249,12 @@ class RackViews:
                 f"{what} wanted and exerted, {unit}",
                 [self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit],
             )
-            for what, unit in (("force", "N"), ("torque", "N m"))
+            for what, unit in CONTACT_UNITS.items()
         ]
         along = _curves("force along z, wanted and exerted, N", [self.path(FORCES, TASK, "z")])
         contact = [
             _curves(f"contact: {what}, with its limit, {unit}", [self.path(FORCES, CONTACT, what)])
-            for what, unit in (("force", "N"), ("torque", "N m"))
+            for what, unit in CONTACT_UNITS.items()
         ]
         return [along, *views, *contact]
 

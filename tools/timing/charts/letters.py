@@ -152,17 +152,13 @@ def _patterns(panel: Panel) -> Iterator[str]:
 
 
 def _counted(name: str, counts: Counter[str], of: str) -> Iterator[str]:
-    (first, count), *others = [
-        (_short(pattern), number) for pattern, number in counts.most_common(SHOWN)
-    ]
-    yield f"{name}: {first}: {count} of {counts.total()} {of}"
-    yield from (f"{' ' * len(name)}  {pattern}: {number}" for pattern, number in others)
-    hidden = len(counts) - len(others) - 1
-    if hidden:
-        yield (
-            f"{' ' * len(name)}  and {hidden} more patterns:"
-            f" {counts.total() - count - sum(n for _, n in others)}"
-        )
+    ranked = counts.most_common()
+    (first, count), *others = ranked[:SHOWN]
+    margin = " " * len(name)
+    yield f"{name}: {_short(first)}: {count} of {counts.total()} {of}"
+    yield from (f"{margin}  {_short(pattern)}: {number}" for pattern, number in others)
+    if hidden := ranked[SHOWN:]:
+        yield f"{margin}  and {len(hidden)} more patterns: {sum(n for _, n in hidden)}"
 
 
 def _short(pattern: str) -> str:
