@@ -193,20 +193,17 @@ class RackViews:
     def _arm(self) -> rrb.Container:
         """Return a view of all joints for each quantity, and in a second tab one of each joint with
         its limits."""
+        error, *together = (_curves(*curves) for curves in self.main_curves().items())
         views = [
             rrb.Tabs(
-                _curves(
-                    f"{quantity}, {unit}",
-                    [self.path(JOINTS, name, quantity) for name in self._joints],
-                ),
+                shown,
                 rrb.Grid(
                     *(self._joint(name, quantity) for name in self._joints),
                     name="by joint, with limits",
                 ),
             )
-            for quantity, unit in QUANTITIES.items()
+            for shown, quantity in zip(together, QUANTITIES, strict=True)
         ]
-        error = _curves("tracking error, mrad", [self.path(ERROR)])
         own = rrb.Tabs(*self._requests(), *self._forces(), error, *self._gripper(), active_tab=0)
         legend = self._legend(JOINTS, "joints", self._joints)
         return rrb.Horizontal(rrb.Grid(*views, own, grid_columns=2), legend, column_shares=[9, 1])

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -108,19 +109,17 @@ class RateFigures:
     failure: str = ""
 
     @property
-    def verdict(self) -> str:
-        """Whether the rate is held, and if not, why."""
-        if self.failure:
-            return f"not held: {self.failure}"
-        if (self.late or 0.0) > PERMITTED:
-            return "not held: the machine is late"
-        return "held" if self.is_held else "not held: the rack is late"
+    def reason(self) -> str:
+        """Why the rate is not held; empty if it is."""
+        late = self.late or 0.0
+        if self.failure or late > PERMITTED:
+            return self.failure or "the machine is late"
+        return "the rack is late" if self.missed - late > PERMITTED else ""
 
     @property
-    def is_held(self) -> bool:
-        """Whether the machine and the rack are in time, and no run ended early."""
-        late = self.late or 0.0
-        return not self.failure and late <= PERMITTED and self.missed - late <= PERMITTED
+    def verdict(self) -> str:
+        """Whether the rate is held, and if not, why."""
+        return f"not held: {self.reason}" if self.reason else "held"
 
 
 @dataclass(frozen=True)
@@ -135,12 +134,8 @@ class Machine(Comparison):
     @property
     def highest_hz(self) -> float | None:
         """The highest rate that is held, as all below it are; None if the lowest is not."""
-        highest = None
-        for one in self.rates:
-            if not one.is_held:
-                break
-            highest = one.rate_hz
-        return highest
+        held = takewhile(lambda one: not one.reason, self.rates)
+        return max((one.rate_hz for one in held), default=None)
 
     @property
     def is_fit(self) -> bool:
@@ -170,7 +165,7 @@ class Machine(Comparison):
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data, without the raw values."""
-        rates = [{**asdict(one), "held": one.is_held} for one in self.rates]
+        rates = [{**asdict(one), "held": not one.reason} for one in self.rates]
         return {
             **super().document(),
             "fit": self.is_fit,

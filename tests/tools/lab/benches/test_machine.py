@@ -82,7 +82,7 @@ def test_a_rack_without_a_board_at_every_tick_is_refused() -> None:
     ],
 )
 def test_a_rate_is_held_up_to_its_bound(figures: RateFigures, verdict: str) -> None:
-    assert (figures.verdict, figures.is_held) == (verdict, verdict == "held")
+    assert (figures.verdict, not figures.reason) == (verdict, verdict == "held")
 
 
 def test_the_verdict_comes_first_and_says_up_to_which_rate_and_why_no_further() -> None:
