@@ -71,14 +71,14 @@ def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> 
 
 
 def boards_of(layout: Layout) -> list[str]:
-    """Return the first names of tasks: planners have those of their boards."""
-    return list(dict.fromkeys(task.name.partition(".")[0] for task in layout.tasks))
+    """Return the boards, in the order of their tasks."""
+    return list(dict.fromkeys(task.board for task in layout.tasks))
 
 
 def colours_of(layout: Layout) -> dict[str, Colour]:
     """Return a colour for each task, by name; a planner has its board's, dimmed."""
     boards = boards_of(layout)
-    own = {task.name: of_joint(boards.index(task.name.partition(".")[0])) for task in layout.tasks}
+    own = {task.name: of_joint(boards.index(task.board)) for task in layout.tasks}
     return {name: dimmed(colour) if "." in name else colour for name, colour in own.items()}
 
 
