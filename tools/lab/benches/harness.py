@@ -135,12 +135,6 @@ def finished(
     return subprocess.CompletedProcess(argv, process.returncode, out, err)
 
 
-def last_line(text: str, otherwise: str) -> str:
-    """Return the last line of what a program printed: the reason where it failed."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else otherwise
-
-
 @contextmanager
 def pinned(core: int, priority: int = 0) -> Iterator[None]:
     """Keep the calling process on a core, at a real-time priority if that is permitted, while the

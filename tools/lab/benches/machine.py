@@ -39,7 +39,6 @@ from rack.tools.lab.benches.cyclictest import (
 from rack.tools.lab.benches.harness import Absent, Comparison, Sample, interleaved, shown
 from rack.tools.lab.benches.observed import (
     UNVIEWED,
-    Runs,
     count_cycles,
     endless,
     lateness_us,
@@ -186,13 +185,22 @@ def _case(rate_hz: float) -> str:
     return f"{rate_hz:g} Hz"
 
 
-def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Machine:
+def measure(
+    name: str,
+    rates_hz: Sequence[float],
+    seconds: float,
+    rounds: int,
+    share: bool,
+    progress: Progress,
+) -> Machine:
     """Run a rack at every rate, by turns with `cyclictest` on the core of its fastest board.
 
     Args:
         name: Config of the rack, by name or path.
         rates_hz: Rates of its fastest board.
-        runs: Length and number of runs, and whether cores may be shared with another rack.
+        seconds: Time of each run.
+        rounds: Number of runs of each contestant.
+        share: Whether cores may be shared with another rack.
         progress: Told of each rate.
 
     Raises:
@@ -208,23 +216,23 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
     with cores_kept_awake() as refusal:
         if refusal:
             absent.append(Absent(who + AWAKE, refusal))
-    each_s = runs.rounds * (3 * runs.seconds + 2 * LAUNCH_S)
+    each_s = rounds * (3 * seconds + 2 * LAUNCH_S)
     progress.total(len(racks) * each_s)
     rates = []
     samples = []
     for rate_hz, rack in racks.items():
         progress.begin(_case(rate_hz))
         priority = config.board[fastest].priority or 1
-        wakes = max(1, round(runs.seconds * rate_hz))
+        wakes = max(1, round(seconds * rate_hz))
         grid = WakeGrid(core, round(1e9 / rate_hz), wakes, priority)
         contestants: dict[str, Callable[[], RackRun]] = {
-            who: partial(_run, rack, fastest, runs, awake=False)
+            who: partial(_run, rack, fastest, seconds, share, awake=False)
         }
         if not refusal:
-            contestants[who + AWAKE] = partial(_run, rack, fastest, runs, awake=True)
+            contestants[who + AWAKE] = partial(_run, rack, fastest, seconds, share, awake=True)
         if is_compared:
             contestants[CYCLICTEST] = partial(_sleep, grid)
-        found = interleaved(contestants, runs.rounds)
+        found = interleaved(contestants, rounds)
         for one, each in found.items():
             late_us = np.concatenate([run.late_us for run in each])
             if len(late_us):
@@ -262,12 +270,12 @@ class RackRun(NamedTuple):
     failure: str = ""
 
 
-def _run(rack: RackConfig, board: str, runs: Runs, awake: bool) -> RackRun:
+def _run(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
     with (
         TemporaryDirectory(prefix="rack-bench-") as folder,
         cores_kept_awake() if awake else nullcontext(),
     ):
-        result, recording = record(rack, runs.seconds, Path(folder), runs.share)
+        result, recording = record(rack, seconds, Path(folder), share)
         late_us = lateness_us(recording, board)
         return RackRun(late_us, result.tasks[board], result.outcome.failure)
 

@@ -24,7 +24,7 @@ from rack.tools.lab.benches.machine import (
     compare_idle_cores,
     measure,
 )
-from rack.tools.lab.benches.observed import Recorded, Runs, record
+from rack.tools.lab.benches.observed import Recorded, record
 from tests.boards.conftest import PLAIN
 from tests.tools.lab.benches import peers
 
@@ -126,7 +126,7 @@ def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
         return record(config, seconds, folder, share)
 
     monkeypatch.setattr(machine, "record", look)
-    found = measure(str(waves), (400,), Runs(0.3, 2, True), Progress())
+    found = measure(str(waves), (400,), 0.3, 2, True, Progress())
     # Of 120 wakes two rounds have two at 2.5 ms and four at 150 ms: 1 and 60 points of this grid.
     assert found.rates[0].late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
     assert {sample.who for sample in found.samples} == {found.who, found.who + AWAKE, CYCLICTEST}
