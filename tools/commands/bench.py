@@ -77,10 +77,9 @@ def machine(
       rack bench machine --rate 1000 --seconds 60 --rounds 1
     """
     from rack.tools.lab.benches.machine import RATES_HZ, measure
-    from rack.tools.lab.benches.observed import Runs
 
-    runs = Runs(seconds, rounds, share)
-    found = show(lambda progress: measure(config, rate or RATES_HZ, runs, progress), as_json)
+    rates = rate or RATES_HZ
+    found = show(lambda progress: measure(config, rates, seconds, rounds, share, progress), as_json)
     if not found.is_fit:
         raise typer.Exit(1)
 

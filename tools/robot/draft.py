@@ -358,11 +358,10 @@ def _home(
 
     def left(q: Array) -> float:
         """Return the part of the torques that gravity leaves; negative: the pose does not serve."""
-        if not (np.all(q >= low) and np.all(q <= high) and first.free(q, 0.0)):
-            return -1.0
-        if not all(checker.free(q) for checker in later):
-            return -1.0
-        return float(statics.held(q)[0].min()) - LEAST_PART
+        is_within = np.all(q >= low) and np.all(q <= high)
+        if is_within and first.free(q, 0.0) and all(checker.free(q) for checker in later):
+            return float(statics.held(q)[0].min()) - LEAST_PART
+        return -1.0
 
     if wanted and wanted not in starts:
         try:

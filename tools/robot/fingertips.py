@@ -85,8 +85,7 @@ def find_fingertips(cell: Cell, tip: str, is_one: bool = False) -> Fingertips:
         fingers.close(step)
         ends.append(farthest(cell.model, fingers.data, fingers.geoms, out))
     reach = max(ends) - float(origin @ out)
-    turned = np.stack((np.cross(across, out), across, out), axis=1)
-    tool = _placed(fingers.data, cell.model.body(tip).id, origin, turned)
+    tool = _placed(fingers.data, cell.model.body(tip).id, origin, across, out)
     return Fingertips(tool, fingers.opening(float(part)), block, reach, fingers.is_one, out)
 
 
@@ -186,8 +185,7 @@ def tool_outward(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
     side = axes[int(np.argmin(np.abs(axes @ out)))]
     side = side - out * (side @ out)
     side /= norm(side)
-    turned = np.stack((np.cross(side, out), side, out), axis=1)
-    return body, _placed(data, model.body(body).id, at, turned)
+    return body, _placed(data, model.body(body).id, at, side, out)
 
 
 def _snapped(way: Array, axes: Array, least: float = ALIGNED) -> Array:
@@ -198,12 +196,12 @@ def _snapped(way: Array, axes: Array, least: float = ALIGNED) -> Array:
     return np.sign(along[best]) * axes[best] if abs(along[best]) > least else way
 
 
-def _placed(data: mujoco.MjData, body: int, origin: Array, turned: Array) -> ToolConfig:
-    """Return a frame of the world, (3,) and (3, 3), as one on a body."""
+def _placed(data: mujoco.MjData, body: int, origin: Array, across: Array, out: Array) -> ToolConfig:
+    """Return a frame of the world as one on a body: its origin, its y and its z axis, (3,) each."""
+    turned = np.stack((np.cross(across, out), across, out), axis=1)
     own = data.xmat[body].reshape(3, 3)
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, (own.T @ turned).ravel())
     position = own.T @ (origin - data.xpos[body])
-    x, y, z = position.round(5).tolist()
-    a, b, c, d = quaternion.round(6).tolist()
-    return ToolConfig(position=(x, y, z), quaternion=(a, b, c, d))
+    frame = {"position": position.round(5).tolist(), "quaternion": quaternion.round(6).tolist()}
+    return ToolConfig.model_validate(frame)

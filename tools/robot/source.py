@@ -56,12 +56,12 @@ def read_source(path: Path) -> Source:
     else:
         raise RobotError(f"model '{path}': <{root.tag}>; valid: <mujoco> (MJCF), <robot> (URDF)")
     # Name what has no name: a config names bodies, joints and actuators.
-    for kind in ("body", "joint", "actuator"):
-        elements = {
-            "body": source.spec.bodies[1:],
-            "joint": source.spec.joints,
-            "actuator": source.spec.actuators,
-        }[kind]
+    named = {
+        "body": source.spec.bodies[1:],
+        "joint": source.spec.joints,
+        "actuator": source.spec.actuators,
+    }
+    for kind, elements in named.items():
         for number, element in enumerate(elements):
             element.name = element.name or f"{kind} {number}"
     # Make dry friction what it says, unless the model says how soon it acts.

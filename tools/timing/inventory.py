@@ -9,7 +9,7 @@ from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.classes import find_class
 from rack.boards.config.cell import built_cell
-from rack.boards.config.schema import CLOCK_SLOT, LAN, HostConfig, RackConfig
+from rack.boards.config.schema import CLOCK_SLOT, LAN, RackConfig
 from rack.levels.level import Executor
 from rack.levels.tables import read_params
 from rack.levels.timing.chains import spanned
@@ -74,7 +74,16 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
         "segment_bytes": places.size,
         "windows": {window.board: window.address for window in places.windows},
         "tasks": tasks,
-        "hosts": [_host(name, host, layout) for name, host in config.host.items()],
+        "hosts": [
+            {
+                "board": name,
+                "program": host.program,
+                "external": host.external,
+                "writes": [mailbox.name for mailbox in layout.mailboxes if mailbox.writer == name],
+                "reads": [mailbox.name for mailbox in layout.mailboxes if name in mailbox.readers],
+            }
+            for name, host in config.host.items()
+        ],
         "network": _network(config),
         "patience": list(_patience(config, layout)),
         "monitors": list(_monitors(config)),
@@ -126,16 +135,6 @@ def _monitors(config: RackConfig) -> Iterator[Document]:
             "velocity_mrad_s": (1e3 * stands.velocity).round(3).tolist(),
             "jitter_ms": round(1e3 * stands.jitter_s, 3),
         }
-
-
-def _host(name: str, host: HostConfig, layout: Layout) -> Document:
-    return {
-        "board": name,
-        "program": host.program,
-        "external": host.external,
-        "writes": [mailbox.name for mailbox in layout.mailboxes if mailbox.writer == name],
-        "reads": [mailbox.name for mailbox in layout.mailboxes if name in mailbox.readers],
-    }
 
 
 def _network(config: RackConfig) -> Document | None:

@@ -12,6 +12,7 @@ from rack.backplane.layout import Layout, Protocol
 from rack.boards.config import RackConfig, loads, rack_timing, resolve
 from rack.boards.config.layout import obtained_core
 from rack.boards.errors import ConfigError
+from rack.levels.timing.level import LevelTiming
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.system_response import predict
 from rack.levels.timing.tasks import Budget
@@ -26,18 +27,6 @@ from rack.tools.console.answer import Document
 
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values; None removes a key."""
-CHANGEABLE = (
-    "priority",
-    "planner_priority",
-    "within_cycles",
-    "coupling",
-    "planner_slot",
-    "planner_core",
-    "core",
-    "every",
-    "rate_hz",
-)
-"""Keys of a board's table that a change may set."""
 
 
 @dataclass(frozen=True)
@@ -65,25 +54,26 @@ class JudgedConfig:
             if board.budget is not None
         }
 
-    def changed(
-        self, board: str, settings: Settings, mailboxes: Mapping[str, Protocol] | None = None
-    ) -> JudgedConfig | None:
-        """Return the config with other settings of a board, loaded anew and judged; None if it is
-        invalid.
-
-        `mailboxes` are those that get another protocol.
-        """
+    def change(self, board: str, settings: Settings) -> Change | None:
+        """Return the change to other settings of a board, with the config loaded anew and judged;
+        None if that is invalid."""
         config = self.config
-        boards = {**config.board, board: config.board[board].model_copy(update=dict(settings))}
+        table = config.board[board]
+        boards = {**config.board, board: table.model_copy(update=dict(settings))}
         update: dict[str, Any] = {"board": boards}
-        if mailboxes:
-            protocols = {**config.protocol.mailbox, **mailboxes}
-            update["protocol"] = config.protocol.model_copy(update={"mailbox": protocols})
+        protocols: dict[str, Protocol] = {}
+        if settings.get("coupling") == "loose" and self.timing.boards[board].is_critical:
+            # Between two processors the paper uses time slices or double buffers (section 3.3).
+            protocols = {f"{board}.plan": "time-slice"}
+            mailboxes = {**config.protocol.mailbox, **protocols}
+            update["protocol"] = config.protocol.model_copy(update={"mailbox": mailboxes})
         try:
             # Copying validates nothing: only the loader finds mistakes.
-            return JudgedConfig.of(loads(config.model_copy(update=update).text()), self.budgets)
+            after = JudgedConfig.of(loads(config.model_copy(update=update).text()), self.budgets)
         except ConfigError:
             return None
+        own = {key: value for key, value in settings.items() if value != getattr(table, key)}
+        return Change(board, own, protocols, self, after)
 
     @property
     def failing(self) -> tuple[EquationVerdict, ...]:
@@ -121,20 +111,26 @@ class JudgedConfig:
 
 @dataclass(frozen=True)
 class Change:
-    """Other settings for a board: the rack `before` and `after`."""
+    """Other settings for a board.
+
+    Attributes:
+        board: Name of the board.
+        settings: Keys of its table that change, with their new values; None removes a key.
+        protocols: Mailboxes whose protocol changes, with the new one.
+        before: The rack before.
+        after: The rack after.
+    """
 
     board: str
+    settings: Settings
+    protocols: Mapping[str, Protocol]
     before: JudgedConfig
     after: JudgedConfig
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """The keys of the board's table that change, with their new values; None: the key is
-        removed."""
-        old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
-        return {
-            key: getattr(new, key) for key in CHANGEABLE if getattr(old, key) != getattr(new, key)
-        }
+    def _levels(self) -> tuple[LevelTiming, LevelTiming]:
+        """The timing of its level, before and after."""
+        return self.before.timing.level(self.board), self.after.timing.level(self.board)
 
     @property
     def cost(self) -> tuple[bool, float, int, int]:
@@ -143,19 +139,14 @@ class Change:
 
         A longer cycle makes a level slower and its plans older: both factors count.
         """
-        cores = set(self.after.timing.cores.values()) - set(self.before.timing.cores.values())
+        cores = {*self.after.timing.cores.values()} - {*self.before.timing.cores.values()}
         lacking = any(obtained_core(core) != core for core in cores)
-        old = self.before.timing.level(self.board)
-        new = self.after.timing.level(self.board)
+        old, new = self._levels
         factor = new.cycle_ns / old.cycle_ns
         if old.slice_ns is not None and new.slice_ns is not None:
             factor *= max(new.slice_ns / old.slice_ns, 1.0)
-        return (
-            lacking,
-            factor,
-            2 * len(cores) + ("planner_slot" in self.settings),
-            len(self.settings),
-        )
+        places = 2 * len(cores) + ("planner_slot" in self.settings)
+        return lacking, factor, places, len(self.settings)
 
     @property
     def text(self) -> str:
@@ -168,7 +159,7 @@ class Change:
             "board": self.board,
             "text": self.text,
             "settings": self.settings,
-            "protocols": self._protocols(),
+            "protocols": self.protocols,
         }
 
     def _parts(self) -> Iterator[str]:
@@ -179,37 +170,31 @@ class Change:
                 yield f"{key} {getattr(old, key)} -> {changed[key]}"
         if "coupling" in changed:
             yield f"coupling {new.coupling}, planner_slot {new.planner_slot}"
-        if "planner_core" in changed and new.planner_core is not None:
-            was = "" if old.planner_core is None else f"{old.planner_core} -> "
-            yield f"planner_core {was}{new.planner_core} ({self._sharing(new.planner_core)})"
-        if "core" in changed:
-            yield f"core {old.core} -> {new.core} ({self._sharing(new.core)})"
-        yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self._protocols().items())
-        if "every" in changed or "within_cycles" in changed:
-            yield from self._cycles()
-        if (
-            changed.get("coupling") == "loose"
-            and not self.after.timing.level(self.board).exchange_ns
-        ):
+        for key in ("planner_core", "core"):
+            if (core := changed.get(key)) is not None:
+                was = "" if getattr(old, key) is None else f"{getattr(old, key)} -> "
+                yield f"{key} {was}{core} ({self._sharing(core)})"
+        yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self.protocols.items())
+        yield from self._cycles()
+        if changed.get("coupling") == "loose" and not self._levels[1].exchange_ns:
             yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
 
     def _cycles(self) -> Iterator[str]:
-        old, new = (rack.timing.level(self.board) for rack in (self.before, self.after))
-        ticks = [rack.timing.boards[self.board].every for rack in (self.before, self.after)]
+        """Yield the change of the cycle, of the system's response, and of the age of plans."""
+        old, new = self._levels
         if new.cycle_ns != old.cycle_ns:
+            ticks = [rack.timing.boards[self.board].every for rack in (self.before, self.after)]
             cycles = f"cycle {old.cycle_ns * 1e-6:g} -> {new.cycle_ns * 1e-6:g} ms"
-            yield f"every {ticks[0]} -> {ticks[1]} ({cycles}{self._response()})"
-        if new.slice_ns is not None:
-            age = f"a plan every {new.slice_ns * 1e-6:g} ms"
-            if new.within_cycles == old.within_cycles:
-                yield age
-            else:
-                yield f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
-
-    def _response(self) -> str:
-        """Return the change of the system's response time, as text."""
-        old, new = (predict(rack.timing).command_ms for rack in (self.before, self.after))
-        return f"; R_s {old:g} -> {new:g} ms" if new != old else ""
+            responses = [predict(rack.timing).command_ms for rack in (self.before, self.after)]
+            if responses[0] != responses[1]:
+                cycles += f"; R_s {responses[0]:g} -> {responses[1]:g} ms"
+            yield f"every {ticks[0]} -> {ticks[1]} ({cycles})"
+        if new.slice_ns is None or not {"every", "within_cycles"} & {*self.settings}:
+            return
+        age = f"a plan every {new.slice_ns * 1e-6:g} ms"
+        if new.within_cycles != old.within_cycles:
+            age = f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
+        yield age
 
     def _sharing(self, core: int) -> str:
         """Return which other tasks are on a core, and whether this machine has it."""
@@ -224,9 +209,3 @@ class Change:
         if obtained == core:
             return sharing
         return f"{sharing}; this machine has no core {core}, uses core {obtained}"
-
-    def _protocols(self) -> dict[str, str]:
-        old, new = (rack.config.protocol.mailbox for rack in (self.before, self.after))
-        return {
-            mailbox: protocol for mailbox, protocol in new.items() if old.get(mailbox) != protocol
-        }

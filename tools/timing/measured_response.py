@@ -8,7 +8,6 @@ and a status back up.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
 
 import numpy as np
 
@@ -85,14 +84,13 @@ def _way(
         for boards, boxes in ways
         if passed and {box.name for box in boxes} <= set(recording.mailboxes)
     ]
-    seen = np.concatenate([ms for ms, _, _ in found]) if found else np.zeros(0)
-    beyond = list(chain(*(each for _, each, _ in found)))
-    holds = not beyond if len(seen) else None
+    seen = np.concatenate([np.zeros(0), *(ms for ms, _, _ in found)])
+    beyond = [each for _, late, _ in found for each in late]
     return {
         "levels": list(levels[start:]),
         "measured_ms": distribution(seen),
         "bound_ms": bound_ms,
-        "holds": holds,
+        "holds": not beyond if len(seen) else None,
         "beyond": beyond,
         "unseen": sum(unseen for _, _, unseen in found),
     }

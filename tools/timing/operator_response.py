@@ -138,17 +138,19 @@ class OperatorResponse:
 
     def document(self) -> Document:
         """Return everything as plain data."""
-        commands = [
-            asdict(c) | {"ticks": self.ticks(c) if c.acts is not None else None}
-            for c in self.commands
-        ]
-        head = {"lockstep": self.lockstep, "tick_ms": self.tick_ms, "commands": len(self.commands)}
-        figures = {
+        return {
+            "lockstep": self.lockstep,
+            "tick_ms": self.tick_ms,
+            "commands": len(self.commands),
             "measured": len(self.measured),
             "beyond": len(self.beyond),
             "off_prediction": len(self.off),
+            "levels": self.rows(),
+            "each": [
+                asdict(c) | {"ticks": self.ticks(c) if c.acts is not None else None}
+                for c in self.commands
+            ],
         }
-        return {**head, **figures, "levels": self.rows(), "each": commands}
 
     def blocks(self) -> Blocks:
         """Yield the figures as text for people."""

@@ -11,10 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from rack.backplane.layout import Protocol
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
 from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Document
 from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
@@ -127,7 +125,7 @@ def _own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
     planner = _any(rack, board, places)
     if planner is None:
         # Another place is not enough: with more cycles for a plan it may be.
-        moved = (_first(rack, board, [{**place, **d} for d in older]) for place in places)
+        moved = (_first(rack, board, [{**d, **place} for d in older]) for place in places)
         planner = _cheapest(moved)
     kinds = (
         _any(rack, board, _priorities(rack, board)),
@@ -188,25 +186,32 @@ def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None
     on the age of plans, a plan may then get fewer cycles."""
     every = rack.timing.boards[board].every
     timing = rack.timing if place is None else rack.timing.changed(board, coupling="loose")
+    level = timing.level(board)
     step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
     longest = min(MAX_FACTOR * every, LONGEST_EVERY)
-    tried = (
-        _lengthened(timing, board, longer) for longer in range(every + step, longest + 1, step)
-    )
-    # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the other
-    # levels less well, or leave plans too few cycles.
-    return [
-        {**(place or {}), **settings}
-        for changed, settings in tried
-        if rack.is_sound(changed, board)
-    ]
+    found: list[Settings] = []
+    for longer in range(every + step, longest + 1, step):
+        cycles = timing.boards[board].within_cycles
+        changed: Settings = {}
+        if level.within_cycles is not None and level.plan_within_ns is not None:
+            cycles = max(min(cycles, level.plan_within_ns // (longer * timing.tick_ns)), 1)
+            changed = {"within_cycles": cycles}
+        # Filtered first, as soundness is not monotonic: a longer cycle may fit the grid of the
+        # other levels less well, or leave plans too few cycles.
+        if rack.is_sound(timing.changed(board, every=longer, within_cycles=cycles), board):
+            found.append({**changed, **(place or {}), "every": longer, "rate_hz": None})
+    return found
 
 
 def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield settings for each place where the board's planner could be loosely coupled; none
     without a planner."""
-    table = rack.config.board[board]
-    slot = _free_slot(rack) if table.planner_slot is None else table.planner_slot
+    slot = rack.config.board[board].planner_slot
+    if slot is None:
+        tables = rack.config.board.values()
+        taken = {slot for table in tables for slot in (table.slot, table.planner_slot)}
+        free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
+        slot = next(free, None)
     if rack.timing.level(board).within_cycles is not None and slot is not None:
         for other in _other_cores(rack, rack.timing.boards[board].planner_core):
             yield {"coupling": "loose", "planner_slot": slot, "planner_core": other}
@@ -221,17 +226,6 @@ def _cycles(level: LevelTiming) -> range:
     if level.plan_within_ns is not None:
         longest = min(level.plan_within_ns // level.cycle_ns, longest)
     return range(level.within_cycles + 1, longest + 1)
-
-
-def _lengthened(timing: RackTiming, board: str, every: int) -> tuple[RackTiming, Settings]:
-    """Return a rack with another cycle of a board, and the settings that make it."""
-    level = timing.level(board)
-    settings = {"every": every, "rate_hz": None}
-    if level.within_cycles is not None and level.plan_within_ns is not None:
-        cycles = level.plan_within_ns // (every * timing.tick_ns)
-        settings["within_cycles"] = max(min(level.within_cycles, cycles), 1)
-    cycles = settings.get("within_cycles") or timing.boards[board].within_cycles
-    return timing.changed(board, every=every, within_cycles=cycles), settings
 
 
 def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
@@ -253,25 +247,12 @@ def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
     yield next(free for free in range(len(used) + 1) if free not in used)
 
 
-def _free_slot(rack: JudgedConfig) -> int | None:
-    taken = {
-        slot for table in rack.config.board.values() for slot in (table.slot, table.planner_slot)
-    }
-    return next((slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken), None)
-
-
 def _attempt(
     rack: JudgedConfig, board: str, settings: Settings, cures: str | None
 ) -> Change | None:
     """Return the change of a board if it cures the board, or the board `cures`."""
-    mailboxes: dict[str, Protocol] = {}
-    if settings.get("coupling") == "loose" and rack.timing.boards[board].is_critical:
-        # Between two processors the paper uses time slices or double buffers (section 3.3).
-        mailboxes = {f"{board}.plan": "time-slice"}
-    after = rack.changed(board, settings, mailboxes)
-    if after is not None and after.cures(cures or board, rack):
-        return Change(board, rack, after)
-    return None
+    change = rack.change(board, settings)
+    return change if change is not None and change.after.cures(cures or board, rack) else None
 
 
 def _any(

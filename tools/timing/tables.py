@@ -45,9 +45,7 @@ def forecast_blocks(forecast: Forecast) -> Blocks:
         yield verdict_table(("", verdict) for verdict in paper)
     if rack.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
-        ordered = sorted(rack.responses, key=lambda response: (response.core, -response.priority))
-        rows = _merged(map(_response_row, ordered), "task")
-        yield TextTable(rows, ("FIFO", "margin"))
+        yield _response_table(rack.responses)
         yield ""
         loads = (
             f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}"
@@ -56,7 +54,7 @@ def forecast_blocks(forecast: Forecast) -> Blocks:
         yield f"load: {', '.join(loads)}"
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
-        yield TextTable(_merged(map(_inbox_row, forecast.inboxes), "board"), ("interrupted by",))
+        yield _inbox_table(forecast.inboxes)
     yield from _schedule_blocks(forecast)
     yield from forecast.notes
 
@@ -109,49 +107,46 @@ def level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTa
         levels: Levels, each with a word about it.
         about: Head of the column of these words.
     """
-    rows = (_level_row(level, about, word) for word, level in levels)
-    return TextTable(_merged(rows, "level"), ("C", "R", "W", "U", "P", "d"))
-
-
-def _level_row(level: LevelTiming, about: str, word: str) -> Row:
-    return {
-        "level": level.board,
-        about: word,
-        "R_i": ms(level.cycle_ns),
-        "t_exec": ms(level.execution_ns),
-        "t_comm": ms(level.communication_ns),
-        "R": ms(level.read_ns),
-        "W": ms(level.write_ns),
-        "C": ms(level.exchange_ns),
-        "t_residual": ms(level.residual_ns),
-        "t_plan": ms(level.planning_ns),
-        "P": ms(level.plan_ns),
-        "U": ms(None if level.plan_ns is None else level.update_ns),
-        "d": level.within_cycles,
-        "d R_i": ms(level.slice_ns),
-    }
+    rows: Iterable[Row] = (
+        {
+            "level": level.board,
+            about: word,
+            "R_i": ms(level.cycle_ns),
+            "t_exec": ms(level.execution_ns),
+            "t_comm": ms(level.communication_ns),
+            "R": ms(level.read_ns),
+            "W": ms(level.write_ns),
+            "C": ms(level.exchange_ns),
+            "t_residual": ms(level.residual_ns),
+            "t_plan": ms(level.planning_ns),
+            "P": ms(level.plan_ns),
+            "U": ms(None if level.plan_ns is None else level.update_ns),
+            "d": level.within_cycles,
+            "d R_i": ms(level.slice_ns),
+        }
+        for word, level in levels
+    )
+    return TextTable(merge_rows(rows, "level"), ("C", "R", "W", "U", "P", "d"))
 
 
 def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
     """Return a line per verdict: both sides, the margin, whether it holds. Each comes with the side
     that it is of, predicted or measured; "": the table needs none."""
-    rows = (_verdict_row(side, verdict) for side, verdict in verdicts)
-    return TextTable(_merged(rows, "of"), ("meaning", "margin"))
-
-
-def _verdict_row(side: str, verdict: EquationVerdict) -> Row:
-    unit = verdict.unit
-    return {
-        "eq.": verdict.equation,
-        "of": verdict.subject,
-        **({"side": side} if side else {}),
-        "left": side_text(verdict.left, unit),
-        " ": verdict.sign,
-        "right": side_text(verdict.right, unit),
-        "margin": side_text(verdict.margin, unit),
-        "": RESULTS[verdict.holds],
-        "meaning": verdict.meaning,
-    }
+    rows: Iterable[Row] = (
+        {
+            "eq.": verdict.equation,
+            "of": verdict.subject,
+            **({"side": side} if side else {}),
+            "left": side_text(verdict.left, verdict.unit),
+            " ": verdict.sign,
+            "right": side_text(verdict.right, verdict.unit),
+            "margin": side_text(verdict.margin, verdict.unit),
+            "": RESULTS[verdict.holds],
+            "meaning": verdict.meaning,
+        }
+        for side, verdict in verdicts
+    )
+    return TextTable(merge_rows(rows, "of"), ("meaning", "margin"))
 
 
 def side_text(value: float, unit: str) -> str:
@@ -161,42 +156,51 @@ def side_text(value: float, unit: str) -> str:
     return ms(value) if unit == "ns" else f"{value:.3g}"
 
 
-def _response_row(response: TaskResponse) -> Row:
-    found = response.response_ns
-    return {
-        "core": response.core,
-        "task": response.task,
-        "FIFO": response.priority or None,
-        "computes": ms(response.job_ns),
-        "blocked": ms(response.blocking_ns),
-        "response": ms(found),
-        "deadline": ms(response.deadline_ns),
-        "margin": ms(None if found is None else response.deadline_ns - found),
-        "": RESULTS[response.holds],
-    }
+def _response_table(responses: Iterable[TaskResponse]) -> TextTable:
+    """Return a line per task that shares a core: its worst case by priority."""
+    rows: Iterable[Row] = (
+        {
+            "core": response.core,
+            "task": response.task,
+            "FIFO": response.priority or None,
+            "computes": ms(response.job_ns),
+            "blocked": ms(response.blocking_ns),
+            "response": ms(response.response_ns),
+            "deadline": ms(response.deadline_ns),
+            "margin": ms(
+                None
+                if response.response_ns is None
+                else response.deadline_ns - response.response_ns
+            ),
+            "": RESULTS[response.holds],
+        }
+        for response in sorted(responses, key=lambda one: (one.core, -one.priority))
+    )
+    return TextTable(merge_rows(rows, "task"), ("FIFO", "margin"))
 
 
-def _inbox_row(inbox: Mapping[str, Any]) -> Row:
-    """Return what messages that interrupt a board cost it, and its worst burst."""
-    return {
-        "board": inbox["task"],
-        "interrupted by": spanned([name.partition(".")[0] for name in inbox["mailboxes"]]),
-        "in a cycle": ms(inbox["cycle_cost_ns"]),
-        "load": f"{inbox['load']:.3f}",
-        "longest": ms(inbox["longest_ns"]),
-        "wait": inbox["waiting"],
-        "of": inbox["depth"],
-        "": RESULTS[inbox["fits"]],
-    }
+def _inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
+    """Return a line per board that messages interrupt: what they cost it, and its worst burst."""
+    rows: Iterable[Row] = (
+        {
+            "board": inbox["task"],
+            "interrupted by": spanned([name.partition(".")[0] for name in inbox["mailboxes"]]),
+            "in a cycle": ms(inbox["cycle_cost_ns"]),
+            "load": f"{inbox['load']:.3f}",
+            "longest": ms(inbox["longest_ns"]),
+            "wait": inbox["waiting"],
+            "of": inbox["depth"],
+            "": RESULTS[inbox["fits"]],
+        }
+        for inbox in inboxes
+    )
+    return TextTable(merge_rows(rows, "board"), ("interrupted by",))
 
 
-def _merged(rows: Iterable[Row], name: str) -> list[Row]:
+def merge_rows(rows: Iterable[Mapping[str, Any]], name: str) -> list[dict[str, Any]]:
     """Return the rows, those that differ only in the column `name` as one: a board a joint fills no
     page."""
-    names: dict[tuple[Cell, ...], list[str]] = {}
-    first: dict[tuple[Cell, ...], Row] = {}
+    names: dict[tuple[tuple[str, Any], ...], list[str]] = {}
     for row in rows:
-        key = tuple(cell for column, cell in row.items() if column != name)
-        names.setdefault(key, []).append(str(row[name]))
-        first.setdefault(key, row)
-    return [{**row, name: spanned(names[key])} for key, row in first.items()]
+        names.setdefault(tuple({**row, name: ""}.items()), []).append(str(row[name]))
+    return [{**dict(alike), name: spanned(found)} for alike, found in names.items()]

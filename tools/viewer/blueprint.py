@@ -32,7 +32,7 @@ from rack.tools.viewer.curves import (
     gripper_units,
 )
 from rack.tools.viewer.events import EVENTS, RECORDER
-from rack.tools.viewer.forces import AXES, CONTACT, FORCES, TASK
+from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
 from rack.tools.viewer.hand import BY_FINGER, HAND, TENSIONS, TIPS
 from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
@@ -72,13 +72,9 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
 
 
 def together(racks: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view of several racks, by name: all at once, and in further tabs each by itself.
-
-    All at once are a column for each rack, its cell above what its levels do, and below them the
-    log of all.
-    """
-    shown = rrb.Vertical(_columns(racks), _log(racks, "racks"), row_shares=[4, 1], name="all racks")
-    return rrb.Tabs(shown, *(views.everything(name) for name, views in racks.items()), active_tab=0)
+    """Return the view of several racks, by name: all at once above the log of all, and in further
+    tabs each by itself."""
+    return _all_and_each(racks, "all racks", _log(racks, "racks"), [4, 1])
 
 
 def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
@@ -92,12 +88,17 @@ def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
         for (title, grey), coloured in both
     ]
     below = rrb.Horizontal(_log(runs, "runs"), rrb.Tabs(*plots, active_tab=0), column_shares=[2, 5])
-    shown = rrb.Vertical(_columns(runs), below, row_shares=[5, 3], name="both runs")
-    return rrb.Tabs(shown, *(views.everything(name) for name, views in runs.items()), active_tab=0)
+    return _all_and_each(runs, "both runs", below, [5, 3])
 
 
-def _columns(racks: Mapping[str, RackViews]) -> rrb.Container:
-    return rrb.Horizontal(*(views.column(name) for name, views in racks.items()))
+def _all_and_each(
+    racks: Mapping[str, RackViews], name: str, below: rrb.Container | rrb.View, shares: list[float]
+) -> rrb.Container:
+    """Return a column for each rack, its cell above what its levels do, and `below` them something
+    of all; in further tabs each rack by itself."""
+    columns = rrb.Horizontal(*(views.column(rack) for rack, views in racks.items()))
+    shown = rrb.Vertical(columns, below, row_shares=shares, name=name)
+    return rrb.Tabs(shown, *(views.everything(rack) for rack, views in racks.items()), active_tab=0)
 
 
 def _log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
@@ -192,20 +193,17 @@ class RackViews:
     def _arm(self) -> rrb.Container:
         """Return a view of all joints for each quantity, and in a second tab one of each joint with
         its limits."""
+        error, *together = (_curves(*curves) for curves in self.main_curves().items())
         views = [
             rrb.Tabs(
-                _curves(
-                    f"{quantity}, {unit}",
-                    [self.path(JOINTS, name, quantity) for name in self._joints],
-                ),
+                shown,
                 rrb.Grid(
                     *(self._joint(name, quantity) for name in self._joints),
                     name="by joint, with limits",
                 ),
             )
-            for quantity, unit in QUANTITIES.items()
+            for shown, quantity in zip(together, QUANTITIES, strict=True)
         ]
-        error = _curves("tracking error, mrad", [self.path(ERROR)])
         own = rrb.Tabs(*self._requests(), *self._forces(), error, *self._gripper(), active_tab=0)
         legend = self._legend(JOINTS, "joints", self._joints)
         return rrb.Horizontal(rrb.Grid(*views, own, grid_columns=2), legend, column_shares=[9, 1])
@@ -248,12 +246,12 @@ class RackViews:
                 f"{what} wanted and exerted, {unit}",
                 [self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit],
             )
-            for what, unit in (("force", "N"), ("torque", "N m"))
+            for what, unit in CONTACT_UNITS.items()
         ]
         along = _curves("force along z, wanted and exerted, N", [self.path(FORCES, TASK, "z")])
         contact = [
             _curves(f"contact: {what}, with its limit, {unit}", [self.path(FORCES, CONTACT, what)])
-            for what, unit in (("force", "N"), ("torque", "N m"))
+            for what, unit in CONTACT_UNITS.items()
         ]
         return [along, *views, *contact]
 

@@ -17,7 +17,7 @@ from rack.levels.robot.engine import view_state
 from rack.tools.viewer.forces import contacts_of
 from rack.tools.viewer.levels import worded
 from rack.tools.viewer.shapes import shape_of, xyzw
-from rack.tools.viewer.stream import Changes, Moment, RowBlock, Sampled, Stream
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, change_finder, row_sampler
 from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, packed
 
 CELL = "cell"
@@ -107,10 +107,10 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 
 class Poses:
-    """Writes an `ArmState` as poses of all moving bodies, by MuJoCo's own kinematics, and the path
-    of the tool."""
+    """Writes an `ArmState` as poses of all moving bodies, by MuJoCo's own kinematics, the path of
+    the tool, and, with `has_pushes`, the forces that the scene exerts on its objects."""
 
-    def __init__(self, stream: Stream, cell: Cell) -> None:
+    def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
         self._stream = stream
         self._cell = cell
         self._data = cell.start()
@@ -119,14 +119,18 @@ class Poses:
         self._world = stream.frame(WORLD)
         self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
         self._frames += [stream.frame(contact.frame) for contact in self._contacts]
-        self._sampled = Sampled(stream.times.clock_ns)
+        self._sampled_rows = row_sampler(stream.times.clock_ns)
+        self._has_pushes = has_pushes
+        self._is_pushed = False
         stream.static(
             TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD)
         )
+        if has_pushes:
+            stream.static(PUSHES, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write poses, one every 20 ms of simulated time."""
-        chosen = self._sampled.rows(block.ticks)
+        chosen = self._sampled_rows(block.ticks)
         data = self._data
         bodies = self._bodies
         if not len(bodies) or not len(chosen):
@@ -143,6 +147,8 @@ class Poses:
             for at, contact in enumerate(self._contacts, len(bodies)):
                 positions[row, at], quaternions[row, at] = contact.pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
+            if self._has_pushes:
+                self._push(block.when(chosen[row]))
         self._stream.columns(TOOL, block.times_of(chosen), rr.Points3D.columns(positions=tool))
         poses = rr.Transform3D.columns(
             translation=positions.reshape(-1, 3),
@@ -152,37 +158,20 @@ class Poses:
         )
         self._stream.columns((FRAMES,), block.times_of(np.repeat(chosen, count)), poses)
 
-
-class Pushes:
-    """Writes the forces that the scene exerts on its objects, as an `ArmState` has them."""
-
-    def __init__(self, stream: Stream, cell: Cell) -> None:
-        self._stream = stream
-        self._cell = cell
-        self._data = cell.start()
-        self._sampled = Sampled(stream.times.clock_ns)
-        self._is_empty = True
-        stream.static(PUSHES, stream.within(WORLD))
-
-    def write(self, block: RowBlock) -> None:
-        """Write the newest pushes, one set every 20 ms of simulated time."""
-        data = self._data
-        bodies = self._cell.bodies
-        for row in self._sampled.rows(block.ticks):
-            view_state(self._cell.model, data, block.messages["state"][row])
-            forces = data.xfrc_applied[bodies, :3]
-            pushed = forces.any(axis=1)
-            if self._is_empty and not pushed.any():
-                continue
-            self._is_empty = not pushed.any()
-            mujoco.mj_kinematics(self._cell.model, data)
+    def _push(self, when: Moment) -> None:
+        """Write the forces that act on the objects now, and that they have ended."""
+        objects = self._cell.bodies
+        forces = self._data.xfrc_applied[objects, :3]
+        pushed = forces.any(axis=1)
+        if self._is_pushed or pushed.any():
+            self._is_pushed = bool(pushed.any())
             arrows = rr.Arrows3D(
-                origins=data.xipos[bodies][pushed],
+                origins=self._data.xipos[objects][pushed],
                 vectors=PUSH_M * forces[pushed],
                 radii=PUSH_RADIUS_M,
                 colors=[FORCE],
             )
-            self._stream.at(block.when(row), PUSHES, arrows)
+            self._stream.at(when, PUSHES, arrows)
 
 
 class Marks:
@@ -191,7 +180,7 @@ class Marks:
 
     def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
         self._stream = stream
-        self._braked = Changes()
+        self._braking_rows = change_finder()
         self._faults: dict[int, tuple[str, str]] = {}  # joint and text, by entry of the fault table
         self._joints = {name: cell.model.joint(name).pos for name in joints}
         self._radius = MARK_PART * extent_of(cell)[1]
@@ -203,7 +192,7 @@ class Marks:
     def write(self, block: RowBlock) -> None:
         """Mark every joint from when the brakes are engaged until they are released."""
         braked = block.messages["braked"]
-        for row in self._braked.rows(braked):
+        for row in self._braking_rows(braked):
             texts = dict.fromkeys(self._joints, "") if braked[row] else {}
             if texts:
                 texts[list(texts)[-1]] = "brakes engaged"
@@ -251,50 +240,40 @@ def floor_of(cell: Cell) -> float:
     return float(cell.start().geom_xpos[floors, 2].min(initial=0.0))
 
 
-class PlannedPath:
-    """Writes a `MovePlan` as a line of the tool point with its way points, from the tick at which
-    they are visible."""
+def planned_path(stream: Stream, cell: Cell) -> ViewPart:
+    """Return the part that writes a `MovePlan` as a line of the tool point with its way points,
+    from the tick at which they are visible; a plan for the gripper clears the path."""
+    data = cell.start()
+    for entity in (PATH, WAYPOINTS):
+        stream.static(entity, stream.within(WORLD))
 
-    def __init__(self, stream: Stream, cell: Cell) -> None:
-        self._stream = stream
-        self._cell = cell
-        self._data = cell.start()
-        for entity in (PATH, WAYPOINTS):
-            stream.static(entity, stream.within(WORLD))
+    def tool_at(joints: Array) -> Array:
+        """Return the position of the tool at joint positions, (3,), m."""
+        data.qpos[cell.qpos] = joints
+        mujoco.mj_kinematics(cell.model, data)
+        return np.array(data.site_xpos[cell.tool])
 
-    def write(self, block: RowBlock) -> None:
-        """Write every plan; a plan for the gripper clears the path."""
+    def write(block: RowBlock) -> None:
         for row, plan in enumerate(block.messages):
             corners = plan["waypoints"][: plan["count"]]
             if plan["kind"] != SegmentKind.PATH or plan["error"]:
                 corners = corners[:0]
-            points = [self._tool(joints) for joints in corners]
-            lines = [[self._tool(joints) for joints in in_pieces(corners)]] if points else []
+            points = [tool_at(joints) for joints in corners]
+            lines = [[tool_at(joints) for joints in in_pieces(corners)]] if points else []
             when = block.visible(row)
-            strips = rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED])
-            self._stream.at(when, PATH, strips)
-            marks = rr.Points3D(points, radii=POINT_M, colors=[PLANNED])
-            self._stream.at(when, WAYPOINTS, marks)
+            stream.at(when, PATH, rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED]))
+            stream.at(when, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED]))
 
-    def _tool(self, joints: Array) -> Array:
-        """Return the position of the tool at joint positions, (3,), m."""
-        self._data.qpos[self._cell.qpos] = joints
-        mujoco.mj_kinematics(self._cell.model, self._data)
-        return np.array(self._data.site_xpos[self._cell.tool])
+    return write
 
 
 def in_pieces(corners: Array) -> Array:
     """Return the points of a joint path, (points, joints), with no piece longer than `STEP_RAD`."""
-    if len(corners) < 2:
-        return corners
-    counts = [
-        max(1, int(np.ceil(np.abs(step).max() / STEP_RAD))) for step in np.diff(corners, axis=0)
-    ]
-    pieces = [
-        np.linspace(a, b, n, endpoint=False)
-        for a, b, n in zip(corners, corners[1:], counts, strict=False)
-    ]
-    return np.concatenate((*pieces, corners[-1:]))
+    longest = np.abs(np.diff(corners, axis=0)).max(axis=1)
+    counts = np.maximum(np.ceil(longest / STEP_RAD), 1)
+    numbers = np.concatenate(([0], np.cumsum(counts)))  # of the corners, among all points
+    points = np.arange(numbers[-1] + 1)
+    return np.column_stack([np.interp(points, numbers, joint) for joint in corners.T])
 
 
 class Goals:
@@ -305,14 +284,14 @@ class Goals:
         self._stream = stream
         self._objects = objects
         self._goals: dict[int, tuple[list[float], str]] = {}  # place and label, by move
-        self._plans = Changes()
-        self._current = Changes()
+        self._planned_rows = change_finder()
+        self._current_rows = change_finder()
         for entity in (GOALS, CURRENT_GOAL):
             stream.static(entity, stream.within(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the goals of every new plan."""
-        for row in self._plans.rows(block.messages["id"]):
+        for row in self._planned_rows(block.messages["id"]):
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
             self._goals |= {
@@ -330,7 +309,7 @@ class Goals:
 
     def write_status(self, block: RowBlock) -> None:
         """Write the goal of the move that each `MoveStatus` names."""
-        for row in self._current.rows(block.messages["current"]):
+        for row in self._current_rows(block.messages["current"]):
             current = int(block.messages["current"][row])
             goals = [self._goals[current]] if current in self._goals else []
             point = rr.Points3D(

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from functools import partial
 from math import prod
 
 import mujoco
 import numpy as np
 
-from rack.backplane.layout import FieldSpec, MailboxSpec
+from rack.backplane.layout import MailboxSpec
+from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
-from rack.tools.viewer.stream import RowBlock, Stream
-from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves, write_legend
+from rack.tools.viewer.stream import RowBlock, Stream, ViewPart
+from rack.tools.viewer.style import (
+    COMMANDED,
+    LIMIT,
+    OVERLAID,
+    curves,
+    of_joints,
+    style_curves,
+    write_legend,
+)
 
 SIGNALS = "signals"
 MAX_CURVES = 16
@@ -23,65 +34,70 @@ GRIP = "force"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
 """Curves of a joint and their units; the torque is the one applied, after the limit gate."""
 FIELDS = {
-    "position": ("target", "position"),
-    "velocity": ("target_velocity", "velocity"),
-    "torque": ("torque",),
+    "position": {"commanded": "target", "measured": "position"},
+    "velocity": {"commanded": "target_velocity", "measured": "velocity"},
+    "torque": {"applied": "torque"},
 }
-"""Fields of the curves: commanded, where it is, and measured."""
+"""Fields of the curves of a joint, by what they show."""
 
 
-class Joints:
-    """Writes the status of what drives the arm: measured and commanded, limits, tracking error and
-    gripper."""
-
-    def __init__(
-        self, stream: Stream, names: tuple[str, ...], cell: Cell, has_gripper: bool
-    ) -> None:
-        self._stream = stream
-        self._names = names
-        self._has_gripper = has_gripper
-        bounds = cell.bounds
-        self._limits = {
-            "position": np.where(np.isfinite(bounds.position), bounds.position, np.nan),
-            "velocity": np.column_stack((-bounds.velocity, bounds.velocity)),
-            "torque": np.column_stack((-bounds.torque, bounds.torque)),
-        }
-        colours = [of_joint(at) for at in range(len(names))]
-        write_legend(stream, JOINTS, names, colours)
-        for at, name in enumerate(names):
-            for quantity, unit in QUANTITIES.items():
-                entity = (JOINTS, name, quantity)
-                limits = ["lower limit", "upper limit"]
-                style_curves(stream, (*entity, "limits"), limits, [LIMIT, LIMIT], [1.0, 1.0])
-                if quantity == "torque":
-                    style_curves(stream, entity, [f"{name} applied, {unit}"], [of_joint(at)])
-                else:
-                    both = [f"{name} commanded, {unit}", f"{name} measured, {unit}"]
-                    # The lower one is wider: it shows on both sides where the two agree.
-                    style_curves(stream, entity, both, [COMMANDED, of_joint(at)], [2.5, 1.0])
-        labels = [f"{name}, mrad" for name in names]
-        style_curves(stream, (ERROR,), labels, colours)
-        if cell.gripper is not None and has_gripper:
-            for name, unit in zip((OPENING, GRIP), gripper_units(cell), strict=True):
-                style_curves(stream, (GRIPPER, name), [f"{name}, {unit}"])
-
-    def write(self, block: RowBlock) -> None:
-        """Write every cycle of that level."""
-        messages = block.messages
-        times = block.times
-        # A straight line needs only its ends.
-        ends = block.times_of([0, -1])
+def joint_curves(
+    stream: Stream, names: Sequence[str], cell: Cell, has_gripper: bool
+) -> Iterator[ViewPart]:
+    """Yield the parts that write the status of what drives the arm: each joint as measured and as
+    commanded, with its limits, tracking error and gripper."""
+    colours = of_joints(len(names))
+    write_legend(stream, JOINTS, names, colours)
+    bounds = cell.bounds
+    limits = {
+        "position": np.where(np.isfinite(bounds.position), bounds.position, np.nan),
+        "velocity": np.column_stack((-bounds.velocity, bounds.velocity)),
+        "torque": np.column_stack((-bounds.torque, bounds.torque)),
+    }
+    for at, name in enumerate(names):
         for quantity, fields in FIELDS.items():
-            curves = np.stack([messages[field] for field in fields], axis=-1)
-            limits = self._limits[quantity]
-            for at, name in enumerate(self._names):
-                entity = (JOINTS, name, quantity)
-                self._stream.scalars(entity, times, curves[:, at])
-                self._stream.scalars((*entity, "limits"), ends, np.tile(limits[at], (2, 1)))
-        self._stream.scalars((ERROR,), times, (messages["position"] - messages["target"]) * 1e3)
-        if self._has_gripper:
-            self._stream.scalars((GRIPPER, OPENING), times, messages["opening"] * 1e3)
-            self._stream.scalars((GRIPPER, GRIP), times, messages["grip_force"])
+            entity = (JOINTS, name, quantity)
+            yield _limits(stream, (*entity, "limits"), limits[quantity][at])
+            labels = [f"{name} {how}, {QUANTITIES[quantity]}" for how in fields]
+            values = partial(_of_joint, at, tuple(fields.values()))
+            if len(fields) == 1:
+                yield curves(stream, entity, values, labels, [colours[at]])
+            else:
+                both = [COMMANDED, colours[at]]
+                yield curves(stream, entity, values, labels, both, OVERLAID)
+    labels = [f"{name}, mrad" for name in names]
+    yield curves(
+        stream,
+        (ERROR,),
+        lambda block: (block.messages["position"] - block.messages["target"]) * 1e3,
+        labels,
+        colours,
+    )
+    if cell.gripper is not None and has_gripper:
+        opening, grip = gripper_units(cell)
+        yield curves(
+            stream,
+            (GRIPPER, OPENING),
+            lambda block: block.messages["opening"] * 1e3,
+            [f"{OPENING}, {opening}"],
+        )
+        yield curves(
+            stream,
+            (GRIPPER, GRIP),
+            lambda block: block.messages["grip_force"],
+            [f"{GRIP}, {grip}"],
+        )
+
+
+def _limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
+    """Return the part that writes the limits of a quantity, (2,): straight lines need only their
+    ends."""
+    style_curves(stream, entity, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0])
+    return lambda block: stream.scalars(entity, block.times_of([0, -1]), np.tile(limits, (2, 1)))
+
+
+def _of_joint(at: int, fields: Sequence[str], block: RowBlock) -> Array:
+    return np.stack([block.messages[field][:, at] for field in fields], axis=-1)
 
 
 def gripper_units(cell: Cell) -> tuple[str, str]:
@@ -92,29 +108,18 @@ def gripper_units(cell: Cell) -> tuple[str, str]:
     return ("mrad", "N m") if turns else ("mm", "N")
 
 
-class Fields:
-    """Writes every numeric field of a mailbox: a user's own messages show without any
-    configuration."""
-
-    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._stream = stream
-        self._fields = [field for field in mailbox.fields if is_curve(field)]
-        self._lanes = {field.name: (SIGNALS, mailbox.name, field.name) for field in self._fields}
-        for field in self._fields:
-            unit = "" if field.unit in ("", "1") else f", {field.unit}"
-            places = [f"[{at}]" for at in range(prod(field.shape))] if field.shape else [""]
-            curves = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
-            style_curves(stream, self._lanes[field.name], curves)
-
-    def write(self, block: RowBlock) -> None:
-        """Write all rows."""
-        for field in self._fields:
-            values = block.messages[field.name].astype(float)
-            self._stream.scalars(
-                self._lanes[field.name], block.times, values.reshape(len(values), -1)
-            )
+def field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
+    """Yield the parts that write the numeric fields of a mailbox: a user's own messages show
+    without any configuration."""
+    for field in mailbox.fields:
+        if field.fields or field.kind[1] not in "iufb" or not 0 < prod(field.shape) <= MAX_CURVES:
+            continue
+        unit = "" if field.unit in ("", "1") else f", {field.unit}"
+        places = [f"[{at}]" for at in range(prod(field.shape))] if field.shape else [""]
+        names = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
+        entity = (SIGNALS, mailbox.name, field.name)
+        yield curves(stream, entity, partial(_numbers, field.name), names)
 
 
-def is_curve(field: FieldSpec) -> bool:
-    """Return whether a field can be shown as curves."""
-    return not field.fields and field.kind[1] in "iufb" and 0 < prod(field.shape) <= MAX_CURVES
+def _numbers(field: str, block: RowBlock) -> Array:
+    return np.asarray(block.messages[field], float).reshape(len(block.rows), -1)

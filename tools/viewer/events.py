@@ -6,9 +6,11 @@ Each board also has a lane: the kind of its last event, until the next.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
 import rerun as rr
 
 from rack.boards.events import Event
@@ -95,39 +97,38 @@ class Events:
         write_span(self._stream, when, (EVENTS, board), state)
 
 
-class Losses:
-    """Writes how many rows were overwritten before the recorder took them; logs every loss."""
+def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
+    """Return a function that writes, at a tick, how many rows by ring were overwritten before the
+    recorder took them; it logs every loss."""
+    entity = (RECORDER, "rows_lost")
+    style_curves(stream, entity, ["rows lost"], [LOST])
+    logged = Counter[str]()
 
-    def __init__(self, stream: Stream) -> None:
-        self._stream = stream
-        self._logged: dict[str, int] = {}
-        style_curves(stream, (RECORDER, "rows_lost"), ["rows lost"], [LOST])
+    def write(tick: int, lost: Mapping[str, int]) -> None:
+        nonlocal logged
+        when = stream.times.moment_of(tick)
+        counts = Counter(lost)
+        for ring, more in (counts - logged).items():
+            stream.say(when, "recorder", f"recorder: {more} rows of {ring} lost", "ERROR")
+        logged = counts
+        stream.at(when, entity, rr.Scalars(counts.total()))
 
-    def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write the losses since the last call."""
-        when = self._stream.times.moment_of(tick)
-        for ring, count in lost.items():
-            if (more := count - self._logged.get(ring, 0)) > 0:
-                self._stream.say(when, "recorder", f"recorder: {more} rows of {ring} lost", "ERROR")
-        self._logged = dict(lost)
-        self._stream.at(when, (RECORDER, "rows_lost"), rr.Scalars(sum(lost.values())))
+    return write
 
 
-class RecorderLoad:
-    """Writes the load of this process: a recorder."""
+def recorder_load(stream: Stream) -> Callable[[int], None]:
+    """Return a function that writes, at a tick, the load of this process, a recorder, since its
+    last call."""
+    entity = (RECORDER, "load")
+    style_curves(stream, entity, ["recorder, % of a core"])
+    last = time.process_time(), time.monotonic()
 
-    def __init__(self, stream: Stream) -> None:
-        self._stream = stream
-        style_curves(stream, (RECORDER, "load"), ["recorder, % of a core"])
-        self._cpu_s = time.process_time()
-        self._wall_s = time.monotonic()
+    def write(tick: int) -> None:
+        nonlocal last
+        now = time.process_time(), time.monotonic()
+        cpu_s, wall_s = np.subtract(now, last)
+        last = now
+        load = rr.Scalars(100.0 * cpu_s / max(wall_s, 1e-9))
+        stream.at(stream.times.moment_of(tick), entity, load)
 
-    def advance(self, tick: int) -> None:
-        """Write the load since the last call."""
-        cpu_s = time.process_time()
-        wall_s = time.monotonic()
-        share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
-        self._cpu_s = cpu_s
-        self._wall_s = wall_s
-        when = self._stream.times.moment_of(tick)
-        self._stream.at(when, (RECORDER, "load"), rr.Scalars(100.0 * share))
+    return write

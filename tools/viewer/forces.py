@@ -3,6 +3,8 @@ and exerted."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import mujoco
@@ -12,14 +14,16 @@ import rerun as rr
 from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
 from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
-from rack.tools.viewer.stream import RowBlock, Sampled, Stream
-from rack.tools.viewer.style import COMMANDED, LIMIT, of_joint, style_curves
+from rack.tools.viewer.stream import RowBlock, Stream, ViewPart, row_sampler
+from rack.tools.viewer.style import COMMANDED, LIMIT, OVERLAID, curves, of_joint
 
 ARROWS = ("cell", "forces")
 FORCES = "forces"
 TASK = "task_frame"
 CONTACT = "contact"
 """Groups of curves: along the axes of a task frame, of the whole contact against its limits."""
+CONTACT_UNITS = {"force": "N", "torque": "N m"}
+"""Quantities of a contact, and their units."""
 ARROW_COLOUR = 0x00E6FFFF
 LONGEST_M = 1.0
 TOOL_SHAFT_M = 0.014
@@ -61,69 +65,58 @@ def contacts_of(cell: Cell) -> list[ContactPlace]:
     return [] if cell.wrist is None else [ContactPlace("tool", cell.tool, None)]
 
 
-class ContactArrows:
-    """Writes the forces of the surroundings on tool or fingertips as arrows."""
+def contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
+    """Return the part that writes the forces of the surroundings on tool or fingertips as arrows,
+    one every 20 ms of simulated time; the numbers of `field` begin with three for each place."""
+    scale, shaft = TIP_M, TIP_SHAFT_M
+    if cell.wrist is not None:
+        scale, shaft = LONGEST_M / cell.wrist.most[0], TOOL_SHAFT_M
+    places = contacts_of(cell)
+    for place in places:
+        arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
+        stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
+    sampled_rows = row_sampler(stream.times.clock_ns)
 
-    def __init__(self, stream: Stream, cell: Cell, field: str) -> None:
-        """Take the forces from `field`, whose numbers begin with three for each place."""
-        self._stream = stream
-        self._field = field
-        self._places = contacts_of(cell)
-        self._scale = TIP_M
-        shaft = TIP_SHAFT_M
-        if cell.wrist is not None:
-            self._scale = LONGEST_M / cell.wrist.most[0]
-            shaft = TOOL_SHAFT_M
-        self._sampled = Sampled(stream.times.clock_ns)
-        for place in self._places:
-            arrow = rr.Arrows3D.from_fields(colors=[ARROW_COLOUR], radii=shaft)
-            stream.static((*ARROWS, place.name), arrow, stream.within(place.frame))
-
-    def write(self, block: RowBlock) -> None:
-        """Write an arrow every 20 ms of simulated time."""
-        chosen = self._sampled.rows(block.ticks)
+    def write(block: RowBlock) -> None:
+        chosen = sampled_rows(block.ticks)
         if not len(chosen):
             return
         times = block.times_of(chosen)
-        forces = block.messages[self._field][chosen].reshape(len(chosen), -1)
-        for at, place in enumerate(self._places):
-            vectors = self._scale * forces[:, 3 * at : 3 * at + 3]
-            self._stream.columns((*ARROWS, place.name), times, rr.Arrows3D.columns(vectors=vectors))
+        forces = block.messages[field][chosen].reshape(len(chosen), -1)
+        for at, place in enumerate(places):
+            vectors = scale * forces[:, 3 * at : 3 * at + 3]
+            stream.columns((*ARROWS, place.name), times, rr.Arrows3D.columns(vectors=vectors))
+
+    return write
 
 
-class TaskForces:
-    """Writes a `ForceStatus`: what the tool exerts along each axis of the task frame, and what is
-    wanted of it."""
-
-    def __init__(self, stream: Stream) -> None:
-        self._stream = stream
-        for at, (axis, unit) in enumerate(AXES.items()):
-            names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
-            style_curves(stream, (FORCES, TASK, axis), names, [COMMANDED, of_joint(at)], [2.5, 1.0])
-
-    def write(self, block: RowBlock) -> None:
-        """Write every cycle of that level; nothing is wanted on an axis of motion."""
-        messages = block.messages
-        wanted = np.where(messages["selected"] == 1, messages["wanted"], np.nan)
-        for at, axis in enumerate(AXES):
-            curves = np.column_stack((wanted[:, at], -messages["wrench"][:, at]))
-            self._stream.scalars((FORCES, TASK, axis), block.times, curves)
+def task_forces(stream: Stream) -> Iterator[ViewPart]:
+    """Yield the parts that write a `ForceStatus`: what the tool exerts along each axis of the task
+    frame, and what is wanted of it."""
+    for at, (axis, unit) in enumerate(AXES.items()):
+        names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
+        values = partial(_wanted_and_exerted, at)
+        shades = [COMMANDED, of_joint(at)]
+        yield curves(stream, (FORCES, TASK, axis), values, names, shades, OVERLAID)
 
 
-class ContactForces:
-    """Writes a `Wrench` as the size of force and torque, with the arm's limits."""
+def _wanted_and_exerted(at: int, block: RowBlock) -> Array:
+    """Return both along one axis, (rows, 2); nothing is wanted on an axis of motion."""
+    selected, wanted, wrench = (
+        block.messages[field][:, at] for field in ("selected", "wanted", "wrench")
+    )
+    return np.column_stack((np.where(selected == 1, wanted, np.nan), -wrench))
 
-    def __init__(self, stream: Stream, most: tuple[float, float]) -> None:
-        self._stream = stream
-        self._most = dict(zip(("force", "torque"), most, strict=True))
-        for what, unit in (("force", "N"), ("torque", "N m")):
-            names = [f"limit, {unit}", f"{what} of the contact, {unit}"]
-            style_curves(stream, (FORCES, CONTACT, what), names, [LIMIT, of_joint(0)])
 
-    def write(self, block: RowBlock) -> None:
-        """Write every cycle of the arm."""
-        halves = block.messages["wrench"].reshape(len(block.rows), 2, 3)
-        for at, (what, most) in enumerate(self._most.items()):
-            size = np.sqrt((halves[:, at] ** 2).sum(axis=1))
-            curves = np.column_stack((np.full(len(size), most), size))
-            self._stream.scalars((FORCES, CONTACT, what), block.times, curves)
+def contact_forces(stream: Stream, most: tuple[float, float]) -> Iterator[ViewPart]:
+    """Yield the parts that write a `Wrench` as the size of force and torque, with the arm's
+    limits, `most`."""
+    for at, (what, unit) in enumerate(CONTACT_UNITS.items()):
+        names = [f"limit, {unit}", f"{what} of the contact, {unit}"]
+        values = partial(_limit_and_size, most[at], 3 * at)
+        yield curves(stream, (FORCES, CONTACT, what), values, names, [LIMIT, of_joint(0)])
+
+
+def _limit_and_size(limit: float, first: int, block: RowBlock) -> Array:
+    size = np.linalg.norm(block.messages["wrench"][:, first : first + 3], axis=1)
+    return np.column_stack((np.full(len(size), limit), size))

@@ -3,7 +3,7 @@ graph."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from rack.levels.messages import Verb
 from rack.levels.systems.hand.messages import GraspKind
 from rack.levels.timing.rack import RackTiming
 from rack.levels.timing.trace_times import is_missed
-from rack.tools.viewer.stream import Changes, Moment, RowBlock, Stream
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, change_finder
 from rack.tools.viewer.style import STATES, packed, style_lane, write_spans
 
 LEVELS = "levels"
@@ -31,31 +31,28 @@ FIRED = ["table", "row", "fired", "in_state"]
 """Fields of a status that say which row of a state table fires."""
 
 
-class ValueLane:
-    """Writes a value of a level's messages as a lane: its name, from where it changes."""
+def value_lane(
+    stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
+) -> ViewPart:
+    """Return the part that writes a value of a level's messages as a lane: its name, from where it
+    changes.
 
-    def __init__(
-        self,
-        stream: Stream,
-        lane: tuple[str, str],
-        fields: str | list[str],
-        name: Callable[[Any], str],
-    ) -> None:
-        """Take the value of one field, or the tuple of several; `lane` is the board and what its
-        lane shows."""
-        self._stream = stream
-        self._lane = (LEVELS, *lane)
-        self._changes = Changes()
-        self._fields = fields
-        self._name = name
+    Args:
+        stream: Where it is written.
+        lane: The board, and what its lane shows.
+        fields: The field with the value; of several, the value is their tuple.
+        name: Returns the name of a value.
+    """
+    changed_rows = change_finder()
 
-    def write(self, block: RowBlock) -> None:
-        """Write what changed."""
-        values = block.messages[self._fields]
-        rows = self._changes.rows(values)
+    def write(block: RowBlock) -> None:
+        values = block.messages[fields]
+        rows = changed_rows(values)
         if len(rows):
-            names = [self._name(value) for value in values[rows].tolist()]
-            write_spans(self._stream, self._lane, block.times_of(rows), names)
+            names = [name(value) for value in values[rows].tolist()]
+            write_spans(stream, (LEVELS, *lane), block.times_of(rows), names)
+
+    return write
 
 
 def numbered(serial: int) -> str:
@@ -78,55 +75,45 @@ def worded(kind: type[IntEnum], number: int) -> str:
     return kind(number).name.lower().replace("_", " ")
 
 
-class Activity:
-    """Writes the state in a level's statuses, and each error once."""
+def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
+    """Yield the parts that write the state in a level's statuses, and each error once."""
+    board, _, port = mailbox.name.partition(".")
+    # An adapter also writes the statuses of other racks' levels.
+    lane = board, "state" if port == "status" else port
+    style_lane(stream, (LEVELS, *lane), STATES)
+    yield value_lane(stream, lane, "state", partial(worded, State))
+    changed_rows = change_finder()
 
-    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._stream = stream
-        (self._board, _, port) = mailbox.name.partition(".")
-        # An adapter also writes the statuses of other racks' levels.
-        lane = "state" if port == "status" else port
-        own = (self._board, lane)
-        self._states = ValueLane(stream, own, "state", partial(worded, State))
-        self._errors = Changes()
-        style_lane(stream, (LEVELS, *own), STATES)
-
-    def write(self, block: RowBlock) -> None:
-        """Write what changed."""
+    def write_errors(block: RowBlock) -> None:
         messages = block.messages
-        self._states.write(block)
-        for row in self._errors.rows(messages["error"]):
+        for row in changed_rows(messages["error"]):
             if error := messages["error"][row]:
                 reason = text_of(messages["reason"][row])
-                text = f"{self._board}: {reason or f'error {error}'}"
-                self._stream.say(block.when(row), "levels", text, "ERROR")
+                text = f"{board}: {reason or f'error {error}'}"
+                stream.say(block.when(row), "levels", text, "ERROR")
+
+    yield write_errors
 
 
-class FiredRows:
-    """Writes which row of a state table fires, as a lane, and every change to the log."""
+def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
+    """Return the part that writes which row of a state table fires, as a lane, and every change to
+    the log."""
+    board = mailbox.name.partition(".")[0]
+    changed_rows = change_finder()
 
-    def __init__(self, stream: Stream, mailbox: MailboxSpec) -> None:
-        self._stream = stream
-        self._board = mailbox.name.partition(".")[0]
-        self._changes = Changes()
-
-    def write(self, block: RowBlock) -> None:
-        """Write what changed."""
-        messages = block.messages
-        changed = self._changes.rows(messages[FIRED])
+    def write(block: RowBlock) -> None:
+        changed = changed_rows(block.messages[FIRED])
         names = []
         for at in changed:
-            table, fired, state = (
-                text_of(messages[field][at]) for field in ("table", "fired", "in_state")
-            )
-            row = messages["row"][at]
-            text = f"{self._board}: row {row} '{fired}', now in '{state}', table {table}"
-            level = "INFO" if row else "ERROR"
-            self._stream.say(block.when(at), "rows", text, level)
-            names.append(f"{row} {fired}")
+            table, row, fired, state = block.messages[FIRED][at]
+            names.append(f"{row} {text_of(fired)}")
+            now = f"now in '{text_of(state)}', table {text_of(table)}"
+            text = f"row {row} '{text_of(fired)}', {now}"
+            stream.say(block.when(at), "rows", f"{board}: {text}", "INFO" if row else "ERROR")
         if names:
-            lane = (LEVELS, self._board, "row")
-            write_spans(self._stream, lane, block.times_of(changed), names)
+            write_spans(stream, (LEVELS, board, "row"), block.times_of(changed), names)
+
+    return write
 
 
 class Hierarchy:

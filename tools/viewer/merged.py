@@ -70,14 +70,10 @@ def _blocks(
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
     recorded = {*recording.cycles, *recording.mailboxes}
     rings = {name: recording.rows(name) for name in names if name in recorded}
-    done = dict.fromkeys(rings, 0)
-    for begin in range(0, last, block):
-        tick = min(last, begin + block)
-        if tick < last:
-            ends = {name: int(np.searchsorted(rows["tick"], tick)) for name, rows in rings.items()}
-        else:
-            # All that is left: what clock and operator wrote after the last cycle, too.
-            ends = {name: len(rows) for name, rows in rings.items()}
-        taken = {name: rings[name][done[name] : end] for name, end in ends.items()}
-        yield tick, {name: rows for name, rows in taken.items() if len(rows)}
-        done = ends
+    borders = list(range(block, last, block))
+    # The last block has all that is left: what clock and operator wrote after the last cycle, too.
+    pieces = {
+        name: np.split(rows, np.searchsorted(rows["tick"], borders)) for name, rows in rings.items()
+    }
+    for at, tick in enumerate((*borders, last)):
+        yield tick, {name: rows[at] for name, rows in pieces.items() if len(rows[at])}

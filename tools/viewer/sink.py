@@ -4,15 +4,16 @@ blocks."""
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, rack_timing, read_stored
@@ -31,29 +32,46 @@ from rack.levels.systems.joint_boards.messages import DRIVING, STREAMED, JointSt
 from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.recording.occasions import Retention
 from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
-from rack.tools.viewer.cell import Goals, Marks, PlannedPath, Poses, Pushes, write_geometry
-from rack.tools.viewer.curves import Fields, Joints
-from rack.tools.viewer.events import Events, Losses, RecorderLoad
-from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces
-from rack.tools.viewer.hand import HandCurves
+from rack.tools.viewer.cell import Goals, Marks, Poses, planned_path, write_geometry
+from rack.tools.viewer.curves import field_curves, joint_curves
+from rack.tools.viewer.events import Events, recorder_load, row_losses
+from rack.tools.viewer.forces import contact_arrows, contact_forces, task_forces
+from rack.tools.viewer.hand import hand_curves
 from rack.tools.viewer.levels import (
     FIRED,
-    Activity,
-    FiredRows,
     Hierarchy,
-    ValueLane,
+    activity,
+    fired_rows,
     move_name,
     numbered,
     step_name,
+    value_lane,
     worded,
 )
 from rack.tools.viewer.parts import next_file
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from rack.tools.viewer.style import write_legend
-from rack.tools.viewer.timing import LOAD, Age, CycleLanes, Load, Misses, boards_of, colours_of
+from rack.tools.viewer.timing import (
+    LOAD,
+    Age,
+    boards_of,
+    colours_of,
+    cycle_lane,
+    load_curves,
+    missed_cycles,
+)
 
-SHOWN_IN_3D = (ArmState.message_type.name, Scene.message_type.name, WorldState.message_type.name)
-"""Messages whose numbers are not shown as curves."""
+SHOWN_OTHERWISE = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
+UNCURVED = {*DRIVING, *(message.message_type.name for message in SHOWN_OTHERWISE)}
+"""Messages whose fields are not shown as curves, one by one."""
+LANES: tuple[tuple[type[Message], str, str | list[str], Callable[[Any], str]], ...] = (
+    (MoveStatus, "move", ["current", "verb"], move_name),
+    (MotionStatus, "request", "current", numbered),
+    (ServerStatus, "request", "current", numbered),
+    (GraspStatus, "step", ["step", "kind"], step_name),
+    (ServerStatus, "mode", "mode", partial(worded, Mode)),
+)
+"""Lanes of messages: what each shows, of which fields, and how its values are named."""
 BLOCK_S = 1.0
 """Simulated time in one block: a call costs the same for 4 rows as for 400."""
 
@@ -91,7 +109,7 @@ class RackWriter:
         self._times = stream.times
         write_document(stream, ran.text, config, layout)
         of_mailbox: dict[str, list[ViewPart]] = {
-            box.name: _of_any(stream, box) for box in layout.mailboxes
+            box.name: list(_of_any(stream, box)) for box in layout.mailboxes
         }
         marks = None
         if ran.cell is not None:
@@ -104,19 +122,17 @@ class RackWriter:
                     of_mailbox[box.name].append(marks.write)
                 of_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
-        period_ns = config.tick_ns
-        speed = 1.0 if lockstep else layout.clock_ns / period_ns
+        tick_ns = layout.clock_ns if lockstep else config.tick_ns  # of what traces measure
         colours = colours_of(layout)
         boards = boards_of(layout)
         write_legend(stream, LOAD, boards, [colours[board] for board in boards])
-        slice_ns = layout.clock_ns if lockstep else period_ns
         self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
-        self._of_task: dict[str, list[ViewPart]] = {
+        of_task: dict[str, list[ViewPart]] = {
             task.name: [
                 partial(self._hierarchy.write, task.name),
-                CycleLanes(stream, task, speed, lockstep).write,
-                Load(stream, task, colours[task.name], slice_ns, lockstep).write,
-                Misses(stream, task).write,
+                cycle_lane(stream, task, layout.clock_ns / tick_ns, lockstep),
+                *load_curves(stream, task, colours[task.name], tick_ns, lockstep),
+                missed_cycles(stream, task),
             ]
             for task in layout.tasks
         }
@@ -129,9 +145,9 @@ class RackWriter:
         }
         for mailbox, age in self._ages.items():
             of_mailbox[mailbox].append(age.write)
-        self._parts = self._of_task | of_mailbox
+        self._parts = of_task | of_mailbox
         self._events = Events(stream, ran.events, self._hierarchy, marks)
-        self._losses = Losses(stream)
+        self._write_losses = row_losses(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
     def write(self, taken: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]) -> None:
@@ -140,15 +156,14 @@ class RackWriter:
         if (fastest := taken.get(self._fastest)) is not None:
             self._times.learn(fastest["tick"], fastest["start_ns"])
         for ring, rows in taken.items():
-            stamp = "start_ns" if ring in self._of_task else "stamp_ns"
-            block = RowBlock(rows, stamp, self._times)
+            block = RowBlock(rows, self._times)
             for write in self._parts[ring]:
                 write(block)
         for age in self._ages.values():
             age.advance(tick)
         self._events.advance()
         self._hierarchy.advance()
-        self._losses.advance(tick, lost)
+        self._write_losses(tick, lost)
 
     def skip(self, tick: int) -> None:
         """Go on at a tick: nothing is recorded of what was before."""
@@ -176,7 +191,7 @@ class ViewSink:
         recording = new_recording(folder.name, run, file, view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
         self._writer = RackWriter(self._stream, ran)
-        self._load = RecorderLoad(self._stream)
+        self._write_load = recorder_load(self._stream)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = block_of(layout)
         self._written = segment.words[System.TICK]
@@ -215,7 +230,7 @@ class ViewSink:
         self._writer.write(
             {ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost
         )
-        self._load.advance(tick)
+        self._write_load(tick)
 
 
 def block_of(layout: Layout) -> int:
@@ -223,66 +238,47 @@ def block_of(layout: Layout) -> int:
     return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
-def _of_any(stream: Stream, mailbox: MailboxSpec) -> list[ViewPart]:
-    """Return the parts of the view for a mailbox, by its message type, so that any rack has a
+def _of_any(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
+    """Yield the parts of the view for a mailbox, by its message type, so that any rack has a
     view."""
     names = {field.name for field in mailbox.fields}
     board, _, port = mailbox.name.partition(".")
-    parts: list[ViewPart] = []
-    if {"state", "error", "reason"} <= names and mailbox.message != ArmState.message_type.name:
-        parts.append(Activity(stream, mailbox).write)
-    elif (
-        mailbox.name.endswith(".command")
-        and "id" in names
-        and mailbox.message not in (*STREAMED, *STREAMED_DOWN)
-    ):
-        parts.append(ValueLane(stream, (board, port), "id", numbered).write)
+    kind = mailbox.message
+    if {"state", "error", "reason"} <= names and kind != ArmState.message_type.name:
+        yield from activity(stream, mailbox)
+    elif port == "command" and "id" in names and kind not in (*STREAMED, *STREAMED_DOWN):
+        yield value_lane(stream, (board, port), "id", numbered)
     if names.issuperset(FIRED):
-        parts.append(FiredRows(stream, mailbox).write)
-    if mailbox.message == MoveStatus.message_type.name:
-        parts.append(ValueLane(stream, (board, "move"), ["current", "verb"], move_name).write)
-    if mailbox.message in (MotionStatus.message_type.name, ServerStatus.message_type.name):
-        parts.append(ValueLane(stream, (board, "request"), "current", numbered).write)
-    if mailbox.message == GraspStatus.message_type.name:
-        parts.append(ValueLane(stream, (board, "step"), ["step", "kind"], step_name).write)
-    if mailbox.message == ServerStatus.message_type.name:
-        parts.append(ValueLane(stream, (board, "mode"), "mode", partial(worded, Mode)).write)
-    if mailbox.message not in (
-        *SHOWN_IN_3D,
-        *DRIVING,
-        JointTorque.message_type.name,
-        JointStatus.message_type.name,
-        HandStatus.message_type.name,
-    ):
-        parts.append(Fields(stream, mailbox).write)
-    return parts
+        yield fired_rows(stream, mailbox)
+    for message, what, fields, name in LANES:
+        if kind == message.message_type.name:
+            yield value_lane(stream, (board, what), fields, name)
+    if kind not in UNCURVED:
+        yield from field_curves(stream, mailbox)
 
 
 def _of_arm(
     stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals
-) -> list[ViewPart]:
-    """Return the parts that show a mailbox in the cell, or as curves of the arm."""
+) -> Iterator[ViewPart]:
+    """Yield the parts that show a mailbox in the cell, or as curves of the arm."""
     robot = config.robot
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ArmState.message_type.name:
-            pushes = [Pushes(stream, cell).write] if config.scene.push else []
-            return [Poses(stream, cell).write, *pushes]
+            yield Poses(stream, cell, bool(config.scene.push)).write
         case HandStatus.message_type.name if cell.hand is not None:
-            arrows = ContactArrows(stream, cell, "force")
-            return [HandCurves(stream, robot.joints, cell.hand).write, arrows.write]
+            yield from hand_curves(stream, robot.joints, cell.hand)
+            yield contact_arrows(stream, cell, "force")
         case driving if driving in DRIVING:
-            return [Joints(stream, robot.joints, cell, robot.gripper is not None).write]
+            yield from joint_curves(stream, robot.joints, cell, robot.gripper is not None)
         case Wrench.message_type.name if cell.wrist is not None:
-            arrows = ContactArrows(stream, cell, "wrench")
-            return [arrows.write, ContactForces(stream, cell.wrist.most).write]
+            yield contact_arrows(stream, cell, "wrench")
+            yield from contact_forces(stream, cell.wrist.most)
         case ForceStatus.message_type.name:
-            return [TaskForces(stream).write]
+            yield from task_forces(stream)
         case MovePlan.message_type.name:
-            return [PlannedPath(stream, cell).write]
+            yield planned_path(stream, cell)
         case TaskPlan.message_type.name:
-            return [goals.write]
+            yield goals.write
         case MoveStatus.message_type.name:
-            return [goals.write_status]
-        case _:
-            return []
+            yield goals.write_status

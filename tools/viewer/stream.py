@@ -112,7 +112,8 @@ class RowBlock:
     trace the fields of `rack.backplane.trace.RECORD`.
     """
 
-    def __init__(self, rows: np.ndarray, stamp: str, timelines: Timelines) -> None:
+    def __init__(self, rows: np.ndarray, timelines: Timelines) -> None:
+        stamp = "stamp_ns" if "stamp_ns" in (rows.dtype.names or ()) else "start_ns"
         self.rows = rows  # (rows,)
         self.ticks: Ints = rows["tick"].astype(np.int64)  # (rows,)
         self.stamps_ns: Ints = rows[stamp].astype(np.int64)  # (rows,), CLOCK_MONOTONIC
@@ -145,40 +146,39 @@ ViewPart = Callable[[RowBlock], None]
 """Writes one aspect of one mailbox or task to the stream, block by block."""
 
 
-class Changes:
-    """Finds the rows of consecutive blocks in which a value changes."""
+def change_finder() -> Callable[[np.ndarray], Ints]:
+    """Return a function that takes the values of consecutive blocks, (rows,) or structured, and
+    returns the indices of the rows that differ from the row before."""
+    last: np.ndarray | None = None
 
-    def __init__(self) -> None:
-        self._last: np.ndarray | None = None
-
-    def rows(self, values: np.ndarray) -> Ints:
-        """Return the indices of the rows that differ from the row before; shape of `values` (rows,)
-        or structured."""
-        before = values[:1] if self._last is None else self._last
-        changed = values != np.concatenate((before, values[:-1]))
-        changed[0] |= self._last is None
-        self._last = values[-1:].copy()
+    def changed_rows(values: np.ndarray) -> Ints:
+        nonlocal last
+        changed = values != np.concatenate((values[:1] if last is None else last, values[:-1]))
+        changed[0] |= last is None
+        last = values[-1:].copy()
         return np.flatnonzero(changed)
+
+    return changed_rows
 
 
 SHOWN_S = 0.02
 """Time between things drawn: the rate of a screen."""
 
 
-class Sampled:
-    """Finds the rows of consecutive blocks that are drawn: the first of every 20 ms of simulated
-    time."""
+def row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
+    """Return a function that takes the ticks of consecutive blocks, and returns the indices of the
+    rows that are drawn: the first of every 20 ms of simulated time."""
+    every = max(1, round(SHOWN_S * 1e9 / clock_ns))
+    last = -1
 
-    def __init__(self, clock_ns: int) -> None:
-        self._every = max(1, round(SHOWN_S * 1e9 / clock_ns))
-        self._last = -1
-
-    def rows(self, ticks: Ints) -> Ints:
-        """Return the indices of these rows."""
-        slots, first = np.unique(ticks // self._every, return_index=True)
-        chosen = first[slots > self._last]
-        self._last = int(slots[-1])
+    def sampled_rows(ticks: Ints) -> Ints:
+        nonlocal last
+        slots, first = np.unique(ticks // every, return_index=True)
+        chosen = first[slots > last]
+        last = int(slots[-1])
         return np.asarray(chosen)
+
+    return sampled_rows
 
 
 def new_recording(

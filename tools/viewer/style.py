@@ -5,13 +5,13 @@ rerun marks the archetype of lanes as unstable, so it is used only here.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from rack.tools.viewer.stream import Moment, Stream
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart
 
 Colour = int
 """0xRRGGBBAA."""
@@ -34,6 +34,8 @@ CURRENT: Colour = 0xFF6E28FF
 FORCE: Colour = 0xF03C3CFF
 LOST: Colour = 0xE63232FF
 GRID: Colour = 0xFFFFFF78
+OVERLAID = (2.5, 1.0)
+"""Widths of two curves: the lower one shows on both sides where the two agree."""
 LEGEND = "legend"
 LEGEND_ROW = 30.0
 LEGEND_LETTER = 7.0
@@ -84,6 +86,11 @@ def of_joint(at: int) -> Colour:
     return _JOINTS[at % len(_JOINTS)]
 
 
+def of_joints(count: int) -> list[Colour]:
+    """Return the colours of this many joints, from base to tool."""
+    return [of_joint(at) for at in range(count)]
+
+
 def dimmed(colour: Colour) -> Colour:
     """Return a colour of which less is seen."""
     return colour & ~0xFF | 110
@@ -123,6 +130,28 @@ def style_curves(
     them."""
     shades = None if colours is None else packed(colours)
     stream.static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
+
+
+def curves(
+    stream: Stream,
+    entity: Sequence[str],
+    values: Callable[[RowBlock], np.ndarray],
+    names: Sequence[str],
+    colours: Sequence[Colour] | None = None,
+    widths: Sequence[float] | None = None,
+) -> ViewPart:
+    """Style the curves of an entity, and return the part that writes them.
+
+    Args:
+        stream: Where they are written.
+        entity: The entity.
+        values: Returns the values of all rows of a block, (rows,) or (rows, curves).
+        names: Names of the curves, with their units.
+        colours: Their colours; without them the viewer picks some.
+        widths: Their widths.
+    """
+    style_curves(stream, entity, names, colours, widths)
+    return lambda block: stream.scalars(entity, block.times, values(block))
 
 
 def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[Colour]) -> None:

@@ -3,6 +3,8 @@ messages."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
@@ -14,13 +16,14 @@ from rack.levels.timing.trace_times import (
     response_ns,
 )
 from rack.tools.viewer.levels import LEVELS
-from rack.tools.viewer.stream import Ints, RowBlock, Stream
+from rack.tools.viewer.stream import Ints, RowBlock, Stream, ViewPart
 from rack.tools.viewer.style import (
     COMMANDED,
     LETTERS,
     LIMIT,
     PHASES,
     Colour,
+    curves,
     dimmed,
     of_joint,
     style_curves,
@@ -38,124 +41,102 @@ SPAN_S = 0.25
 """Time marked around a missed cycle: the cycle itself would be too narrow to be visible."""
 
 
-class CycleLanes:
-    """Writes trace records as spans: read, process or plan, write, wait. Missed cycles are red.
+def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> ViewPart:
+    """Return the part that writes trace records as four spans a cycle: read, process or plan,
+    write, wait. Missed cycles are red.
 
-    In real time a span is where it was on the wall clock, scaled to simulated time. In lockstep,
-    where simulated time stands still meanwhile, it begins at its tick and is cut at the end of its
-    time slice.
+    In real time a span is where it was on the wall clock, scaled to simulated time by `speed`. In
+    lockstep, where simulated time stands still meanwhile, it begins at its tick and is cut at the
+    end of its time slice.
     """
+    lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
+    last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
+    work = "process" if task.role == "executor" else "plan"
+    style_lane(stream, lane, PHASES, LETTERS)
 
-    def __init__(self, stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> None:
-        self._stream = stream
-        self._speed = speed
-        self._lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
-        self._last_ns = task.slice * stream.times.clock_ns - len(MOMENTS) if lockstep else None
-        self._work = "process" if task.role == "executor" else "plan"
-        style_lane(stream, self._lane, PHASES, LETTERS)
-
-    def write(self, block: RowBlock) -> None:
-        """Write four spans a cycle."""
+    def write(block: RowBlock) -> None:
         rows = block.rows
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
-        within = ((moments - rows["release_ns"][:, None]) * self._speed).astype(np.int64)
-        if self._last_ns is not None:
+        within = ((moments - rows["release_ns"][:, None]) * speed).astype(np.int64)
+        if lockstep:
             # Cut spans keep their order: no two of a lane begin at the same time.
-            within = np.minimum(within, self._last_ns + np.arange(len(MOMENTS)))
+            within = np.minimum(within, last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
-        states = np.array([["read", self._work, "write", "wait"]] * len(rows))
+        states = np.array([["read", work, "write", "wait"]] * len(rows))
         states[is_missed(rows), :3] = MISSED
-        times = self._stream.times.columns(ticks, moments.ravel(), within.ravel())
-        write_spans(self._stream, self._lane, times, states.ravel().tolist())
+        times = stream.times.columns(ticks, moments.ravel(), within.ravel())
+        write_spans(stream, lane, times, states.ravel().tolist())
+
+    return write
 
 
 def boards_of(layout: Layout) -> list[str]:
-    """Return the first names of tasks: planners have those of their boards."""
-    return list(dict.fromkeys(task.name.partition(".")[0] for task in layout.tasks))
+    """Return the boards, in the order of their tasks."""
+    return list(dict.fromkeys(task.board for task in layout.tasks))
 
 
 def colours_of(layout: Layout) -> dict[str, Colour]:
     """Return a colour for each task, by name; a planner has its board's, dimmed."""
     boards = boards_of(layout)
-    own = {task.name: of_joint(boards.index(task.name.partition(".")[0])) for task in layout.tasks}
+    own = {task.name: of_joint(boards.index(task.board)) for task in layout.tasks}
     return {name: dimmed(colour) if "." in name else colour for name, colour in own.items()}
 
 
-class Load:
-    """Writes trace records as curves: lateness, execution and deadline in ms, and the used part of
-    the time slice.
+def load_curves(
+    stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
+) -> Iterator[ViewPart]:
+    """Yield the parts that write trace records as curves: lateness, execution and deadline in ms,
+    and the used part of the time slice, whose 100 % are the deadline.
 
     In lockstep a tick lasts as long as its tasks take: there is only execution, without anything to
     compare it with.
     """
+    slice_ns = task.slice * period_ns
 
-    def __init__(
-        self, stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
-    ) -> None:
-        self._stream = stream
-        self._task = task.name
-        self._is_lockstep = is_lockstep
-        self._slice_ns = task.slice * period_ns
-        curves = [
-            f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")
-        ]
-        style_curves(stream, (TIMES, task.name), curves, [COMMANDED, colour, LIMIT])
-        style_curves(stream, (LOAD, task.name), [f"{task.name}, %"], [colour])
-
-    def write(self, block: RowBlock) -> None:
-        """Write every cycle; 100 % is the deadline."""
+    def times_ms(block: RowBlock) -> np.ndarray:
         rows = block.rows
-        curves = (
-            np.column_stack(
-                (lateness_ns(rows), execution_ns(rows), np.full(len(rows), self._slice_ns))
-            )
-            * 1e-6
+        found = np.full((len(rows), 3), np.nan)
+        found[:, 1] = execution_ns(rows) * 1e-6
+        if not is_lockstep:
+            found[:, 0] = lateness_ns(rows) * 1e-6
+            found[:, 2] = slice_ns * 1e-6
+        return found
+
+    names = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
+    yield curves(stream, (TIMES, task.name), times_ms, names, [COMMANDED, colour, LIMIT])
+    if not is_lockstep:
+        yield curves(
+            stream,
+            (LOAD, task.name),
+            lambda block: response_ns(block.rows) * (100.0 / slice_ns),
+            [f"{task.name}, %"],
+            [colour],
         )
-        if self._is_lockstep:
-            curves[:, [0, 2]] = np.nan
-        self._stream.scalars((TIMES, self._task), block.times, curves)
-        if not self._is_lockstep:
-            used = response_ns(rows) * (100.0 / self._slice_ns)
-            self._stream.scalars((LOAD, self._task), block.times, used)
 
 
-class Misses:
-    """Writes missed cycles: as a lane that shows them at any zoom, and as one log line a block.
+def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
+    """Return the part that writes missed cycles: as a lane that shows them at any zoom, and as one
+    log line a block. A task that never misses has no lane."""
+    lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
+    span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
 
-    A task that never misses has no lane.
-    """
-
-    def __init__(self, stream: Stream, task: TaskSpec) -> None:
-        self._stream = stream
-        self._task = task.name
-        self._lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
-        self._span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
-        self._is_styled = False
-
-    def write(self, block: RowBlock) -> None:
-        """Write the cycles that were missed."""
+    def write(block: RowBlock) -> None:
         missed = np.flatnonzero(is_missed(block.rows))
         if not len(missed):
             return
-        if not self._is_styled:
-            style_lane(self._stream, self._lane, {MISSED: PHASES[MISSED]})
-            self._is_styled = True
+        style_lane(stream, lane, {MISSED: PHASES[MISSED]})
         ticks = block.ticks[missed]
-        self._mark(np.unique(ticks // self._span))
         which = f"tick {ticks[0]}"
         if len(ticks) > 1:
             which = f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
-        self._stream.say(block.when(missed[0]), "misses", f"missed: {self._task}: {which}", "WARN")
+        stream.say(block.when(missed[0]), "misses", f"missed: {task.name}: {which}", "WARN")
+        marked = np.unique(ticks // span)
+        moments = np.union1d(marked, marked + 1)
+        states = np.where(np.isin(moments, marked), MISSED, "")
+        times = stream.times.columns(moments * span, stream.times.stamps_of(moments * span))
+        write_spans(stream, lane, times, states.tolist())
 
-    def _mark(self, spans: np.ndarray) -> None:
-        ends = np.setdiff1d(spans + 1, spans)
-        moments = np.concatenate((spans, ends))
-        order = np.argsort(moments)
-        ticks = moments[order] * self._span
-        states = np.array([MISSED] * len(spans) + [""] * len(ends))[order]
-        times = self._stream.times
-        columns = times.columns(ticks, times.stamps_of(ticks))
-        write_spans(self._stream, self._lane, columns, states.tolist())
+    return write
 
 
 class Age:

@@ -94,7 +94,7 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
     rows = np.zeros(9, dtype=dtype)
     rows["tick"] = np.arange(9)
     rows["message"]["braked"][3:6] = 1
-    marks.write(RowBlock(rows, "stamp_ns", times))
+    marks.write(RowBlock(rows, times))
     for tick, code in ((2, "begins"), (7, "ends")):
         text = f"sensor-nan (j3) {code}, and more"
         event = Event(0, tick, "fault", "servo", text, code, fault=0, subject="j3")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from rack.backplane.message import Message
 from rack.backplane.segment import Launch
 from rack.levels.robot.cell import Cell, build_cell, sizes
 from rack.levels.systems.force.messages import ForceStatus, Wrench
-from rack.tools.viewer.forces import ContactArrows, ContactForces, TaskForces, contacts_of
+from rack.tools.viewer.forces import contact_arrows, contact_forces, contacts_of, task_forces
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
 from tests.levels.systems.force.pad import pad
@@ -35,7 +36,9 @@ class Written:
         self._times = Timelines(CLOCK_NS, Launch(0, 0))
         self.stream = Stream(recording, self._times)
 
-    def write(self, kind: type[Message], cell: Cell, write: ViewPart, **fields: np.ndarray) -> None:
+    def write(
+        self, kind: type[Message], cell: Cell, parts: Iterable[ViewPart], **fields: np.ndarray
+    ) -> None:
         """Write `ROWS` messages with these fields, one a tick."""
         dtype = [
             ("tick", "i8"),
@@ -46,7 +49,8 @@ class Written:
         rows["tick"] = rows["stamp_ns"] = np.arange(ROWS)
         for name, values in fields.items():
             rows["message"][name] = values
-        write(RowBlock(rows, "stamp_ns", self._times))
+        for write in parts:
+            write(RowBlock(rows, self._times))
         self.stream.close()
 
 
@@ -54,7 +58,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
     force = np.zeros((ROWS, 6))
     force[:, 2] = np.arange(ROWS)
     written = Written(tmp_path)
-    written.write(Wrench, cell, ContactArrows(written.stream, cell, "wrench").write, wrench=force)
+    written.write(Wrench, cell, [contact_arrows(written.stream, cell, "wrench")], wrench=force)
     arrows = read(written.file, "/cell/forces/tool", "Arrows3D:vectors")
     assert arrows.ticks.tolist() == [0, 20, 40]
     assert arrows.values[:, 0] == pytest.approx(
@@ -68,8 +72,8 @@ def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
     wrench, wanted, selected = np.zeros((3, ROWS, 6))
     wrench[:, 2], wanted[:, 2], selected[:, 2] = 18.0, -20.0, 1
     written = Written(tmp_path)
-    part = TaskForces(written.stream).write
-    written.write(ForceStatus, cell, part, wrench=wrench, wanted=wanted, selected=selected)
+    parts = task_forces(written.stream)
+    written.write(ForceStatus, cell, parts, wrench=wrench, wanted=wanted, selected=selected)
     assert read(written.file, "/forces/task_frame/z").values[-1].tolist() == [-20.0, -18.0]
     assert np.isnan(read(written.file, "/forces/task_frame/x").values[-1][0])
 
@@ -77,8 +81,8 @@ def test_curves_show_what_is_wanted_of_the_tool_and_what_it_exerts(
 def test_the_contact_is_shown_against_the_arms_limits(tmp_path: Path, cell: Cell) -> None:
     assert cell.wrist is not None
     written = Written(tmp_path)
-    part = ContactForces(written.stream, cell.wrist.most).write
-    written.write(Wrench, cell, part, wrench=np.tile([3.0, 0.0, 4.0, 0.0, 0.6, 0.8], (ROWS, 1)))
+    parts = contact_forces(written.stream, cell.wrist.most)
+    written.write(Wrench, cell, parts, wrench=np.tile([3.0, 0.0, 4.0, 0.0, 0.6, 0.8], (ROWS, 1)))
     assert read(written.file, "/forces/contact/force").values[-1].tolist() == [60.0, 5.0]
     assert read(written.file, "/forces/contact/torque").values[-1].tolist() == [8.0, 1.0]
 

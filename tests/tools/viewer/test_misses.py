@@ -14,7 +14,7 @@ from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, Flag
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.stream import RowBlock, Stream, Timelines, new_recording
-from rack.tools.viewer.timing import Misses
+from rack.tools.viewer.timing import missed_cycles
 
 TICK_NS = 2_500_000
 SPAN = 100
@@ -25,13 +25,13 @@ def recorded(folder: Path, missed: list[list[int]]) -> Path:
     """Write blocks of 400 cycles with misses at those ticks."""
     times = Timelines(TICK_NS, Launch(time.time_ns(), 0))
     stream = Stream(new_recording("misses", "run", folder / "run.rrd", rrb.Blueprint()), times)
-    part = Misses(stream, TASK)
+    write = missed_cycles(stream, TASK)
     for number, ticks in enumerate(missed):
         rows = np.zeros(400, dtype=RECORD)
         rows["tick"] = np.arange(400) + 400 * number
         rows["start_ns"] = rows["tick"] * TICK_NS
         rows["flags"][np.array(ticks, dtype=int) - 400 * number] = Flag.MISSED
-        part.write(RowBlock(rows, "start_ns", times))
+        write(RowBlock(rows, times))
     stream.flush()
     stream.close()
     return folder / "run.rrd"

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import finished, last_line
+from rack.tools.lab.benches.harness import finished
 
 THIS = "this tree"
 RUN = "import sys; from rack.tools.cli import main; sys.argv[0] = 'rack'; sys.exit(main())"
@@ -48,8 +48,9 @@ class RackCommand:
         argv = [*self.argv, *map(str, arguments)]
         done = finished(called, argv, bound_s, self.environment)
         if done.returncode:
-            why = last_line(done.stderr, f"exit status {done.returncode}")
-            raise Failure(f"{called}: {why}")
+            lines = [line for line in done.stderr.splitlines() if line.strip()]
+            said = lines or [f"exit status {done.returncode}"]
+            raise Failure(f"{called}: {said[-1]}")
         return done.stdout
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rack.tools.console.progress import Progress
-from rack.tools.console.tables import table
+from rack.tools.console.tables import Blocks, TextTable
 from rack.tools.lab.benches.apart import apart
 from rack.tools.lab.benches.chain import Chain
 from rack.tools.lab.benches.checkout import THIS, RackCommand, rack_commands
@@ -79,15 +79,17 @@ class CycleCosts(Comparison):
         parts = [{"case": case, "who": who, **one} for (case, who), one in self.parts.items()]
         return {**super().document(), "parts_unit": "us", "parts": parts}
 
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield both tables for people, fitted to `width`."""
+    def blocks(self) -> Blocks:
+        """Yield both tables for people."""
         yield "Parts of a board's cycle, processor time, us, median"
-        rows = [
-            [*place, *(shown(one[part]) for part in PARTS)] for place, one in self.parts.items()
-        ]
-        yield from table(["board", "who", *PARTS], rows, width)
+        yield TextTable(
+            [
+                {"board": board, "who": who, **{part: shown(one[part]) for part in PARTS}}
+                for (board, who), one in self.parts.items()
+            ]
+        )
         yield ""
-        yield from super().lines(width)
+        yield from super().blocks()
 
 
 def measure(

@@ -9,6 +9,7 @@ time.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +19,7 @@ import numpy as np
 
 from rack.backplane.process import set_priority
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import Absent, absent_program, finished
+from rack.tools.lab.benches.harness import Absent, finished
 
 CYCLICTEST = "cyclictest"
 LONGEST_US = 100_000
@@ -40,10 +41,11 @@ class WakeGrid(NamedTuple):
 
 def absent_cyclictest() -> tuple[Absent, ...]:
     """Return what `cyclictest` lacks; nothing if it can run."""
-    absent = absent_program(CYCLICTEST, CYCLICTEST, "rt-tests")
-    if absent or permits_fifo():
-        return absent
-    return (Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)"),)
+    if shutil.which(CYCLICTEST) is None:
+        return (Absent(CYCLICTEST, f"no program '{CYCLICTEST}'", "apt-get install rt-tests"),)
+    if not permits_fifo():
+        return (Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)"),)
+    return ()
 
 
 def permits_fifo() -> bool:

@@ -13,7 +13,6 @@ lacks is `Absent`: it is named, and the others are measured all the same.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ import numpy as np
 
 from rack.backplane.process import pin, set_priority
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.tables import decimal, print_blocks, table, terminal_width
+from rack.tools.console.tables import Blocks, Cell, TextTable, decimal, print_blocks
 
 if TYPE_CHECKING:
     from rack.tools.console.progress import Progress
@@ -36,6 +35,8 @@ EXTRA = "pip install 'nasrem-rack[lab]'"
 """Brings the peers that are Python packages."""
 END_S = 1.2
 """Longest wait for a program that was asked to end."""
+FIGURES = ("median", "p99", "best", "worst")
+"""Figures of a sample, in its unit."""
 _Name = TypeVar("_Name")
 _Result = TypeVar("_Result")
 
@@ -104,13 +105,6 @@ def absent_package(who: str, module: str) -> tuple[Absent, ...]:
     return ()
 
 
-def absent_program(who: str, program: str, debian: str) -> tuple[Absent, ...]:
-    """Return what a program of a Debian package lacks; nothing if it is on the path."""
-    if shutil.which(program):
-        return ()
-    return (Absent(who, f"no program '{program}'", f"apt-get install {debian}"),)
-
-
 def finished(
     called: str,
     argv: Sequence[str],
@@ -139,12 +133,6 @@ def finished(
         if process.poll() is None:
             _end(process)
     return subprocess.CompletedProcess(argv, process.returncode, out, err)
-
-
-def last_line(text: str, otherwise: str) -> str:
-    """Return the last line of what a program printed: the reason where it failed."""
-    lines = [line for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else otherwise
 
 
 @contextmanager
@@ -214,38 +202,29 @@ class Comparison:
         }
 
     def _figures(self, sample: Sample) -> dict[str, Any]:
-        names = ("case", "who", "unit", "count", "median", "p99", "best", "worst")
+        names = ("case", "who", "unit", "count", *FIGURES)
         ratios = {"ratio": self.ratio(sample), "p99_ratio": self.ratio(sample, "p99")}
         return {name: getattr(sample, name) for name in names} | ratios
 
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield the figures as a table for people, fitted to `width`, and the absent
-        contestants."""
+    def blocks(self) -> Blocks:
+        """Yield the figures as text for people: a table, the absent contestants, the conclusion."""
         yield self.title
-        head = [
-            "case",
-            "who",
-            "count",
-            "median",
-            "p99",
-            "best",
-            "worst",
-            "unit",
-            "ratio",
-            "p99 ratio",
+        rows: list[dict[str, Cell]] = [
+            {
+                "case": sample.case,
+                "who": sample.who,
+                "count": sample.count,
+                **{name: shown(getattr(sample, name)) for name in FIGURES},
+                "unit": sample.unit,
+                "ratio": decimal(self.ratio(sample), 2),
+                "p99 ratio": decimal(self.ratio(sample, "p99"), 2),
+            }
+            for sample in self.samples
         ]
-        rows = [self._row(sample) for sample in self.samples]
-        yield from table(head, rows, width, ("count", "worst", "p99 ratio", "best"))
-        for one in self.absent:
-            yield one.line
+        yield TextTable(rows, ("count", "worst", "p99 ratio", "best"))
+        yield from (one.line for one in self.absent)
         if self.conclusion:
             yield self.conclusion
-
-    def _row(self, sample: Sample) -> list[str]:
-        found = self._figures(sample)
-        figures = [shown(found[name]) for name in ("median", "p99", "best", "worst")]
-        ratios = [decimal(found[name], 2) for name in ("ratio", "p99_ratio")]
-        return [sample.case, sample.who, f"{sample.count}", *figures, sample.unit, *ratios]
 
 
 Found = TypeVar("Found", bound=Comparison)
@@ -260,7 +239,7 @@ def show(measure: Callable[[Progress], Found], as_json: bool) -> Found:
     if as_json:
         print_json(found.document())
     else:
-        print_blocks(found.lines(terminal_width()))
+        print_blocks(found.blocks())
     return found
 
 
@@ -269,33 +248,25 @@ def shown(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
-def turns(names: Sequence[_Name], rounds: int) -> Iterator[tuple[int, _Name]]:
-    """Yield round and contestant; every round has another order, the same in every run of the
-    bench."""
-    random = Random(rounds)
-    for turn in range(rounds):
-        for name in random.sample(list(names), len(names)):
-            yield turn, name
-
-
 def interleaved(
     contestants: Mapping[_Name, Callable[[], _Result]],
     rounds: int,
     progress: Progress | None = None,
     each_s: float = 0.0,
 ) -> dict[_Name, list[_Result]]:
-    """Call every contestant once a round, in changing order; return the results of each, oldest
-    first.
+    """Call every contestant once a round; return the results of each, oldest first.
 
-    Progress, if given, is told of each call, which takes about `each_s`.
+    Every round has another order, the same in every run of the bench. Progress, if given, is told
+    of each call, which takes about `each_s`.
     """
     found: dict[_Name, list[_Result]] = {name: [] for name in contestants}
-    for turn, name in turns(list(contestants), rounds):
-        if progress is not None:
-            words = name if isinstance(name, tuple) else (name,)
-            label = ", ".join(map(str, words))
-            progress.begin(f"{label}: round {turn + 1} of {rounds}")
-        found[name].append(contestants[name]())
-        if progress is not None:
-            progress.end(each_s)
+    random = Random(rounds)
+    for turn in range(1, rounds + 1):
+        for name in random.sample([*contestants], len(contestants)):
+            if progress is not None:
+                words = name if isinstance(name, tuple) else (name,)
+                progress.begin(f"{', '.join(map(str, words))}: round {turn} of {rounds}")
+            found[name].append(contestants[name]())
+            if progress is not None:
+                progress.end(each_s)
     return found

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
@@ -26,6 +27,7 @@ from rack.boards.config import RackConfig, load
 from rack.boards.config.layout import obtained_core
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
+from rack.tools.console.tables import Blocks
 from rack.tools.lab.benches.cyclictest import (
     CYCLICTEST,
     WakeGrid,
@@ -37,7 +39,6 @@ from rack.tools.lab.benches.cyclictest import (
 from rack.tools.lab.benches.harness import Absent, Comparison, Sample, interleaved, shown
 from rack.tools.lab.benches.observed import (
     UNVIEWED,
-    Runs,
     count_cycles,
     endless,
     lateness_us,
@@ -107,19 +108,17 @@ class RateFigures:
     failure: str = ""
 
     @property
-    def verdict(self) -> str:
-        """Whether the rate is held, and if not, why."""
-        if self.failure:
-            return f"not held: {self.failure}"
-        if (self.late or 0.0) > PERMITTED:
-            return "not held: the machine is late"
-        return "held" if self.is_held else "not held: the rack is late"
+    def reason(self) -> str:
+        """Why the rate is not held; empty if it is."""
+        late = self.late or 0.0
+        if self.failure or late > PERMITTED:
+            return self.failure or "the machine is late"
+        return "the rack is late" if self.missed - late > PERMITTED else ""
 
     @property
-    def is_held(self) -> bool:
-        """Whether the machine and the rack are in time, and no run ended early."""
-        late = self.late or 0.0
-        return not self.failure and late <= PERMITTED and self.missed - late <= PERMITTED
+    def verdict(self) -> str:
+        """Whether the rate is held, and if not, why."""
+        return f"not held: {self.reason}" if self.reason else "held"
 
 
 @dataclass(frozen=True)
@@ -134,12 +133,8 @@ class Machine(Comparison):
     @property
     def highest_hz(self) -> float | None:
         """The highest rate that is held, as all below it are; None if the lowest is not."""
-        highest = None
-        for one in self.rates:
-            if not one.is_held:
-                break
-            highest = one.rate_hz
-        return highest
+        held = takewhile(lambda one: not one.reason, self.rates)
+        return max((one.rate_hz for one in held), default=None)
 
     @property
     def is_fit(self) -> bool:
@@ -169,7 +164,7 @@ class Machine(Comparison):
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain data, without the raw values."""
-        rates = [{**asdict(one), "held": one.is_held} for one in self.rates]
+        rates = [{**asdict(one), "held": not one.reason} for one in self.rates]
         return {
             **super().document(),
             "fit": self.is_fit,
@@ -179,24 +174,33 @@ class Machine(Comparison):
             "rates": rates,
         }
 
-    def lines(self, width: int | None = None) -> Iterator[str]:
-        """Yield the verdict, then the lateness as a table, fitted to `width`."""
+    def blocks(self) -> Blocks:
+        """Yield the verdict, then the lateness as a table."""
         yield from self.verdict
         yield ""
-        yield from super().lines(width)
+        yield from super().blocks()
 
 
 def _case(rate_hz: float) -> str:
     return f"{rate_hz:g} Hz"
 
 
-def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress) -> Machine:
+def measure(
+    name: str,
+    rates_hz: Sequence[float],
+    seconds: float,
+    rounds: int,
+    share: bool,
+    progress: Progress,
+) -> Machine:
     """Run a rack at every rate, by turns with `cyclictest` on the core of its fastest board.
 
     Args:
         name: Config of the rack, by name or path.
         rates_hz: Rates of its fastest board.
-        runs: Length and number of runs, and whether cores may be shared with another rack.
+        seconds: Time of each run.
+        rounds: Number of runs of each contestant.
+        share: Whether cores may be shared with another rack.
         progress: Told of each rate.
 
     Raises:
@@ -212,23 +216,23 @@ def measure(name: str, rates_hz: Sequence[float], runs: Runs, progress: Progress
     with cores_kept_awake() as refusal:
         if refusal:
             absent.append(Absent(who + AWAKE, refusal))
-    each_s = runs.rounds * (3 * runs.seconds + 2 * LAUNCH_S)
+    each_s = rounds * (3 * seconds + 2 * LAUNCH_S)
     progress.total(len(racks) * each_s)
     rates = []
     samples = []
     for rate_hz, rack in racks.items():
         progress.begin(_case(rate_hz))
         priority = config.board[fastest].priority or 1
-        wakes = max(1, round(runs.seconds * rate_hz))
+        wakes = max(1, round(seconds * rate_hz))
         grid = WakeGrid(core, round(1e9 / rate_hz), wakes, priority)
         contestants: dict[str, Callable[[], RackRun]] = {
-            who: partial(_run, rack, fastest, runs, awake=False)
+            who: partial(_run, rack, fastest, seconds, share, awake=False)
         }
         if not refusal:
-            contestants[who + AWAKE] = partial(_run, rack, fastest, runs, awake=True)
+            contestants[who + AWAKE] = partial(_run, rack, fastest, seconds, share, awake=True)
         if is_compared:
             contestants[CYCLICTEST] = partial(_sleep, grid)
-        found = interleaved(contestants, runs.rounds)
+        found = interleaved(contestants, rounds)
         for one, each in found.items():
             late_us = np.concatenate([run.late_us for run in each])
             if len(late_us):
@@ -266,12 +270,12 @@ class RackRun(NamedTuple):
     failure: str = ""
 
 
-def _run(rack: RackConfig, board: str, runs: Runs, awake: bool) -> RackRun:
+def _run(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
     with (
         TemporaryDirectory(prefix="rack-bench-") as folder,
         cores_kept_awake() if awake else nullcontext(),
     ):
-        result, recording = record(rack, runs.seconds, Path(folder), runs.share)
+        result, recording = record(rack, seconds, Path(folder), share)
         late_us = lateness_us(recording, board)
         return RackRun(late_us, result.tasks[board], result.outcome.failure)
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from itertools import count, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -111,54 +112,37 @@ def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample
             peer.name: stack.enter_context(peer.opened(dtype, case.readers)) for peer in peers
         }
         turns = {
-            name: Exchange(name, transport, case.lengths).batch()
-            for name, transport in transports.items()
+            name: exchange(name, transport, case.lengths) for name, transport in transports.items()
         }
         found = interleaved(turns, rounds)
     return [Sample(case.name, name, tuple(values), "us") for name, values in found.items()]
 
 
-class Exchange:
-    """One message after another through a transport. Raises `Failure` if a reader receives another
-    message."""
+def exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callable[[], float]:
+    """Return a function that makes many exchanges through a transport, and returns the us that each
+    took. Raises `Failure` if a reader receives another message than the one sent."""
+    message, send, readers = transport
+    for key, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
+        setattr(message, key, np.linspace(-9.0, 9.0, lengths[length]))
+    ticks = count(1)
 
-    def __init__(self, name: str, transport: Transport, lengths: dict[str, int]) -> None:
-        self._name = name
-        self._transport = transport
-        self._tick = 0
-        message, _, _ = transport
-        for name, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
-            setattr(message, name, np.linspace(-9.0, 9.0, lengths[length]))
-
-    def batch(self) -> Callable[[], float]:
-        """Return a function that makes many exchanges, and returns the us that each took."""
-        self._measure(20)
-        self._check()
-        calls = max(10, int(BATCH_S * 1e6 / self._measure(20)))
-        return partial(self._measure, calls)
-
-    def _measure(self, calls: int) -> float:
-        message, send, readers = self._transport
+    def measure_us(calls: int) -> float:
         start_ns = time.perf_counter_ns()
-        for tick in range(self._tick + 1, self._tick + calls + 1):
+        for tick in islice(ticks, calls):
             message.id = tick
             send(tick)
             for read in readers:
                 read(tick)
-        taken_ns = time.perf_counter_ns() - start_ns
-        self._tick += calls
-        return taken_ns / calls * 1e-3
+        return (time.perf_counter_ns() - start_ns) / calls * 1e-3
 
-    def _check(self) -> None:
-        """Exchange one message more, and compare what every reader receives with what was sent."""
-        message, send, readers = self._transport
-        self._tick += 1
-        message.id = self._tick
-        message.torque[:] = self._tick
-        sent = bytes(message.raw)
-        send(self._tick)
-        if any(bytes(read(self._tick).raw) != sent for read in readers):
-            raise Failure(f"{self._name}: a reader received another message than the one sent")
+    measure_us(20)
+    message.id = tick = next(ticks)
+    message.torque[:] = tick
+    sent = bytes(message.raw)
+    send(tick)
+    if any(bytes(read(tick).raw) != sent for read in readers):
+        raise Failure(f"{name}: a reader received another message than the one sent")
+    return partial(measure_us, max(10, int(BATCH_S * 1e6 / measure_us(20))))
 
 
 @contextmanager

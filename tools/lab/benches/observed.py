@@ -18,15 +18,6 @@ SETTLE_NS = 250_000_000
 """Start of a run, in which caches are cold: no peer is measured in its own."""
 
 
-class Runs(NamedTuple):
-    """How a bench runs its contestants: how long, in how many turns, and whether on cores that
-    another rack holds."""
-
-    seconds: float
-    rounds: int
-    share: bool = False
-
-
 class Recorded(NamedTuple):
     """How a run went, and its recording."""
 

@@ -8,14 +8,10 @@ from functools import partial
 
 from rack.tools.lab.reproduction import predictions, rules
 from rack.tools.lab.reproduction.experiments import (
-    deadline,
-    determinism,
-    losses,
     partition,
     response,
     sharing,
     switch,
-    tables,
     tasks,
 )
 from rack.tools.lab.reproduction.experiments.figures import (
@@ -31,7 +27,15 @@ from rack.tools.lab.reproduction.experiments.figures import (
     SHORT_3,
     settings_of,
 )
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NASREM, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    DEADLINE,
+    DETERMINISM,
+    KILLS,
+    NAME,
+    NASREM,
+    SENSORS,
+    NasremRun,
+)
 from rack.tools.lab.reproduction.page import PaperClaim, Section
 from rack.tools.lab.reproduction.verdict import ClaimVerdict
 
@@ -70,7 +74,7 @@ def _system(
     return PaperClaim(name, title, quote, why, experiments, partial(judge, rates_hz))
 
 
-SYSTEMS = (NAME, tables.NAME, *tasks.TASKS)
+SYSTEMS = (NAME, tasks.STATE_TABLES, *tasks.TASKS)
 """The racks that model systems."""
 HURRIED = ("timing.response_ms=1000",)
 """A response within 1 s is demanded of NASREM's four levels."""
@@ -84,7 +88,7 @@ SECTIONS = (
                 "Determinism is the measure",
                 "Determinism, not performance, is the key element in assessing a control model.",
                 "Two runs in lockstep and one in real time wrote the same messages, bit for bit.",
-                (determinism.DETERMINISM,),
+                (DETERMINISM,),
                 rules.judge_determinism,
             ),
         ),
@@ -174,7 +178,7 @@ SECTIONS = (
                 "A dead board or sensor does not stall the system",
                 "A level awaiting a reading from a failed sensor could loop forever.",
                 "Every loss was detected and over within its bounds, and the tasks were done.",
-                (losses.KILLS, losses.SENSORS),
+                (KILLS, SENSORS),
                 rules.judge_losses,
             ),
             PaperClaim(
@@ -198,7 +202,7 @@ SECTIONS = (
                 "GOTO A BY t_i, GOTO B BY t_i+1 ... demands real time handling.",
                 "A time that is too early is refused before anything moves; one that is promised"
                 " is met.",
-                (deadline.DEADLINE,),
+                (DEADLINE,),
                 rules.judge_goto,
             ),
         ),
@@ -408,7 +412,7 @@ SECTIONS = (
                 "The earlier controller: executors and state tables",
                 "The flow of control featured state-table transitions.",
                 "The task was done with and without a disturbance; own transitions answered it.",
-                (tables.TABLES,),
+                (tasks.TABLES,),
                 rules.judge_tables,
             ),
             PaperClaim(
@@ -457,7 +461,7 @@ SECTIONS = (
                 "These architectures share common characteristics with the concurrent,"
                 " hierarchical control model.",
                 "All systems do their tasks on one set of mechanisms, within their bounds.",
-                (NASREM, tables.TABLES, *tasks.TASKS.values()),
+                (NASREM, tasks.TABLES, *tasks.TASKS.values()),
                 partial(rules.judge_systems, SYSTEMS),
             ),
             PaperClaim(

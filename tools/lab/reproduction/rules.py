@@ -7,14 +7,6 @@ from math import ceil, inf
 
 from rack.boards.config import load, rack_timing, wire
 from rack.levels.timing.verdicts import EquationVerdict
-from rack.tools.lab.reproduction.experiments import (
-    deadline,
-    determinism,
-    losses,
-    partition,
-    response,
-    tables,
-)
 from rack.tools.lab.reproduction.experiments.figures import (
     FIG2,
     LEAST_X,
@@ -25,10 +17,18 @@ from rack.tools.lab.reproduction.experiments.figures import (
     FigureRun,
     settings_of,
 )
-from rack.tools.lab.reproduction.experiments.nasrem import NAME, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    NAME,
+    ComparedRun,
+    GotoRuns,
+    LossesRun,
+    NasremRun,
+)
+from rack.tools.lab.reproduction.experiments.partition import Partition, PartitionFigures
+from rack.tools.lab.reproduction.experiments.response import ResponseRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
-from rack.tools.lab.reproduction.experiments.tasks import LATER_MS, NetworkRun, TaskRun
+from rack.tools.lab.reproduction.experiments.tasks import LATER_MS, NetworkRun, TableRuns, TaskRun
 from rack.tools.lab.reproduction.verdict import (
     STRAY,
     Check,
@@ -66,11 +66,11 @@ def check_done(*runs: TaskRun) -> list[Check]:
     return check_none(tasks_not_done=sum(run.ended != DONE for run in runs))
 
 
-def judge_determinism(found: determinism.ComparedRuns) -> ClaimVerdict:
+def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
     """Compare digests, and where runs diverge with where they first missed a deadline."""
-    digest = found.runs[0].digest
-    lockstep = [run for run in found.runs if run.mode == "lockstep"]
-    real = [run for run in found.runs if run.mode == "realtime"]
+    digest = runs[0].digest
+    lockstep = [run for run in runs if run.mode == "lockstep"]
+    real = [run for run in runs if run.mode == "realtime"]
     early = sum(
         run.difference is not None
         and (run.first_miss is None or run.first_miss > run.difference.tick)
@@ -127,12 +127,12 @@ def judge_replication() -> ClaimVerdict:
     return rule_on(needs=[compare("replicas", 0, ">=", 1)])
 
 
-def judge_communication(found: NasremRun, partitions: partition.Partitions) -> ClaimVerdict:
+def judge_communication(found: NasremRun, partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
     """Compare the processor time of communication with what a second processor takes off one, ms a
     second."""
     communication = sum(task.communication_us / task.slice_ms for task in found.executors.values())
-    loads = {one.partition: one.loads.values() for one in partitions.partitions}
-    one, two = (loads[partition.Partition("tight", cores)] for cores in (1, 2))
+    loads = {one.partition: one.loads.values() for one in partitions}
+    one, two = (loads[Partition("tight", cores)] for cores in (1, 2))
     saved = 1e3 * (sum(one) - max(two))
     return rule_on(compare("communication_ms_per_s", communication, "<", saved))
 
@@ -156,7 +156,7 @@ def judge_loop(found: NasremRun) -> ClaimVerdict:
     return rule_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
-def judge_losses(*runs: losses.LossesRun) -> ClaimVerdict:
+def judge_losses(*runs: LossesRun) -> ClaimVerdict:
     """Compare when each loss was detected and over with its bounds."""
     faults = [fault for run in runs for fault in run.faults]
     lacking = check_none(
@@ -168,7 +168,7 @@ def judge_losses(*runs: losses.LossesRun) -> ClaimVerdict:
     return rule_on(compare("losses", struck, "=", len(faults)), *lacking)
 
 
-def judge_goto(found: deadline.GotoRuns) -> ClaimVerdict:
+def judge_goto(found: GotoRuns) -> ClaimVerdict:
     """Compare when A was done with the time by which it was promised, s."""
     early, met = found.early, found.met
     begun = early.moved + (early.done_s is not None)
@@ -312,7 +312,7 @@ def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
     )
 
 
-def judge_tables(found: tables.TableRuns) -> ClaimVerdict:
+def judge_tables(found: TableRuns) -> ClaimVerdict:
     """Compare the state transitions of runs with and without a disturbance."""
     answering = {*found.disturbed.rows} - {*found.undisturbed.rows}
     return rule_on(
@@ -347,7 +347,7 @@ def judge_switch(found: SwitchRun) -> ClaimVerdict:
     )
 
 
-def judge_figure_5(found: partition.Partitions) -> ClaimVerdict:
+def judge_figure_5(found: Sequence[PartitionFigures]) -> ClaimVerdict:
     """Compare what levels miss by partition: do slow levels do with multitasking, and do fast ones
     need more?"""
     is_slow = {
@@ -356,7 +356,7 @@ def judge_figure_5(found: partition.Partitions) -> ClaimVerdict:
     }
     tasks = [
         ("slow" if is_slow.get(task.board) else one.partition.coupling, task)
-        for one in found.partitions
+        for one in found
         for task in one.tasks
     ]
 
@@ -374,10 +374,10 @@ def judge_figure_5(found: partition.Partitions) -> ClaimVerdict:
     )
 
 
-def judge_systems(names: Iterable[str], *found: TaskRun | tables.TableRuns) -> ClaimVerdict:
+def judge_systems(names: Iterable[str], *found: TaskRun | TableRuns) -> ClaimVerdict:
     """Compare the responses in whole tasks of these systems with their bounds, ms; a missed cycle
     may prolong them."""
-    runs = [run.disturbed if isinstance(run, tables.TableRuns) else run for run in found]
+    runs = [run.disturbed if isinstance(run, TableRuns) else run for run in found]
     ways = {
         f"{name}_{way}_ms": response
         for name, run in zip(names, runs, strict=True)
@@ -436,7 +436,7 @@ def judge_rccl(rates_hz: Mapping[str, int], found: TaskRun) -> ClaimVerdict:
     return judge_links(rates_hz, found, [cores])
 
 
-def judge_predictable(found: response.ResponseRun) -> ClaimVerdict:
+def judge_predictable(found: ResponseRun) -> ClaimVerdict:
     """Compare responses with the tick predicted, and with equations 3.2 and 3.3; within bounds,
     with the longest that the grid permits instead of the sum of eq. 3.3."""
     real = found.realtime

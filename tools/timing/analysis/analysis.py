@@ -3,6 +3,7 @@ measured."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import TaskSpec
-from rack.boards.config import RackConfig, rack_timing
+from rack.boards.config import rack_timing
 from rack.boards.config.timing import without_interrupts
 from rack.levels.timing import trace_times
 from rack.levels.timing.rack import RackTiming
@@ -57,18 +58,15 @@ class Analysis:
     """A run compared with the timing model.
 
     `predicted` is the rack with the budgets of its config, `measured` the rack with those of the
-    run. `cycles` are by task, `loads` by core, as parts of its time; `response` is that of the
-    system, None without a hierarchy. `pairs` are of the `percentile`, `mostly` of the longest of
-    `MOSTLY` in 100 cycles: a level that does not fit fails in most of its cycles, a machine that
-    stalls now and then does not.
+    run. `cycles` are by task, `loads` by core, as parts of its time. `pairs` are of the
+    `percentile`, `mostly` of the longest of `MOSTLY` in 100 cycles: a level that does not fit fails
+    in most of its cycles, a machine that stalls now and then does not.
     """
 
     recording: Recording
-    config: RackConfig
     percentile: float
     cycles: Mapping[str, Cycles]
     loads: Mapping[int, float]
-    response: Mapping[str, Any] | None
     predicted: RackTiming
     measured: RackTiming
     pairs: tuple[Pair, ...]
@@ -93,33 +91,24 @@ class Analysis:
         progress(0.4)
         predicted = rack_timing(config, layout)
         loads = core_loads(recording, cycles, predicted)
+        meaning = "time used by its tasks"
+        used = [
+            EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
+            for core, load in loads.items()
+        ]
         response = system_response(recording)
 
-        def measured(percent: float) -> RackTiming:
-            return rack_timing(
-                config, layout, without_interrupts(predicted, budgets_of(cycles, percent))
-            )
-
-        def pairs(percent: float) -> tuple[Pair, ...]:
-            rack = measured(percent)
-            directly = [*_system(response, rack), *_tasks(cycles, rack, percent), *_cores(loads)]
+        def judged(percent: float) -> tuple[RackTiming, tuple[Pair, ...]]:
+            budgets = without_interrupts(predicted, budgets_of(cycles, percent))
+            rack = rack_timing(config, layout, budgets)
+            directly = [*_system(response, rack), *_tasks(cycles, rack, percent), *used]
             derived = [verdict for verdict in verdicts(rack) if verdict.equation not in OBSERVED]
-            return tuple(_paired(verdicts(predicted), [*derived, *directly]))
+            return rack, tuple(_paired(verdicts(predicted), [*derived, *directly]))
 
-        found = pairs(percentile)
+        measured, pairs = judged(percentile)
         progress(0.7)
-        return cls(
-            recording=recording,
-            config=config,
-            percentile=percentile,
-            cycles=cycles,
-            loads=loads,
-            response=response,
-            predicted=predicted,
-            measured=measured(percentile),
-            pairs=found,
-            mostly=pairs(min(percentile, MOSTLY)),
-        )
+        _, mostly = judged(min(percentile, MOSTLY))
+        return cls(recording, percentile, cycles, loads, predicted, measured, pairs, mostly)
 
     @property
     def holds(self) -> bool:
@@ -173,37 +162,29 @@ def _tasks(
     found: Mapping[str, Cycles], rack: RackTiming, percentile: float
 ) -> Iterator[EquationVerdict]:
     for name, cycles in found.items():
+        rows = cycles.rows
         if cycles.task.role == "executor":
-            step = worst_of(_steps_ns(cycles, rack)[cycles.is_judged], percentile)
             every_ns = cycle_ns(rack, cycles.task)
-            yield EquationVerdict("3.7", name, step, "=", every_ns, "t_(k+1) - t_k = R_i")
+            # By the releases skipped as traced: a restart, or a row lost by the recorder, is not a
+            # skipped release.
+            steps_ns = (1 + trace_times.skipped(rows)) * every_ns
+            step_ns = worst_of(steps_ns[cycles.is_judged], percentile)
+            yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
-            worst = worst_of(_response_ns(cycles, rack)[cycles.is_judged], percentile)
             deadline_ns = slice_ns(rack, cycles.task)
+            # A cycle whose message came too late, as its trace says, has missed its deadline
+            # whenever it ended.
+            least_ns = np.where(trace_times.is_missed(rows), deadline_ns + 1, 0)
+            response_ns = np.maximum(trace_times.response_ns(rows), least_ns)
+            worst_ns = worst_of(response_ns[cycles.is_judged], percentile)
             meaning = "measured response <= deadline"
-            yield EquationVerdict(RESPONSE_TIME, name, worst, "<=", deadline_ns, meaning)
-
-
-def _cores(loads: Mapping[int, float]) -> Iterator[EquationVerdict]:
-    for core, load in loads.items():
-        meaning = "time used by its tasks"
-        yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
+            yield EquationVerdict(RESPONSE_TIME, name, worst_ns, "<=", deadline_ns, meaning)
 
 
 def core_loads(
     recording: Recording, found: Mapping[str, Cycles], rack: RackTiming
 ) -> dict[int, float]:
-    """Return by core the part of its time that tasks used, as `task_loads`."""
-    loads: dict[int, float] = {}
-    for name, load in task_loads(recording, found, rack).items():
-        loads[found[name].core] = loads.get(found[name].core, 0.0) + load
-    return dict(sorted(loads.items()))
-
-
-def task_loads(
-    recording: Recording, found: Mapping[str, Cycles], rack: RackTiming
-) -> dict[str, float]:
-    """Return by task the part of its core's time that it used, without the clock's own.
+    """Return by core the part of its time that tasks used, without the clock's own.
 
     An executor counts at all its releases, skipped ones too: so the load of an overloaded core
     exceeds 1.
@@ -211,14 +192,14 @@ def task_loads(
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())
     lasted_ns = (last - first + 1) * rack.tick_ns
-    loads: dict[str, float] = {}
+    loads: defaultdict[int, float] = defaultdict(float)
     for name, cycles in found.items():
         used_ns = recording.cycles[name]["processor_ns"]
         if cycles.task.role == "executor":
-            loads[name] = float(used_ns.mean()) / cycle_ns(rack, cycles.task)
+            loads[cycles.core] += float(used_ns.mean()) / cycle_ns(rack, cycles.task)
         else:
-            loads[name] = int(used_ns.sum()) / lasted_ns
-    return loads
+            loads[cycles.core] += int(used_ns.sum()) / lasted_ns
+    return dict(sorted(loads.items()))
 
 
 def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
@@ -229,23 +210,3 @@ def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
 def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
     """Return the time available to one cycle of a task; d R_i, the time slice, of a planner."""
     return task.slice * rack.tick_ns
-
-
-def _response_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
-    """Return the time from the release to the end of each cycle, shape (n,).
-
-    A cycle whose message came too late, as its trace says, has missed its deadline whenever it
-    ended.
-    """
-    least = np.where(trace_times.is_missed(cycles.rows), slice_ns(rack, cycles.task) + 1, 0)
-    return np.asarray(np.maximum(trace_times.response_ns(cycles.rows), least))
-
-
-def _steps_ns(cycles: Cycles, rack: RackTiming) -> np.ndarray:
-    """Return the time from the previous release to that of each cycle, t_(k+1) - t_k of eq. 3.7,
-    shape (n,).
-
-    It follows from the releases skipped as traced: a restart, or a row lost by the recorder, is not
-    a skipped release.
-    """
-    return np.asarray((1 + trace_times.skipped(cycles.rows)) * cycle_ns(rack, cycles.task))

@@ -3,12 +3,12 @@ its text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
-from rack.backplane.message import state_name
+from rack.backplane.message import printable, state_name
 from rack.boards.config import RackConfig
 from rack.levels.messages import ArmState, Scene, TaskStatus
 from rack.tools.console.answer import Document
@@ -33,22 +33,20 @@ LEAST_M = 0.005
 along."""
 
 
+Signals = Callable[[str], np.ndarray]
+"""Returns a field of all messages of a mailbox, by its name."""
+
+
 def task_outcome(recording: Recording) -> Document | None:
     """Return the last status of the level that reports on the whole task."""
-    mailbox = _mailbox_of(recording, TaskStatus.message_type.name)
-    if mailbox is None:
+    status = signals_of(recording, TaskStatus.message_type.name)
+    if status is None:
         return None
-
-    def last(field: str) -> Any:
-        return recording.signal(mailbox, field)[-1]
-
-    counts = {
-        name: int(last(name)) for name in ("action", "actions", "moves_done", "moves", "error")
-    }
+    counts = ("action", "actions", "moves_done", "moves", "error")
     return {
-        "state": state_name(int(last("state"))),
-        "reason": recording.reason(mailbox, -1),
-        **counts,
+        "state": state_name(int(status("state")[-1])),
+        "reason": printable(str(status("reason")[-1])),
+        **{name: int(status(name)[-1]) for name in counts},
     }
 
 
@@ -62,13 +60,13 @@ def objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
 def _drops(recording: Recording, row: int) -> Iterator[Document]:
     """Yield tick and height, mm, of each fall of an object: it goes down quickly, and not with the
     tool."""
-    mailbox = _mailbox_of(recording, Scene.message_type.name)
-    if mailbox is None:
+    scene = signals_of(recording, Scene.message_type.name)
+    if scene is None:
         return
-    ticks = recording.signal(mailbox, "tick")
-    place = recording.signal(mailbox, "position")[:, row]
+    ticks = scene("tick")
+    place = scene("position")[:, row]
     # What moves and turns with the tool keeps its distance from it.
-    away = np.linalg.norm(place - recording.signal(mailbox, "tool_position"), axis=1)
+    away = np.linalg.norm(place - scene("tool_position"), axis=1)
     height = place[:, 2]
     least = FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
     falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(away))) > least)
@@ -82,41 +80,34 @@ def _drops(recording: Recording, row: int) -> Iterator[Document]:
 def motion(recording: Recording) -> Document | None:
     """Return tracking error, mrad, where a status tells it, and the counts of touches, exceeded
     limits and refused or cut commands, or None."""
-    mailbox = _mailbox_of(recording, *DRIVING)
-    counts = _counts(recording, mailbox)
-    if not counts or _mailbox_of(recording, HAND_STATUS) is not None:
+    status = signals_of(recording, *DRIVING)
+    counts = _counts(recording, status)
+    if not counts or signals_of(recording, HAND_STATUS) is not None:
         return None
-    if mailbox is None:
-        return {"tracking_rms_mrad": None, "tracking_peak_mrad": None, **counts}
-    error = (recording.signal(mailbox, "position") - recording.signal(mailbox, "target")) * 1e3
-    return {
-        "tracking_rms_mrad": _rms(error),
-        "tracking_peak_mrad": rounded(np.abs(error).max()),
-        **counts,
-    }
+    tracking: Document = dict.fromkeys(("tracking_rms_mrad", "tracking_peak_mrad"))
+    if status is not None:
+        error = (status("position") - status("target")) * 1e3
+        tracking = dict(zip(tracking, _rms_and_peak(error), strict=True))
+    return tracking | counts
 
 
-def _counts(recording: Recording, status: str | None) -> Document:
+def _counts(recording: Recording, status: Signals | None) -> Document:
     """Return what an arm or a hand has counted, by its state, and what the board that drives it has
-    cut besides, by the mailbox of its status; nothing without either."""
-    names = {name: name for name in ("touches", "violations", "pushed")} | {
-        "clipped_cycles": "clipped"
-    }
-    boxes = [
-        box
-        for box in (status, _mailbox_of(recording, ArmState.message_type.name))
-        if box is not None
-    ]
-    if not boxes:
+    cut besides, by its status; nothing without either."""
+    state = signals_of(recording, ArmState.message_type.name)
+    if not (known := [found for found in (status, state) if found is not None]):
         return {}
-    return {
-        key: max(int(recording.signal(box, name)[-1]) for box in boxes)
-        for key, name in names.items()
+    fields = {
+        "touches": "touches",
+        "violations": "violations",
+        "pushed": "pushed",
+        "clipped_cycles": "clipped",
     }
+    return {key: max(int(found(name)[-1]) for found in known) for key, name in fields.items()}
 
 
-def _rms(error: np.ndarray) -> float:
-    return rounded(np.sqrt(np.mean(error**2)))
+def _rms_and_peak(error: np.ndarray) -> tuple[float, float]:
+    return rounded(np.sqrt(np.mean(error**2))), rounded(np.abs(error).max())
 
 
 def rounded(value: float) -> float:
@@ -127,54 +118,51 @@ def rounded(value: float) -> float:
 def hand(recording: Recording, config: RackConfig) -> Document | None:
     """Return a hand's tensions as far as commanded, N, its forces by finger, N, and its counts, or
     None."""
-    mailbox = _mailbox_of(recording, HAND_STATUS)
-    if mailbox is None or config.robot is None or config.robot.hand is None:
+    status = signals_of(recording, HAND_STATUS)
+    if status is None or config.robot is None or config.robot.hand is None:
         return None
-    tension = recording.signal(mailbox, "tension")
-    forces = recording.signal(mailbox, "force")
-    error = tension - recording.signal(mailbox, "wanted")
-    most = np.linalg.norm(forces, axis=2).max(axis=0)
+    tension = status("tension")
+    rms_n, peak_n = _rms_and_peak(tension - status("wanted"))
+    most = np.linalg.norm(status("force"), axis=2).max(axis=0)
     fingers = [finger.name for finger in config.robot.hand.finger]
     return {
-        "tension_rms_n": _rms(error),
-        "tension_peak_n": rounded(np.abs(error).max()),
+        "tension_rms_n": rms_n,
+        "tension_peak_n": peak_n,
         "least_tension_n": rounded(tension.min()),
         "largest_tension_n": rounded(tension.max()),
-        "largest_force_n": {
-            finger: rounded(value) for finger, value in zip(fingers, most, strict=True)
-        },
-        "closed_cycles": int(np.count_nonzero(recording.signal(mailbox, "stopped"))),
-        **_counts(recording, mailbox),
+        "largest_force_n": dict(zip(fingers, map(rounded, most), strict=True)),
+        "closed_cycles": int(np.count_nonzero(status("stopped"))),
+        **_counts(recording, status),
     }
 
 
 def force(recording: Recording) -> Document | None:
     """Return what an arm's wrist has felt, N and N m, and how far forces were from those wanted, N,
     or None."""
-    wrench = _mailbox_of(recording, WRENCH)
-    status = _mailbox_of(recording, FORCE_STATUS)
+    wrench = signals_of(recording, WRENCH)
+    status = signals_of(recording, FORCE_STATUS)
     if wrench is None:
         return None
-    halves = recording.signal(wrench, "wrench").reshape(-1, 2, 3)
+    halves = wrench("wrench").reshape(-1, 2, 3)
     most_n, most_nm = np.linalg.norm(halves, axis=2).max(axis=0)
     error = np.zeros(0)
     if status is not None:
         # The tool exerts the opposite of what it feels.
-        off = recording.signal(status, "wanted") + recording.signal(status, "wrench")
-        error = off[:, :3][recording.signal(status, "selected")[:, :3] == 1]
+        off = status("wanted") + status("wrench")
+        error = off[:, :3][status("selected")[:, :3] == 1]
     return {
         "largest_force_n": rounded(most_n),
         "largest_torque_nm": rounded(most_nm),
-        "exceeded_cycles": int(recording.signal(wrench, "exceeded")[-1]),
-        "force_rms_n": _rms(error) if len(error) else None,
+        "exceeded_cycles": int(wrench("exceeded")[-1]),
+        "force_rms_n": _rms_and_peak(error)[0] if len(error) else None,
     }
 
 
-def _mailbox_of(recording: Recording, *messages: str) -> str | None:
-    """Return the first mailbox with messages of one of these types; None when it is empty, or there
-    is none."""
+def signals_of(recording: Recording, *messages: str) -> Signals | None:
+    """Return the signals of the first mailbox with messages of one of these types; None when it is
+    empty, or there is none."""
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
-    return name if name in recording.mailboxes else None
+    return partial(recording.signal, name) if name in recording.mailboxes else None
 
 
 def outcome_text(report: RunReport) -> Iterator[str]:

@@ -43,12 +43,12 @@ class Repetition:
 
 
 class _Again(NamedTuple):
-    """A repeated cycle: the attributes of its level before it, serial and chain of what it wrote,
-    and the mailboxes that are not as recorded."""
+    """A repeated cycle: the attributes of its level before it, the mailboxes that are not as
+    recorded, and whether it wrote the same each time."""
 
     attributes: Mapping[str, Any]
-    wrote: tuple[int, int]
     unlike: tuple[str, ...]
+    is_equal: bool
 
 
 def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
@@ -60,10 +60,9 @@ def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
             raise Failure(f"{run.folder} ran in real time")
     until = found.unlike[cycle.mailbox].visible_at + 1
     with INTERRUPT.raising(), as_failure():
-        repeats = {run: _again(run, cycle, until) for run in found.runs}
-    again = {run: what for run, (what, _) in repeats.items()}
+        again = {run: _again(run, cycle, until) for run in found.runs}
     others = [run for run in found.runs if cycle.mailbox in again[run].unlike]
-    is_chance = not all(repeats[run][1] for run in others)
+    is_chance = not all(again[run].is_equal for run in others)
     layout = found.runs[0].layout
     strays = {
         str(run.folder): tuple(
@@ -80,15 +79,15 @@ def repeated(found: Divergence, cycle: UnlikeCycle) -> Repetition:
     )
 
 
-def _again(run: Recording, cycle: UnlikeCycle, until: int) -> tuple[_Again, bool]:
-    """Repeat a cycle of a run until what it writes is visible; return what it did, and whether it
-    does that each time."""
+def _again(run: Recording, cycle: UnlikeCycle, until: int) -> _Again:
+    """Repeat a cycle of a run until what it writes is visible."""
     with RunAgain(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
         attributes = again.levels(cycle.tick)[cycle.writer]
         found = []
         for _ in range(TIMES):
             with again.rack_at(until) as rack:
+                # Serial and chain of what it wrote.
                 wrote = chains(rack.segment, until)[cycle.mailbox]
-                unlike = tuple(unlike_in(run, rack.segment, until))
-                found.append(_Again(attributes, wrote, unlike))
-    return found[0], len({one.wrote for one in found}) == 1
+                found.append((wrote, tuple(unlike_in(run, rack.segment, until))))
+    wrote, unlike = found[0]
+    return _Again(attributes, unlike, all(one == wrote for one, _ in found))

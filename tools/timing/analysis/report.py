@@ -201,9 +201,7 @@ def _entries(recording: Recording) -> list[Document]:
     for mailbox, entry, source in entries_of(recording.layout, recording.config):
         if mailbox in recording.mailboxes:
             ages = recording.signal(mailbox, f"{entry}.age")
-            counts = {
-                name: int(recording.signal(mailbox, f"{entry}.{name}")[-1]) for name in ENTRY_COUNTS
-            }
+            counts = {name: _last(recording, mailbox, f"{entry}.{name}") for name in ENTRY_COUNTS}
             name = f"{mailbox.partition('.')[0]}.{entry}"
             ages_ms = distribution(ages[ages >= 0] * tick_ms)
             found.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
@@ -216,37 +214,38 @@ def network(recording: Recording) -> Document | None:
     entries = exchanged(recording.config)
     if entries is None or STATUS not in recording.mailboxes:
         return None
-
-    def last(field: str) -> int:
-        return int(recording.signal(STATUS, field)[-1])
-
     imports = []
     for port, source in entries.imports.items():
         ages_s = recording.signal(STATUS, f"import_{port}.age_s")
-        counts = {name: last(f"import_{port}.{name}") for name in COUNTS}
+        counts = {name: _last(recording, STATUS, f"import_{port}.{name}") for name in COUNTS}
         # In every cycle of the adapter, not of each message: between two it grows.
         ages = distribution(ages_s[ages_s >= 0.0] * 1e3)
         imports.append({"entry": f"{BOARD}.{port}", "source": source, **counts, "age_ms": ages})
     exports = [
-        {"entry": f"{BOARD}.{port}", "source": source, "sent": last(f"export_{port}.sent")}
+        {
+            "entry": f"{BOARD}.{port}",
+            "source": source,
+            "sent": _last(recording, STATUS, f"export_{port}.sent"),
+        }
         for port, source in entries.exports.items()
     ]
-    return {
-        "imports": imports,
-        "exports": exports,
-        "peers": [_peer(recording, rack) for rack in entries.peers],
-    }
+    peers = [_peer(recording, rack) for rack in entries.peers]
+    return {"imports": imports, "exports": exports, "peers": peers}
 
 
 def _peer(recording: Recording, rack: str) -> Document:
     mailbox = f"{BOARD}.{peer_port(rack)}"
     presence = recording.signal(mailbox, "presence")
     cycle_s = recording.layout.task(BOARD).every * recording.layout.clock_ns * 1e-9
-    launches = int(recording.signal(mailbox, "launches")[-1])
     return {
         "peer": rack,
         "state": Presence(int(presence[-1])).name.lower(),
-        "losses": int(recording.signal(mailbox, "losses")[-1]),
-        "restarts": max(0, launches - 1),
+        "losses": _last(recording, mailbox, "losses"),
+        "restarts": max(0, _last(recording, mailbox, "launches") - 1),
         "lost_s": round(float((presence == Presence.LOST).sum() * cycle_s), 6),
     }
+
+
+def _last(recording: Recording, mailbox: str, count: str) -> int:
+    """Return a count in the last message of a mailbox."""
+    return int(recording.signal(mailbox, count)[-1])

@@ -66,15 +66,17 @@ def report_blocks(document: Document) -> Blocks:
     yield from _queues(report.queues)
     yield from _interrupts(report.interrupts)
     if report.holds:
-        yield from _holds(report)
+        yield from _holds(report.rack, report.holds)
     if report.state_tables:
-        yield from _state_tables(report.state_tables)
+        yield from ("", "## State tables", "", _state_tables(report.state_tables))
     yield from times_text(report)
     yield from _faults(report)
     if report.misses:
         yield from _misses(report)
-    if report.system_response:
-        yield from _responses(report.system_response)
+    if (response := report.system_response) is not None:
+        yield from ("", "## System response, ms of simulated time")
+        for found in (response, *response["others"]):
+            yield from _response_along(found)
     if report.entries:
         yield from ("", "## Bus adapters, ages in ms of simulated time", "")
         yield _passed(report.entries, ("superseded", "waiting", "source"))
@@ -103,10 +105,8 @@ def _the_most(rows: Sequence[Any], which: str) -> str:
     return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
 
 
-def _holds(report: RunReport) -> Blocks:
-    holds = report.holds
+def _holds(rack: str, holds: Sequence[Document]) -> Blocks:
     yield from ("", f"## Holds: {len(holds)}{_the_most(holds, 'longest')}", "")
-    longest = sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
     rows = [
         {
             "level": hold["level"],
@@ -115,25 +115,21 @@ def _holds(report: RunReport) -> Blocks:
             "until, s": "the end" if hold["until_s"] is None else decimal(hold["until_s"], 2),
             "lasted, s": decimal(hold["lasted_s"], 2),
         }
-        for hold in longest
+        for hold in sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
     ]
     yield TextTable(rows)
-    for level in (
-        hold["level"] for hold in holds if hold["until_s"] is None and hold["by"] == "operator"
-    ):
-        yield from (
-            "",
-            (
-                f"Still held at the end: {level}; `{resume_command(report.rack, level)}`"
-                " releases it."
-            ),
-        )
+    for hold in holds:
+        if hold["until_s"] is None and hold["by"] == "operator":
+            level = hold["level"]
+            yield from (
+                "",
+                f"Still held at the end: {level}; `{resume_command(rack, level)}` releases it.",
+            )
 
 
-def _state_tables(levels: dict[str, list[Document]]) -> Blocks:
-    """Yield one line a level: the table, how many rows fired, and those that fired first and
+def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
+    """Return one line a level: the table, how many rows fired, and those that fired first and
     last."""
-    yield from ("", "## State tables", "")
     rows = []
     for level, fired in levels.items():
         most = max(fired, key=lambda row: row["cycles"])
@@ -150,7 +146,7 @@ def _state_tables(levels: dict[str, list[Document]]) -> Blocks:
                 "newest, since": newest,
             }
         )
-    yield TextTable(rows)
+    return TextTable(rows)
 
 
 def _machine(report: RunReport) -> Iterator[str]:
@@ -233,18 +229,13 @@ def _misses(report: RunReport) -> Blocks:
     """Yield the first missed and skipped cycles, and why they are fewer than tasks counted."""
     misses = report.misses
     late, skipped = counted(misses)
-    yield from (
-        "",
-        f"## Missed and skipped cycles: {late} and {skipped}{_the_most(misses, 'first')}",
-        "",
-    )
+    which = f"{late} and {skipped}{_the_most(misses, 'first')}"
+    yield from ("", f"## Missed and skipped cycles: {which}", "")
     if (late, skipped) != (report.missed, report.skipped):
         of_all = f"{report.missed} and {report.skipped}"
-        why = (
-            "the recorder lost rows"
-            if report.rows_lost
-            else "the recording does not hold all of it"
-        )
+        why = "the recording does not hold all of it"
+        if report.rows_lost:
+            why = "the recorder lost rows"
         yield from (f"The tasks counted {of_all}; {why}.", "")
     rows = [
         {
@@ -257,13 +248,6 @@ def _misses(report: RunReport) -> Blocks:
         for miss in misses[:SHOWN]
     ]
     yield TextTable(rows)
-
-
-def _responses(response: Document) -> Blocks:
-    """Yield the responses of all chains of levels against their bounds, and what is beyond."""
-    yield from ("", "## System response, ms of simulated time")
-    for found in (response, *response["others"]):
-        yield from _response_along(found)
 
 
 def _response_along(response: Document) -> Blocks:
@@ -294,22 +278,14 @@ def _response_along(response: Document) -> Blocks:
     ]
     yield TextTable(rows)
     for way, found in ways.items():
-        if found["beyond"]:
-            yield from (
-                "",
-                (
-                    f"{way}: {len(found['beyond'])} beyond the"
-                    f" bound{_the_most(found['beyond'], 'longest')}:"
-                ),
-            )
-        for each in sorted(found["beyond"], key=lambda each: -each["ms"])[:SHOWN]:
+        if beyond := found["beyond"]:
+            most = _the_most(beyond, "longest")
+            yield from ("", f"{way}: {len(beyond)} beyond the bound{most}:")
+        for each in sorted(beyond, key=lambda each: -each["ms"])[:SHOWN]:
             why = "; ".join(each["delayed_by"]) or "no cause is recorded"
             yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
-        if found["unseen"]:
-            yield from (
-                "",
-                f"{way}: {found['unseen']} not measured: messages are missing in the recording.",
-            )
+        if unseen := found["unseen"]:
+            yield from ("", f"{way}: {unseen} not measured: messages are missing in the recording.")
 
 
 def _queues(queues: Sequence[Document]) -> Iterator[str]:

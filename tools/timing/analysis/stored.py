@@ -5,8 +5,7 @@ newer than the recording and this program.
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 from rack.tools.console.answer import Document, Failure, print_json
@@ -16,6 +15,7 @@ from rack.tools.recording.recorder_process import SPOOL
 FILES = ("report.json", "report.md")
 RECORDED = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
 PROGRAM = Path(__file__).resolve().parents[3]
+FLOORS = ("backplane", "levels", "boards", "tools")
 
 
 def stored_report(folder: Path) -> tuple[Document, str] | None:
@@ -26,27 +26,18 @@ def stored_report(folder: Path) -> tuple[Document, str] | None:
         kept = (*FILES, *RECORDED)
         checksums.verify(*(name for name in checksums.stored if name.startswith(kept)))
         made_ns = min((folder / name).stat().st_mtime_ns for name in FILES)
-        newest_ns = max((folder / name).stat().st_mtime_ns for name in RECORDED)
-        if (folder / SPOOL).exists() or made_ns <= max(newest_ns, *_changed_ns()):
+        program = (path for floor in FLOORS for path in (PROGRAM / floor).rglob("*.py"))
+        basis = chain((folder / name for name in RECORDED), program)
+        if (folder / SPOOL).exists() or any(made_ns <= path.stat().st_mtime_ns for path in basis):
             return None
         data = json.loads(read_file(folder / FILES[0]))
         text = read_file(folder / FILES[1]).decode()
     except (OSError, ValueError, Failure):
         return None
-    # A comparison with another run is no report of this one, and the folder may have been moved.
-    is_own = (
-        isinstance(data, dict) and not data.get("against") and data.get("folder") == str(folder)
-    )
-    return (data, text) if is_own else None
-
-
-def _changed_ns() -> Iterator[int]:
-    """Yield the times at which this program's files were changed."""
-    for floor in ("backplane", "levels", "boards", "tools"):
-        for path, _, names in os.walk(PROGRAM / floor):
-            yield from (
-                Path(path, name).stat().st_mtime_ns for name in names if name.endswith(".py")
-            )
+    if not isinstance(data, dict) or data.get("against") or data.get("folder") != str(folder):
+        # A comparison with another run is no report of this one, or the folder has been moved.
+        return None
+    return data, text
 
 
 def newest_report(folder: Path) -> tuple[Document, str]:
@@ -54,6 +45,7 @@ def newest_report(folder: Path) -> tuple[Document, str]:
     one."""
     report = stored_report(folder)
     if report is None:
+        # It takes long to import.
         from rack.tools.timing.analysis.report import write_report
 
         report = write_report(folder)

@@ -23,7 +23,7 @@ def document(analysis: Analysis) -> Document:
     """Return everything as plain data; infinite numbers are null. report.json has restarts and
     the system's response."""
     recording = analysis.recording
-    config = analysis.config
+    config = recording.rack_config
     return {
         "rack": config.name,
         "folder": str(recording.folder),
@@ -111,7 +111,7 @@ def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
         " eq. 3.6."
     )
     sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
-    names = analysis.config.board
+    names = analysis.recording.rack_config.board
     yield level_table(
         ((side, of[name]) for name in names for side, of in sides.items() if name in of), "side"
     )
@@ -135,7 +135,7 @@ def _worst_words(percentile: float) -> str:
 
 
 def _head(analysis: Analysis) -> Iterator[str]:
-    config = analysis.config
+    config = analysis.recording.rack_config
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.fails]
     yield f"{config.name}: {_ended(analysis)}"
@@ -162,8 +162,9 @@ def _head(analysis: Analysis) -> Iterator[str]:
 
 def _left_out(analysis: Analysis) -> Iterator[str]:
     """Yield whatever was not judged."""
+    config = analysis.recording.rack_config
     measured = analysis.measured.levels
-    if silent := ", ".join(name for name in analysis.config.board if name not in measured):
+    if silent := ", ".join(name for name in config.board if name not in measured):
         yield f"never ran: {silent}"
     if planless := ", ".join(
         level.board
@@ -173,7 +174,7 @@ def _left_out(analysis: Analysis) -> Iterator[str]:
         yield f"made no plan: {planless}"
     yield (
         f"the first {START_UP_S:g} s of each process are not judged; t_cs is"
-        f" {analysis.config.timing.context_switch_ms:g} ms"
+        f" {config.timing.context_switch_ms:g} ms"
     )
     if stalled := ", ".join(
         f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled

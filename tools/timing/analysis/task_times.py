@@ -4,7 +4,6 @@ show."""
 from __future__ import annotations
 
 from collections.abc import Mapping
-from statistics import pstdev
 
 import numpy as np
 
@@ -93,10 +92,9 @@ def task_times(
         # Eq. 3.6: alpha is the residual guaranteed in the worst cycle, though the longest execution
         # and the longest communication may fall into different ones; smooth motion needs a small
         # deviation.
-        alpha_ns = slice_ns - max(execution.tolist()) - max(communication.tolist())
+        alpha_ns = slice_ns - int(execution.max()) - int(communication.max())
         by_the_clock["alpha_ms"] = round(alpha_ns * MS, 6)
-        deviation_ns = pstdev((execution + communication).tolist())
-        by_the_clock["deviation_ms"] = round(deviation_ns * MS, 6)
+        by_the_clock["deviation_ms"] = round(float((execution + communication).std()) * MS, 6)
     return {
         "traced": len(cycles),
         "slice_ms": slice_ns * MS,

@@ -4,14 +4,14 @@ level of a rack."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rack.boards.config import RackConfig
-from rack.levels.timing.chains import spanned
 from rack.tools.console.answer import Document
 from rack.tools.console.pictures import paths_of, picture
+from rack.tools.timing.tables import merge_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,29 +84,19 @@ def placed(config: RackConfig) -> list[Placed]:
     """Return the levels of a rack with their regions, the fastest first."""
     tick_s = config.tick_ns * 1e-9
     cycles = {name: config.every(name) * tick_s for name in config.board}
-    found = []
-    for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1]):
-        region = region_of(cycle_s)
-        coupling = config.board[name].coupling
-        found.append(
-            Placed(
-                name,
-                cycle_s,
-                region.words,
-                coupling,
-                f"{region.words}: {_remark(region, coupling)}",
-            )
+    return [
+        Placed(
+            name, cycle_s, region.words, coupling, f"{region.words}: {_remark(region, coupling)}"
         )
-    return found
+        for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1])
+        for region, coupling in [(region_of(cycle_s), config.board[name].coupling)]
+    ]
 
 
 def together(levels: Sequence[Placed]) -> list[Placed]:
     """Return the levels, those of the same place in the figure as one: a board a joint needs one
     line."""
-    names: dict[Placed, list[str]] = {}
-    for level in levels:
-        names.setdefault(replace(level, level=""), []).append(level.level)
-    return [replace(place, level=spanned(found)) for place, found in names.items()]
+    return [Placed(**row) for row in merge_rows(map(vars, levels), "level")]
 
 
 def region_of(cycle_s: float) -> Region:

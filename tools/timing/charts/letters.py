@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import count, groupby
 
-from rack.levels.timing.schedule import Chart, Job, Span
+from rack.levels.timing.schedule import Chart, Job
 from rack.tools.console.tables import ms
 from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.patterns import IDLE, Lane
@@ -48,7 +48,10 @@ def lines(panel: Panel, column_ns: int) -> Iterator[str]:
         marks = _marks(panel, lane, column_ns)
         if marks:
             yield " " * margin + marks
-    yield from (" " * margin + line for line in _axis(panel, column_ns))
+    times = [
+        ((time - chart.start_ns) // column_ns, ms(time)) for time in label_times(panel, column_ns)
+    ]
+    yield f"{' ' * margin}{label_row(times)} ms"
     if unseen:
         yield f"too short for a column: {', '.join(unseen)}; show less time, or see the picture"
     yield from _patterns(panel)
@@ -69,27 +72,17 @@ def column_for(window_ns: int, shortest_ns: int | None) -> int:
 def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
     """Return the letters of a lane: in each column the unit function that took most of it."""
     columns = -(-(chart.end_ns - chart.start_ns) // column_ns)
-    shares: list[dict[str, int]] = [{} for _ in range(columns)]
+    shares: list[Counter[str]] = [Counter() for _ in range(columns)]
     for span in (span for span in chart.spans if span.core == lane.core):
         letter = span.unit.value if span.task in lane.tasks else OTHER
-        for at, share in _shares(span, chart.start_ns, column_ns):
-            shares[at][letter] = shares[at].get(letter, 0) + share
-    return "".join(_letter(share, column_ns) for share in shares)
-
-
-def _shares(span: Span, start_ns: int, column_ns: int) -> Iterator[tuple[int, int]]:
-    """Yield each column that a span reaches, with the time it takes of it."""
-    first = (span.start_ns - start_ns) // column_ns
-    last = (span.end_ns - start_ns - 1) // column_ns
-    for at in range(first, last + 1):
-        begin = start_ns + at * column_ns
-        yield at, min(span.end_ns, begin + column_ns) - max(span.start_ns, begin)
-
-
-def _letter(share: dict[str, int], column_ns: int) -> str:
-    idle = column_ns - sum(share.values())
-    letter, most = max(share.items(), key=lambda entry: entry[1], default=(IDLE, 0))
-    return letter if most >= idle and most else IDLE
+        start, end = span.start_ns - chart.start_ns, span.end_ns - chart.start_ns
+        for at in range(start // column_ns, -(-end // column_ns)):
+            begin = at * column_ns
+            shares[at][letter] += min(end, begin + column_ns) - max(start, begin)
+    for share in shares:
+        # Added last, it loses to a letter with as much of the column.
+        share[IDLE] = column_ns - share.total()
+    return "".join(max(share, key=share.__getitem__) for share in shares)
 
 
 def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
@@ -104,13 +97,6 @@ def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
         if job.deadline_ns >= chart.start_ns:
             row[(job.deadline_ns - chart.start_ns) // column_ns] = "!"
     return "".join(row).rstrip()
-
-
-def _axis(panel: Panel, column_ns: int) -> Iterator[str]:
-    """Yield the time below the chart."""
-    start = panel.chart.start_ns
-    times = label_times(panel, column_ns)
-    yield f"{label_row(((time - start) // column_ns, ms(time)) for time in times)} ms"
 
 
 def label_row(labels: Iterable[tuple[int, str]]) -> str:
@@ -166,17 +152,13 @@ def _patterns(panel: Panel) -> Iterator[str]:
 
 
 def _counted(name: str, counts: Counter[str], of: str) -> Iterator[str]:
-    (first, count), *others = [
-        (_short(pattern), number) for pattern, number in counts.most_common(SHOWN)
-    ]
-    yield f"{name}: {first}: {count} of {counts.total()} {of}"
-    yield from (f"{' ' * len(name)}  {pattern}: {number}" for pattern, number in others)
-    hidden = len(counts) - len(others) - 1
-    if hidden:
-        yield (
-            f"{' ' * len(name)}  and {hidden} more patterns:"
-            f" {counts.total() - count - sum(n for _, n in others)}"
-        )
+    ranked = counts.most_common()
+    (first, count), *others = ranked[:SHOWN]
+    margin = " " * len(name)
+    yield f"{name}: {_short(first)}: {count} of {counts.total()} {of}"
+    yield from (f"{margin}  {_short(pattern)}: {number}" for pattern, number in others)
+    if hidden := ranked[SHOWN:]:
+        yield f"{margin}  and {len(hidden)} more patterns: {sum(n for _, n in hidden)}"
 
 
 def _short(pattern: str) -> str:

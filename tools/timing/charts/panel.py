@@ -79,12 +79,21 @@ class Panel:
 
     def document(self) -> Document:
         """Return everything as plain data; times are ms."""
+        late = {job for lane in self.lanes for job in self.late(lane)}
         return {
             "kind": self.kind,
             "from_ms": self.chart.start_ns / NS_PER_MS,
             "to_ms": self.chart.end_ns / NS_PER_MS,
             "frame_ms": self.frame_ns / NS_PER_MS or None,
-            "lanes": [_lane(lane) for lane in self.lanes],
+            "lanes": [
+                {
+                    "core": lane.core,
+                    "board": lane.board,
+                    "tasks": list(lane.tasks),
+                    **_in_ms(lane, "cycle", "slice"),
+                }
+                for lane in self.lanes
+            ],
             "spans": [
                 {
                     "task": span.task,
@@ -94,27 +103,20 @@ class Panel:
                 }
                 for span in self.chart.spans
             ],
-            "jobs": list(self._jobs()),
+            "jobs": [
+                {
+                    "task": job.task,
+                    **_in_ms(job, "release", "deadline", "end"),
+                    "late": job in late,
+                }
+                for job in self.chart.jobs
+            ],
             "patterns": {
                 lane: {of: dict(counts.most_common()) for of, counts in found._asdict().items()}
                 for lane, found in self.patterns.items()
             },
             "counts": {task: vars(count) for task, count in self.counts.items()},
         }
-
-    def _jobs(self) -> Iterator[Document]:
-        late = {(job.task, job.release_ns) for lane in self.lanes for job in self.late(lane)}
-        for job in self.chart.jobs:
-            yield {
-                "task": job.task,
-                **_in_ms(job, "release", "deadline", "end"),
-                "late": (job.task, job.release_ns) in late,
-            }
-
-
-def _lane(lane: Lane) -> Document:
-    times = _in_ms(lane, "cycle", "slice")
-    return {"core": lane.core, "board": lane.board, "tasks": list(lane.tasks), **times}
 
 
 def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:

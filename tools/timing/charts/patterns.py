@@ -6,10 +6,11 @@ A pattern is written as in the paper: "R X W P | R X W P U -".
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import accumulate, groupby
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -74,28 +75,23 @@ class Lane:
 
 def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
     """Return the lanes of `tasks`, by core, then by falling priority."""
-    places = dict.fromkeys((task.core, task.board) for task in tasks)
-    lanes = [
-        _lane(core, [t for t in tasks if (t.core, t.board) == (core, board)])
-        for core, board in places
-    ]
+    lanes = []
+    for core, board in dict.fromkeys((task.core, task.board) for task in tasks):
+        own = [task for task in tasks if (task.core, task.board) == (core, board)]
+        planner = next((task for task in own if task.role == "planner"), None)
+        lanes.append(
+            Lane(
+                core=core,
+                board=board,
+                executor=next((task.name for task in own if task.role != "planner"), None),
+                planner=None if planner is None else planner.name,
+                priority=max(task.priority for task in own),
+                cycle_ns=own[0].every_ns,
+                slice_ns=(planner or own[0]).period_ns,
+                phase_ns=own[0].phase_ns,
+            )
+        )
     return tuple(sorted(lanes, key=lambda lane: (lane.core, -lane.priority, lane.cycle_ns)))
-
-
-def _lane(core: int, tasks: list[TimedTask]) -> Lane:
-    planner = next((task for task in tasks if task.role == "planner"), None)
-    executor = next((task.name for task in tasks if task.role != "planner"), None)
-    planner_name = None if planner is None else planner.name
-    return Lane(
-        core=core,
-        board=tasks[0].board,
-        executor=executor,
-        planner=planner_name,
-        priority=max(task.priority for task in tasks),
-        cycle_ns=tasks[0].every_ns,
-        slice_ns=(planner or tasks[0]).period_ns,
-        phase_ns=tasks[0].phase_ns,
-    )
 
 
 class Patterns(NamedTuple):
@@ -143,35 +139,22 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
     `chart` must extend beyond the stretch by a slice.
     """
     counted = Patterns.none()
-    spans = _by_cycle([span for span in chart.spans if span.core == lane.core], lane)
+    spans = [span for span in chart.spans if span.core == lane.core]
+    starts = [span.start_ns for span in spans]
+    # The ends are sorted as well, unless ordinary scheduling has mixed the tasks of a core.
+    ends = list(accumulate((span.end_ns for span in spans), max))
     for start, cycles, is_plan in _beginnings(chart, lane, within):
-        first = (start - lane.phase_ns) // lane.cycle_ns
-        of_cycles = [spans[first + cycle] for cycle in range(cycles)]
-        if lane.executor is None:
-            # The only cycles of a planner on its own processor are its plans.
-            of_cycles = [[span for spans_of_cycle in of_cycles for span in spans_of_cycle]]
-        length = cycles * lane.cycle_ns // len(of_cycles)
-        borders = (start + at * length for at in range(len(of_cycles)))
-        orders = (
-            _order(found, lane, (begin, begin + length), detail)
-            for begin, found in zip(borders, of_cycles, strict=True)
-        )
+        end = start + cycles * lane.cycle_ns
+        # The only cycles of a planner on its own processor are its plans.
+        length = lane.cycle_ns if lane.executor is not None else end - start
+        orders = []
+        for begin in range(start, end, length):
+            near = spans[bisect_right(ends, begin) : bisect_left(starts, begin + length)]
+            own = [span for span in near if span.end_ns > begin]
+            orders.append(_order(own, lane, (begin, begin + length), detail))
         counter = counted.plans if is_plan else counted.cycles
         counter[" | ".join(orders)] += 1
     return counted
-
-
-def _by_cycle(spans: Sequence[Span], lane: Lane) -> dict[int, list[Span]]:
-    """Return the spans of each cycle of a lane, with those that extend into it."""
-    found: dict[int, list[Span]] = defaultdict(list)
-    first = lane.phase_ns
-    cycle_ns = lane.cycle_ns
-    for span in spans:
-        for cycle in range(
-            (span.start_ns - first) // cycle_ns, (span.end_ns - 1 - first) // cycle_ns + 1
-        ):
-            found[cycle].append(span)
-    return found
 
 
 def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
@@ -188,10 +171,11 @@ def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int
 
 
 def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -> str:
-    """Return the order of the unit functions within a stretch, as in "R X W P -"."""
+    """Return the order of the unit functions within a stretch, as in "R X W P -"; `spans` are those
+    in it, in the order of time."""
     stretches: list[tuple[Unit | None, int]] = []
     busy_until = within[0]
-    for span in sorted(spans, key=lambda span: span.start_ns):
+    for span in spans:
         start = max(span.start_ns, within[0])
         end = min(span.end_ns, within[1])
         if start - busy_until > detail.gap_ns:

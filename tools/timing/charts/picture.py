@@ -14,7 +14,7 @@ from rack.levels.timing.tasks import Unit
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import ms
 from rack.tools.timing.charts.letters import COLUMNS, label_times, numbered_frames
-from rack.tools.timing.charts.panel import NS_PER_MS, Panel
+from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.patterns import IDLE
 
 if TYPE_CHECKING:
@@ -94,28 +94,23 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
 
 
 def draw(axes: Axes, panel: Panel) -> None:
-    """Draw one panel: the first lane on top."""
+    """Draw one panel: the first lane on top. Along the axis are ns, labelled in ms."""
     chart = panel.chart
     count = len(panel.lanes)
     for row, lane in enumerate(panel.lanes):
         _draw_lane(axes, panel, lane, count - 1 - row)
     if panel.frames:
-        starts = [start / NS_PER_MS for start in panel.frames.values()]
+        starts = list(panel.frames.values())
         axes.vlines(starts, -0.5, count - 0.5, colors=FRAME, linewidth=0.8, linestyles="dashed")
         character_ns = round(FRAME_CHARACTER * (chart.end_ns - chart.start_ns))
         for number, start in numbered_frames(panel, character_ns, "frame "):
-            axes.annotate(
-                f"frame {number}",
-                (start / NS_PER_MS, count - 0.5),
-                fontsize=7,
-                va="bottom",
-                color=GRID,
-            )
-    axes.set_xlim(chart.start_ns / NS_PER_MS, chart.end_ns / NS_PER_MS)
+            place = (start, count - 0.5)
+            axes.annotate(f"frame {number}", place, fontsize=7, va="bottom", color=GRID)
+    axes.set_xlim(chart.start_ns, chart.end_ns)
     axes.set_ylim(-0.5, count - 0.5)
     # The axis is as wide as a chart in letters.
     times = label_times(panel, (chart.end_ns - chart.start_ns) // COLUMNS)
-    axes.set_xticks([time / NS_PER_MS for time in times], [ms(time) for time in times])
+    axes.set_xticks(times, [ms(time) for time in times])
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
     pad = 14 if panel.frames else None
@@ -127,30 +122,22 @@ def draw(axes: Axes, panel: Panel) -> None:
 def _draw_lane(axes: Axes, panel: Panel, lane: Lane, at: int) -> None:
     chart = panel.chart
     low = at - BAR / 2
-    start = chart.start_ns / NS_PER_MS
-    end = chart.end_ns / NS_PER_MS
-    axes.broken_barh([(start, end - start)], (low, BAR), facecolors=FLOOR)
+    window_ns = chart.end_ns - chart.start_ns
+    axes.broken_barh([(chart.start_ns, window_ns)], (low, BAR), facecolors=FLOOR)
     own = [span for span in chart.spans if span.task in lane.tasks]
     for unit in Unit:
-        bars = [
-            (s.start_ns / NS_PER_MS, (s.end_ns - s.start_ns) / NS_PER_MS)
-            for s in own
-            if s.unit is unit
-        ]
+        bars = [(s.start_ns, s.end_ns - s.start_ns) for s in own if s.unit is unit]
         axes.broken_barh(bars, (low, BAR), color=COLOURS[unit], linewidth=EDGE)
-    window_ns = chart.end_ns - chart.start_ns
     letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in own]
     letters += [(IDLE, idle) for idle in panel.idle(lane)]
     for letter, (begin, stop) in letters:
         size = min((stop - begin) / window_ns / LETTER, LETTER_PT)
         # Small dashes would be a dotted line.
         if size >= (LETTER_PT if letter == IDLE else SMALLEST_PT):
-            middle = (begin + stop) / 2 / NS_PER_MS
-            axes.text(middle, at, letter, ha="center", va="center", fontsize=size)
+            axes.text((begin + stop) / 2, at, letter, ha="center", va="center", fontsize=size)
     if lane.cycle_ns >= CYCLE * window_ns:
         starts = range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
-        marks = [time / NS_PER_MS for time in starts]
-        axes.vlines(marks, low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)
+        axes.vlines(list(starts), low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)
     for job in panel.late(lane):
         _mark_late(axes, chart, job, low + BAR + 0.06)
 
@@ -159,7 +146,6 @@ def _mark_late(axes: Axes, chart: Chart, job: Job, at: float) -> None:
     """Mark a missed deadline, and the time from it to the end of the job."""
     due = max(job.deadline_ns, chart.start_ns)
     if due == job.deadline_ns:
-        axes.plot([due / NS_PER_MS], [at], marker="v", markersize=6, color=LATE, clip_on=False)
+        axes.plot([due], [at], marker="v", markersize=6, color=LATE, clip_on=False)
     if job.end_ns is not None:
-        stop = min(job.end_ns, chart.end_ns)
-        axes.hlines(at, due / NS_PER_MS, stop / NS_PER_MS, colors=LATE, linewidth=1.6)
+        axes.hlines(at, due, min(job.end_ns, chart.end_ns), colors=LATE, linewidth=1.6)

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import lcm
+from typing import TypeVar
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
 from rack.levels.timing.frames import core_frames
-from rack.levels.timing.schedule import Chart, simulate
+from rack.levels.timing.schedule import Chart, Job, Span, simulate
 from rack.levels.timing.tasks import Part, Unit
 from rack.tools.console.answer import Failure
 from rack.tools.timing.charts.panel import Count, Panel
@@ -21,6 +22,9 @@ MOST_FRAMES = 24
 """Most minor frames of a static schedule in a default chart."""
 MOST_CYCLES = 1_000_000
 """Most cycles of all tasks that are simulated: a minute of work."""
+
+
+E = TypeVar("E", Chart, Span, Job)
 
 
 class Schedule:
@@ -100,22 +104,13 @@ class Schedule:
 
 def _later(chart: Chart, by_ns: int) -> Chart:
     """Return a chart moved to a later time."""
-    spans = (
-        replace(
-            span,
-            start_ns=span.start_ns + by_ns,
-            end_ns=span.end_ns + by_ns,
-            release_ns=span.release_ns + by_ns,
-        )
-        for span in chart.spans
+
+    def moved(entry: E) -> E:
+        """Return a chart, span or job with all its times later."""
+        times = {name: time for name, time in vars(entry).items() if name.endswith("_ns")}
+        later = {name: time + by_ns for name, time in times.items() if time is not None}
+        return replace(entry, **later)
+
+    return replace(
+        moved(chart), spans=tuple(map(moved, chart.spans)), jobs=tuple(map(moved, chart.jobs))
     )
-    jobs = (
-        replace(
-            job,
-            release_ns=job.release_ns + by_ns,
-            deadline_ns=job.deadline_ns + by_ns,
-            end_ns=None if job.end_ns is None else job.end_ns + by_ns,
-        )
-        for job in chart.jobs
-    )
-    return Chart(chart.start_ns + by_ns, chart.end_ns + by_ns, tuple(spans), tuple(jobs))

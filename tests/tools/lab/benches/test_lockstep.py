@@ -43,7 +43,7 @@ def test_speeds_follow_from_times_and_the_ratios_from_the_baseline() -> None:
     for baseline, expected in ratios.items():
         found = compare(samples, baseline)
         assert [found.ratio(sample) for sample in samples] == expected
-        assert list(found.lines())[-1] == (
+        assert list(found.blocks())[-1] == (
             "simulated seconds a second:"
             " nasrem 4.17 (this tree), nasrem 2 (base), nasrem 6.25 (no rack)"
         )

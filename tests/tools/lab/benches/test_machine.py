@@ -24,7 +24,7 @@ from rack.tools.lab.benches.machine import (
     compare_idle_cores,
     measure,
 )
-from rack.tools.lab.benches.observed import Recorded, Runs, record
+from rack.tools.lab.benches.observed import Recorded, record
 from tests.boards.conftest import PLAIN
 from tests.tools.lab.benches import peers
 
@@ -82,11 +82,11 @@ def test_a_rack_without_a_board_at_every_tick_is_refused() -> None:
     ],
 )
 def test_a_rate_is_held_up_to_its_bound(figures: RateFigures, verdict: str) -> None:
-    assert (figures.verdict, figures.is_held) == (verdict, verdict == "held")
+    assert (figures.verdict, not figures.reason) == (verdict, verdict == "held")
 
 
 def test_the_verdict_comes_first_and_says_up_to_which_rate_and_why_no_further() -> None:
-    lines = list(FOUND.lines())
+    lines = list(FOUND.blocks())
     assert lines[:3] == [
         "fit for real time up to 400 Hz",
         "400 Hz held; missed 0.12% of 6000 cycles, cyclictest late in 0.05%;"
@@ -98,10 +98,10 @@ def test_the_verdict_comes_first_and_says_up_to_which_rate_and_why_no_further() 
     # A rate counts only if all below it are held.
     worse = replace(FOUND, rates=(replace(HELD, missed=0.02), replace(HELD, rate_hz=1000.0)))
     assert not worse.is_fit
-    assert next(worse.lines()) == "not fit for real time at 400 Hz or more"
+    assert next(worse.blocks()) == "not fit for real time at 400 Hz or more"
     refused = replace(FOUND, is_fifo=False)
     assert not refused.is_fit
-    assert next(refused.lines()).startswith("not fit for real time: SCHED_FIFO is refused")
+    assert next(refused.blocks()).startswith("not fit for real time: SCHED_FIFO is refused")
     document = json.loads(json.dumps(FOUND.document()))
     assert [document[name] for name in ("fit", "highest_hz", "fifo")] == [True, 400.0, True]
     assert [one["held"] for one in document["rates"]] == [True, False]
@@ -126,7 +126,7 @@ def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
         return record(config, seconds, folder, share)
 
     monkeypatch.setattr(machine, "record", look)
-    found = measure(str(waves), (400,), Runs(0.3, 2, True), Progress())
+    found = measure(str(waves), (400,), 0.3, 2, True, Progress())
     # Of 120 wakes two rounds have two at 2.5 ms and four at 150 ms: 1 and 60 points of this grid.
     assert found.rates[0].late == pytest.approx((2 * 1 + 4 * 60) / (2 * 120 + 4 * 59))
     assert {sample.who for sample in found.samples} == {found.who, found.who + AWAKE, CYCLICTEST}
@@ -134,7 +134,7 @@ def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
     own = found.sample("400 Hz", found.who)
     assert own is not None
     assert found.ratio(own) == pytest.approx(own.median / 12.0)
-    assert list(found.lines())[-1] == found.conclusion != ""
+    assert list(found.blocks())[-1] == found.conclusion != ""
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from rack.backplane.segment import SHM_FOLDER
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import EXTRA, Absent, Sample, absent_package
-from rack.tools.lab.benches.mailbox import Bench, Case, Exchange, compare, measure
+from rack.tools.lab.benches.mailbox import Bench, Case, compare, exchange, measure
 from rack.tools.lab.benches.transports import PEERS, Peer, Transport, multiprocessing_pipe
 from tests.processes import BOUND_S
 from tests.tools.lab.benches.test_harness import Hidden
@@ -80,7 +80,7 @@ def test_a_transport_that_loses_messages_is_noticed() -> None:
         lossy() as transport,
         pytest.raises(Failure, match=r"^lossy: a reader received another message"),
     ):
-        Exchange("lossy", transport, case.lengths).batch()
+        exchange("lossy", transport, case.lengths)
 
 
 def test_the_baseline_of_a_case_is_its_best_peer() -> None:

@@ -12,7 +12,7 @@ from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.partition import (
     PARTITION,
     PARTITIONS,
-    Partitions,
+    PartitionFigures,
 )
 from tests.boards.conftest import PLANNED
 from tests.machine import needs_fifo, needs_two_cores
@@ -43,7 +43,7 @@ def test_every_planner_is_coupled_the_same_way_on_so_many_cores() -> None:
 
 def partitioned(
     text: str, seconds: float, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> Partitions:
+) -> tuple[PartitionFigures, ...]:
     """Run the partitions of the rack of a config."""
     (folder / "rack.toml").write_text(text)
     monkeypatch.setattr(partition, "NAME", str(folder / "rack.toml"))
@@ -60,8 +60,8 @@ def test_partitions_are_run_and_measured_one_after_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = partitioned(PLANNED, 0.3, tmp_path, monkeypatch)
-    assert tuple(one.partition for one in found.partitions) == PARTITIONS
-    for one in found.partitions:
+    assert tuple(one.partition for one in found) == PARTITIONS
+    for one in found:
         cycles = {(task.board, task.role): task.cycles for task in one.tasks}
         assert cycles.keys() == {("wave", "executor"), ("wave", "planner"), ("watch", "executor")}
         assert 0 < cycles["wave", "executor"] <= 120

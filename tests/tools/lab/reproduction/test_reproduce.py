@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.lab.reproduction.experiments.deadline import DEADLINE
 from rack.tools.lab.reproduction.experiments.experiment import KEPT, kept
+from rack.tools.lab.reproduction.experiments.nasrem import DEADLINE
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, rack
 

@@ -11,24 +11,28 @@ import pytest
 
 from rack.levels.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
-from rack.tools.lab.reproduction.experiments.deadline import GotoRun, GotoRuns
-from rack.tools.lab.reproduction.experiments.determinism import ComparedRun, ComparedRuns
 from rack.tools.lab.reproduction.experiments.experiment import Kept
 from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
-from rack.tools.lab.reproduction.experiments.nasrem import MeasuredVerdict, NasremRun
+from rack.tools.lab.reproduction.experiments.nasrem import (
+    ComparedRun,
+    GotoRun,
+    GotoRuns,
+    MeasuredVerdict,
+    NasremRun,
+)
 from rack.tools.lab.reproduction.experiments.partition import (
     Partition,
     PartitionFigures,
-    Partitions,
     TaskFigures,
 )
 from rack.tools.lab.reproduction.experiments.sharing import ChainRun, Chains
 from rack.tools.lab.reproduction.experiments.switch import SwitchRun
-from rack.tools.lab.reproduction.experiments.tables import TableRun, TableRuns
 from rack.tools.lab.reproduction.experiments.tasks import (
     TASKS,
     NetworkRun,
     SystemResponse,
+    TableRun,
+    TableRuns,
     TaskRun,
     WayResponse,
     response_from,
@@ -88,12 +92,10 @@ def compared(mode: str, digest: str, miss: int | None = None, differs: int | Non
     return ComparedRun(mode, digest, miss, difference)
 
 
-def determined(*runs: ComparedRun, second: str = "a") -> ComparedRuns:
+def determined(*runs: ComparedRun, second: str = "a") -> tuple[ComparedRun, ...]:
     """Return runs in real time after two in lockstep."""
     differs = None if second == "a" else 1
-    return ComparedRuns(
-        (compared("lockstep", "a"), compared("lockstep", second, differs=differs), *runs)
-    )
+    return compared("lockstep", "a"), compared("lockstep", second, differs=differs), *runs
 
 
 EQUAL = compared("realtime", "a")
@@ -140,7 +142,7 @@ def switch(assumed_us: float) -> SwitchRun:
     return SwitchRun(times, assumed_us)
 
 
-def partitions(slow: int, fast: int, plans: int) -> Partitions:
+def partitions(slow: int, fast: int, plans: int) -> tuple[PartitionFigures, ...]:
     """Return what levels miss of 100 cycles: a slow one, and a fast one on one processor."""
 
     def figures(partition: Partition, missed: dict[str, int]) -> PartitionFigures:
@@ -150,7 +152,7 @@ def partitions(slow: int, fast: int, plans: int) -> Partitions:
 
     tight = figures(Partition("tight", 1), {"task": slow, "servo": fast})
     loose = figures(Partition("loose", 2), {"task": slow, "servo": 0})
-    return Partitions((tight, loose))
+    return tight, loose
 
 
 def equation(name: str, holds: bool, mostly: bool) -> NasremRun:

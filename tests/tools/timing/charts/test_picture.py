@@ -32,12 +32,8 @@ def drawn(panel: Panel) -> tuple[list[Text], Figure]:
     return list(axes.texts), figure
 
 
-def spans_ms(panel: Panel, letter: str) -> list[tuple[float, float]]:
-    return [
-        (span.start_ns / NS_PER_MS, span.end_ns / NS_PER_MS)
-        for span in panel.chart.spans
-        if span.unit.value == letter
-    ]
+def spans_ns(panel: Panel, letter: str) -> list[tuple[int, int]]:
+    return [(s.start_ns, s.end_ns) for s in panel.chart.spans if s.unit.value == letter]
 
 
 @pytest.mark.slow
@@ -52,7 +48,7 @@ def test_a_letter_is_no_wider_than_its_span(end_ms: float) -> None:
         extent: Bbox = text.get_window_extent()
         left, right = (to_data.transform((x, 0.0))[0] for x in (extent.x0, extent.x1))
         middle = (left + right) / 2
-        own = spans_ms(panel, text.get_text())
+        own = spans_ns(panel, text.get_text())
         assert any(start <= left and right <= end for start, end in own if start < middle < end)
 
 

@@ -143,13 +143,13 @@ class Experiment(Generic[Found]):
             raise Lacking(f"it needs {self.cores} processors; this machine has {there}")
         return self.measure(workshop)
 
-    def record(self, document: Document) -> Found:
+    def record(self, data: Any) -> Found:
         """Return what was found, from plain data."""
-        return TypeAdapter(self.kind).validate_python(document)
+        return TypeAdapter(self.kind).validate_python(data)
 
-    def document(self, found: Found) -> Document:
+    def document(self, found: Found) -> Any:
         """Return what was found as plain data."""
-        return dict(TypeAdapter(self.kind).dump_python(found, mode="json"))
+        return TypeAdapter(self.kind).dump_python(found, mode="json")
 
 
 def depends() -> Document:
@@ -162,7 +162,7 @@ class Kept:
     """A result that is kept: what was found, when, in which time, and what it depends on; or why
     nothing can be found on this machine."""
 
-    found: Document
+    found: Any
     took_s: float
     made_at: str
     lacking: str = ""
@@ -183,7 +183,7 @@ def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
     """Make an experiment and keep its result. Raises `Failure` and what a rack raises."""
     started = time.monotonic()
     basis = depends()
-    found: Document = {}
+    found: Any = None
     lacking = ""
     try:
         found = experiment.document(experiment.make(workshop))

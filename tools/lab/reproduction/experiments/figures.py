@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from rack.boards.config import RackConfig, load, wire
-from rack.boards.config.schema import BudgetConfig
 from rack.levels.timing.trace_times import plans
 from rack.tools.lab.reproduction.experiments import storing
 from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Workshop
@@ -48,9 +47,15 @@ class FigureRack:
     label: str
     settings: tuple[str, ...] = ()
 
-    def loaded(self) -> RackConfig:
-        """Return the config."""
+    @cached_property
+    def rack(self) -> RackConfig:
+        """The config, loaded."""
         return load(self.config, self.settings)
+
+    @cached_property
+    def schedule(self) -> Schedule:
+        """The schedule that follows from its budget."""
+        return Schedule(self.rack, wire(self.rack), {})
 
     @property
     def experiment(self) -> Experiment[FigureRun]:
@@ -61,39 +66,30 @@ class FigureRack:
             SECONDS + LAUNCH_S,
             FigureRun,
             partial(_measure, self),
-            cores=2 if self.loaded().board[LEVEL].coupling == "loose" else 1,
+            cores=2 if self.rack.board[LEVEL].coupling == "loose" else 1,
         )
 
     @property
     def window_ns(self) -> int:
         """The time that its charts show."""
-        config = self.loaded()
-        return self.cycles * config.every(LEVEL) * config.clock_ns
+        return self.cycles * self.rack.every(LEVEL) * self.rack.clock_ns
 
     def panel(self) -> Panel:
-        """Return the schedule that follows from its budget, from the first cycle on."""
-        config = self.loaded()
-        return Schedule(config, wire(config), {}).panel(0, self.window_ns)
+        """Return its schedule from the first cycle on."""
+        return self.schedule.panel(0, self.window_ns)
 
     def letters(self, panel: Panel) -> str:
         """Return a panel of this figure as the paper draws it."""
-        config = self.loaded()
-        column_ns = column_for(self.window_ns, Schedule(config, wire(config), {}).shortest_ns)
+        column_ns = column_for(self.window_ns, self.schedule.shortest_ns)
         return "\n".join((self.label, *lines(panel, column_ns)))
-
-
-def budget_of(config: RackConfig) -> BudgetConfig:
-    """Return the budget of a figure's only level."""
-    budget = config.board[LEVEL].budget
-    assert budget is not None, "every figure has a budget"
-    return budget
 
 
 def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
     """Return the settings with which the executor of a figure takes this X, ms, in its budget and
     on its board."""
-    config = load(name)
-    own_ms = budget_of(config).process_ms - config.board[LEVEL].params["process_ms"]
+    board = load(name).board[LEVEL]
+    assert board.budget is not None, "every figure has a budget"
+    own_ms = board.budget.process_ms - board.params["process_ms"]
     computed_ms = max(process_ms - own_ms, 0.0)
     return (
         f"board.{LEVEL}.budget.process_ms={process_ms:g}",

@@ -81,25 +81,18 @@ class PartitionFigures:
     loads: dict[int, float]
 
 
-@dataclass(frozen=True)
-class Partitions:
-    """The measurements of all partitions."""
-
-    partitions: tuple[PartitionFigures, ...]
-
-
-def _measure(workshop: Workshop) -> Partitions:
+def _measure(workshop: Workshop) -> tuple[PartitionFigures, ...]:
     config = workshop.config(NAME)
     # All of them are checked before the first one runs.
     racks = [(partition, partition.of(config)) for partition in PARTITIONS]
-    return Partitions(tuple(_figures(workshop, *one) for one in racks))
+    return tuple(_figures(workshop, *one) for one in racks)
 
 
 PARTITION = Experiment(
     "partition",
     "nasrem with its planners on one core and on two",
     len(PARTITIONS) * (SECONDS + LAUNCH_S),
-    Partitions,
+    tuple[PartitionFigures, ...],
     _measure,
     cores=2,
 )

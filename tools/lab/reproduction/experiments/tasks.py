@@ -18,6 +18,7 @@ from rack.tools.lab.benches.observed import UNVIEWED, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import RUNS, Experiment, Workshop
 from rack.tools.live.host_side import entries_of
 from rack.tools.live.launch import RunResult
+from rack.tools.recording.history import fired_rows
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackGrid
 from rack.tools.timing.measured_response import system_response
@@ -31,8 +32,12 @@ TASKS_S = {
     "penn": 26.2,
     "rccl": 17.5,
 }
-"""The systems of one rack, with the simulated time of their tasks, s. Other experiments run the
-tasks of NASREM and of the state tables."""
+"""The systems of one rack, with the simulated time of their tasks, s; NASREM and the state tables
+have experiments of their own."""
+STATE_TABLES = "nist-state-table"
+UNDISTURBED = ("scene.motion=[]", "clock.mode=lockstep")
+"""Nothing in the cell moves but the arm; which rows fire then depends on no clock."""
+TABLES_S = 55.0
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
@@ -144,6 +149,43 @@ def task_run(result: RunResult, *recordings: Recording) -> TaskRun:
         messages=messages,
         response=response_from(system_response(first)),
     )
+
+
+@dataclass(frozen=True)
+class TableRun(TaskRun):
+    """A run of the task with the rows of state tables that fired, as "level: row"."""
+
+    rows: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TableRuns:
+    """NIST's controller before NASREM, of executors with state tables: with what moves in the cell,
+    in real time, and without."""
+
+    disturbed: TableRun
+    undisturbed: TableRun
+
+
+def _measure_tables(workshop: Workshop) -> TableRuns:
+    calm = f"{STATE_TABLES}-undisturbed"
+    return TableRuns(_table_run(workshop, STATE_TABLES), _table_run(workshop, calm, UNDISTURBED))
+
+
+def _table_run(workshop: Workshop, label: str, settings: Sequence[str] = ()) -> TableRun:
+    result, recording = workshop.run(label, workshop.config(STATE_TABLES, settings))
+    fired = fired_rows(recording).items()
+    rows = (f"{level}: {row['name']}" for level, rows in fired for row in rows)
+    return TableRun(**vars(task_run(result, recording)), rows=tuple(rows))
+
+
+TABLES = Experiment(
+    STATE_TABLES,
+    "state tables, with a disturbance and without",
+    TABLES_S,
+    TableRuns,
+    _measure_tables,
+)
 
 
 def _missed(*recordings: Recording) -> float:
