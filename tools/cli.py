@@ -1,19 +1,16 @@
 """The `rack` command line. A command's module is imported only when that command runs or shows its
 help.
 
-The parser, typer, takes longer to import than short commands take to run: what needs none goes past
-it, and `rack run` starts its crate before it.
+The parser, typer, takes long to import: `rack run` starts its crate before it.
 """
 
 from __future__ import annotations
 
 import errno
-import gc
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from importlib import import_module
 from io import StringIO, TextIOBase
 from itertools import chain
@@ -30,147 +27,75 @@ if TYPE_CHECKING:
 
 
 class CommandEntry(NamedTuple):
-    """A command.
+    """A command: its name, one line of help, and the function or `typer.Typer` that it is.
 
-    Attributes:
-        name: Name on the command line.
-        source: Module and function, or `typer.Typer`, in it.
-        line: One line of help.
+    `source` names that as "module:attribute"; without one, it has the name of the command, in the
+    module of that name.
     """
 
     name: str
-    source: str
     line: str
+    source: str = ""
 
 
 COMMANDS = {
     "Run": (
+        CommandEntry("run", "Run a rack until its task ends, and report on the run."),
+        CommandEntry("stop", "End a run and wait until it is gone."),
+        CommandEntry("pause", "Pause a rack, or the motion of its arm."),
+        CommandEntry("resume", "Let a paused rack go on.", "rack.tools.commands.pause:resume"),
+        CommandEntry("step", "Let a rack in lockstep go on by single cycles."),
+        CommandEntry("rewind", "Go back to any tick of a recorded run, and branch off."),
         CommandEntry(
-            "run",
-            "rack.tools.commands.run:run",
-            "Run a rack until its task ends, and report on the run.",
+            "list", "List the racks on this machine.", "rack.tools.commands.list:list_racks"
         ),
-        CommandEntry(
-            "stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."
-        ),
-        CommandEntry(
-            "pause", "rack.tools.commands.pause:pause", "Pause a rack, or the motion of its arm."
-        ),
-        CommandEntry("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
-        CommandEntry(
-            "step",
-            "rack.tools.commands.step:step",
-            "Let a rack in lockstep go on by single cycles.",
-        ),
-        CommandEntry(
-            "rewind",
-            "rack.tools.commands.rewind:rewind",
-            "Go back to any tick of a recorded run, and branch off.",
-        ),
-        CommandEntry(
-            "list", "rack.tools.commands.list:list_racks", "List the racks on this machine."
-        ),
-        CommandEntry(
-            "clean",
-            "rack.tools.commands.clean:clean",
-            "Remove the shared memory that killed racks left behind.",
-        ),
+        CommandEntry("clean", "Remove the shared memory that killed racks left behind."),
     ),
     "Watch": (
-        CommandEntry("status", "rack.tools.commands.status:status", "Show a running rack once."),
-        CommandEntry("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
-        CommandEntry(
-            "watch",
-            "rack.tools.commands.watch:watch",
-            "Show signals of a running rack, or what was around a moment.",
-        ),
-        CommandEntry(
-            "mailbox",
-            "rack.tools.commands.mailbox:mailbox",
-            "Show what is in a mailbox of a running rack.",
-        ),
-        CommandEntry("record", "rack.tools.commands.record:record", "Record a running rack."),
-        CommandEntry(
-            "replay",
-            "rack.tools.commands.replay:replay",
-            "Open recordings in the viewer, of several racks on one time line.",
-        ),
-        CommandEntry(
-            "export", "rack.tools.commands.export:export", "Write a recorded run as an MCAP file."
-        ),
-        CommandEntry(
-            "report",
-            "rack.tools.commands.report:report",
-            "Report on a recorded run, or compare two runs.",
-        ),
+        CommandEntry("status", "Show a running rack once."),
+        CommandEntry("top", "Watch a running rack until its end."),
+        CommandEntry("watch", "Show signals of a running rack, or what was around a moment."),
+        CommandEntry("mailbox", "Show what is in a mailbox of a running rack."),
+        CommandEntry("record", "Record a running rack."),
+        CommandEntry("replay", "Open recordings in the viewer, of several racks on one time line."),
+        CommandEntry("export", "Write a recorded run as an MCAP file."),
+        CommandEntry("report", "Report on a recorded run, or compare two runs."),
     ),
     "Command and disturb": (
+        CommandEntry("command", "Command one level of a running rack."),
         CommandEntry(
-            "command", "rack.tools.commands.command:command", "Command one level of a running rack."
+            "set", "Set a live parameter of a running rack.", "rack.tools.commands.set:set_param"
         ),
+        CommandEntry("prompt", "Open a Python prompt on the host side of a rack."),
+        CommandEntry("estop", "Engage the brakes of the arm at once, until --reset."),
         CommandEntry(
-            "set", "rack.tools.commands.set:set_param", "Set a live parameter of a running rack."
+            "inject", "Inject a fault into a running rack.", "rack.tools.commands.inject:app"
         ),
-        CommandEntry(
-            "prompt",
-            "rack.tools.commands.prompt:prompt",
-            "Open a Python prompt on the host side of a rack.",
-        ),
-        CommandEntry(
-            "estop",
-            "rack.tools.commands.estop:estop",
-            "Engage the brakes of the arm at once, until --reset.",
-        ),
-        CommandEntry(
-            "inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."
-        ),
-        CommandEntry(
-            "campaign",
-            "rack.tools.commands.campaign:campaign",
-            "Inject random faults into many runs, and judge each.",
-        ),
+        CommandEntry("campaign", "Inject random faults into many runs, and judge each."),
     ),
     "Predict": (
-        CommandEntry(
-            "check", "rack.tools.commands.check:check", "Validate a config and predict its timing."
-        ),
-        CommandEntry(
-            "analyze",
-            "rack.tools.commands.analyze:analyze",
-            "Compare a run with the timing model, equation by equation.",
-        ),
-        CommandEntry(
-            "gantt",
-            "rack.tools.commands.gantt:gantt",
-            "Draw a Gantt chart of a config's schedule, or of a run.",
-        ),
+        CommandEntry("check", "Validate a config and predict its timing."),
+        CommandEntry("analyze", "Compare a run with the timing model, equation by equation."),
+        CommandEntry("gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
     ),
     "Compare": (
-        CommandEntry("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
-        CommandEntry(
-            "reproduce",
-            "rack.tools.commands.reproduce:reproduce",
-            "Reproduce the paper, claim by claim, as one page.",
-        ),
+        CommandEntry("bench", "Measure costs on this machine."),
+        CommandEntry("reproduce", "Reproduce the paper, claim by claim, as one page."),
     ),
     "Bring up": (
         CommandEntry(
-            "robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."
+            "robot", "Bring up any arm, from a model file.", "rack.tools.commands.robot:app"
         ),
     ),
     "Reach others": (
         CommandEntry(
             "lan",
-            "rack.tools.network.group:app",
             "Prepare racks that work together over a network.",
+            "rack.tools.network.group:app",
         ),
     ),
     "Look up": (
-        CommandEntry(
-            "schema",
-            "rack.tools.commands.schema:schema",
-            "Show the keys of a config with their units and defaults.",
-        ),
+        CommandEntry("schema", "Show the keys of a config with their units and defaults."),
     ),
 }
 """All commands, by what one would do with them."""
@@ -209,9 +134,6 @@ def main() -> None:
             raise
         finally:
             _flush()
-        # After a short answer. What it imported need not be taken apart: that would be another
-        # tenth of its time.
-        os._exit(0)
     except Interrupted:
         return
     finally:
@@ -253,11 +175,8 @@ def run_commands() -> None:
         print("help lacks its texts: PYTHONOPTIMIZE=2 (python -OO) removes them", file=sys.stderr)
     try:
         _check_arguments(arguments)
-        if answer := _short_answer(arguments):
-            _print(answer)
-        else:
-            with _head_start(arguments) as crate:
-                sys.exit(commands()(prog_name="rack", obj=crate, standalone_mode=False))
+        with _head_start(arguments) as crate:
+            sys.exit(commands()(prog_name="rack", obj=crate, standalone_mode=False))
     except Failure as failure:
         fail(str(failure), failure.status)
     except OSError as error:
@@ -287,48 +206,6 @@ def _fail_on_system_error(error: OSError) -> NoReturn:
     if error.errno not in (errno.EAGAIN, errno.EMFILE):
         raise error
     fail(refusal(error), 1)
-
-
-def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
-    """Return what answers a command that is given with a name and --json at most; None for any
-    other."""
-    command, *rest = arguments or [""]
-    if command == "--version":
-        return _show_version
-    names = [argument for argument in rest if argument != "--json"]
-    if COMPLETION in os.environ or any(not name or name.startswith("-") for name in names):
-        return None
-    as_json = "--json" in rest
-    match command, names:
-        case "list", []:
-            from rack.tools.commands.answers import list_racks
-
-            return partial(list_racks, as_json)
-        case "status", [] | [_] if "/" not in "".join(names):
-            from rack.tools.commands.answers import show_status
-
-            name = names[0] if names else None
-            return partial(show_status, name, as_json)
-        case "report", [folder]:
-            from rack.tools.timing.analysis.stored import show_report
-
-            return partial(show_report, folder, as_json)
-    return None
-
-
-def _show_version() -> None:
-    from importlib.metadata import version
-
-    print(f"rack {version('nasrem-rack')}")
-
-
-def _print(answer: Callable[[], None]) -> None:
-    """Print an answer, without collecting garbage: that would be a tenth of its time."""
-    gc.disable()
-    try:
-        answer()
-    finally:
-        gc.enable()
 
 
 def _flush(text: str = "") -> None:
@@ -387,11 +264,23 @@ def commands() -> TyperGroup:
             """Load the command; from here on it takes this one's place."""
             return _loaded(self._command).make_context(info_name, args, parent, **extra)
 
+    def show_version(is_asked: bool) -> None:
+        from importlib.metadata import version
+
+        if is_asked:
+            print(f"rack {version('nasrem-rack')}")
+            raise typer.Exit
+
     def rack(
-        version: bool = typer.Option(False, "--version", help="Show the version and exit."),
+        version: bool = typer.Option(
+            False,
+            "--version",
+            help="Show the version and exit.",
+            callback=show_version,
+            is_eager=True,
+        ),
     ) -> None:
-        # It is answered before.
-        assert not version
+        """Take the options that stand before a command."""
 
     app = _app(
         cls=Grouped,
@@ -423,7 +312,8 @@ def _loaded(command: CommandEntry) -> Any:
     """Import a command."""
     import typer
 
-    path, _, attribute = command.source.partition(":")
+    source = command.source or f"rack.tools.commands.{command.name}:{command.name}"
+    path, _, attribute = source.partition(":")
     found = getattr(import_module(path), attribute)
     if not isinstance(found, typer.Typer):
         app = _app()

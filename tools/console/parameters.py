@@ -1,8 +1,4 @@
-"""Arguments and options that several commands have.
-
-They are apart from the answers of commands because typer takes as long to import as numpy: what
-needs no parser does without it.
-"""
+"""Arguments and options that several commands have."""
 
 from __future__ import annotations
 
