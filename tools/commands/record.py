@@ -8,9 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
-
-import typer
+from typing import NoReturn
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -18,7 +16,7 @@ from rack.boards.config.layout import KEPT_S
 from rack.tools.commands.replay import merge
 from rack.tools.console.answer import Document, Failure, fail, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName, View, named_here
+from rack.tools.console.parameters import Json, RackName, View, named_here, option
 from rack.tools.live.folder import folder_of
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder, SafeSink, is_opening
@@ -42,26 +40,12 @@ LOOK_S = 0.1
 
 def record(
     rack: RackName,
-    others: Annotated[
-        list[str],
-        typer.Option(
-            "--with",
-            metavar="RACK",
-            help="record this rack as well; repeatable",
-        ),
-    ] = [],  # noqa: B006  typer copies it
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>"),
-    ] = None,
+    others: list[str] = option("--with RACK", "record this rack as well; repeatable", []),
+    out: Path | None = option("--out DIR", "folder of the recording; default: runs/<rack>-<time>"),
     view: View = False,
-    save: Annotated[
-        bool,
-        typer.Option(
-            "--save",
-            help="save what the recorder of its run has taken so far; the run is untouched",
-        ),
-    ] = False,
+    save: bool = option(
+        "--save", "save what the recorder of its run has taken so far; the run is untouched", False
+    ),
     as_json: Json = False,
 ) -> None:
     """Record a running rack until its run is over, or until Ctrl-C.
