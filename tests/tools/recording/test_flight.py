@@ -119,7 +119,7 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     with pytest.raises(Failure, match=r"the rest was not kept.*cannot be compared"):
         first_difference(recording, recording)
     assert not (folder / FILE).exists()
-    replay([folder], made)
+    replay([folder], made, against=None)
     shown = read(made, "/signals/lower.status/count")
     assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
     # No age is shown where nothing was kept.
