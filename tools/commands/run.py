@@ -139,7 +139,7 @@ def run(
     if step and found.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
-    begins = None
+    begins = Beginning(crate=crate)
     with ExitStack() as stack:
         if origin is not None:
             warm = crate if isinstance(crate, WarmCrate) else None
@@ -150,17 +150,9 @@ def run(
         stack.enter_context(INTERRUPT.orderly(unfinished=unfinished))
         with display_for(silent=as_json) as display:
             if entries is not None:
-                begins = Beginning(entries=recorded_entries(found, entries))
+                begins = Beginning(crate=crate, entries=recorded_entries(found, entries))
             result = run_rack(
-                found,
-                seconds,
-                folder,
-                display,
-                view=view,
-                share=share,
-                crate=crate,
-                step=step,
-                begins=begins,
+                found, seconds, folder, display, view=view, share=share, step=step, begins=begins
             )
         report = _report(found, folder, result, as_json)
     if not report["worked"]:

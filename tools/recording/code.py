@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import platform
 import sys
-from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,15 +33,15 @@ def write_code(config: RackConfig, folder: Path) -> None:
     """Write with what a run is made, after its levels have been loaded. Raises `OSError`."""
     files = [getattr(module, "__file__", None) for module in [*sys.modules.values()]]
     own = [Path(file) for file in files if file]
-    paths = [path for path in own if any(path.is_relative_to(p) for p in config.python_path)]
-    paths += [] if config.robot is None else [config.robot.model.parent]
-    names = ["version", "python", PROGRAM, *map(str, sorted({*paths}))]
-    states = {name: _state_of(name) for name in names}
-    (folder / CODE).write_text(encode_json(states) + "\n")
+    paths = {path for path in own if any(path.is_relative_to(p) for p in config.python_path)}
+    if config.robot is not None:
+        paths.add(config.robot.model.parent)
+    names = ["version", "python", PROGRAM, *sorted(map(str, paths))]
+    (folder / CODE).write_text(encode_json({name: _state_of(name) for name in names}) + "\n")
 
 
-def check_code(recording: Recording, asked: str, anyway: bool) -> Iterator[str]:
-    """Yield what has changed since a run, as one line, if it is to be repeated `anyway`. Raises
+def check_code(recording: Recording, asked: str, anyway: bool) -> None:
+    """Note on stderr what has changed since a run, if it is to be repeated `anyway`. Raises
     `Failure`, which begins with what was `asked`, if it is not."""
     path = recording.folder / CODE
     if not path.exists():
@@ -51,11 +50,13 @@ def check_code(recording: Recording, asked: str, anyway: bool) -> Iterator[str]:
         recording.checksums.verify(CODE)
         recorded: dict[str, str] = json.loads(read_file(path))
         differ = [name for name, state in recorded.items() if _state_of(name) != state]
-        why = f"since it was recorded, these have changed: {', '.join(differ)}" if differ else ""
-    if why and not anyway:
+        if not differ:
+            return
+        shown = ", ".join("the code of rack" if name == PROGRAM else name for name in differ)
+        why = f"since it was recorded, these have changed: {shown}"
+    if not anyway:
         raise Failure(f"{asked}: {why}; --anyway continues it: digests may differ", 2)
-    if why:
-        yield f"{asked}: {why}; digests may differ"
+    print(f"{asked}: {why}; digests may differ", file=sys.stderr)
 
 
 def _state_of(name: str) -> str:
@@ -64,16 +65,14 @@ def _state_of(name: str) -> str:
         return version("nasrem-rack")
     if name == "python":
         return platform.python_version()
+    paths = [path := Path(name)]
     if name == PROGRAM:
         floors = ("backplane", "levels", "boards")
-        return _digest(path for floor in floors for path in (FLOORS / floor).rglob("*.py"))
-    path = Path(name)
-    return _digest(path.rglob("*.xml") if path.is_dir() else [path])
-
-
-def _digest(paths: Iterator[Path] | list[Path]) -> str:
-    found = xxh3_128()
+        paths = [path for floor in floors for path in (FLOORS / floor).rglob("*.py")]
+    elif path.is_dir():
+        paths = [*path.rglob("*.xml")]
+    digest = xxh3_128()
     for path in sorted(paths):
         # One that is gone has another digest.
-        found.update(path.name.encode() + (path.read_bytes() if path.is_file() else b""))
-    return found.hexdigest()
+        digest.update(path.name.encode() + (path.read_bytes() if path.is_file() else b""))
+    return digest.hexdigest()

@@ -70,15 +70,16 @@ class IdleLooks:
 
 
 class RecorderProcess:
-    """A recorder for a rack that is about to run; it imports its libraries while the rack is being
-    launched.
+    """A recorder for a rack that is about to run, which records into `folder`; it imports its
+    libraries while the rack is being launched.
 
     One that dies is restarted up to RESTARTS times, in the same folder; one that hangs is killed
     first. Lockstep waits meanwhile. If its files cannot be written, `news` and `finish` raise
     `Failure`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
         # stderr goes to a file in memory: nobody would empty a pipe.
         self._complaints = os.memfd_create("recorder")
         self._request = b""
@@ -107,15 +108,10 @@ class RecorderProcess:
         """Process id of the recorder."""
         return self._process.pid
 
-    def attach(
-        self, rack: str, folder: Path, port: int | None = None, words: memoryview | None = None
-    ) -> bool:
-        """Record that rack into that folder, and serve a viewer on that port; return False if it
-        has not begun in time.
-
-        With the `words` of a rack in lockstep, that waits for it, in any case.
-        """
-        self._request = encode_json([rack, str(folder), port]).encode() + b"\n"
+    def attach(self, rack: str, port: int | None, words: memoryview) -> bool:
+        """Record that rack, and serve a viewer on that port; return False if it has not begun in
+        time. A rack in lockstep, whose `words` these are, waits for it in any case."""
+        self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
         self._words = words
         self._ask()
         return self.await_begun(ATTACH_S)
