@@ -15,7 +15,7 @@ from importlib import import_module
 from io import StringIO, TextIOBase
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from rack.tools.console.interrupt import INTERRUPT, Interrupted
 
@@ -26,79 +26,65 @@ if TYPE_CHECKING:
     from rack.boards.crate.line import CrateLine
 
 
-class CommandEntry(NamedTuple):
-    """A command: its name, one line of help, and the function or `typer.Typer` that it is.
-
-    `source` names that as "module:attribute"; without one, it has the name of the command, in the
-    module of that name.
-    """
-
-    name: str
-    line: str
-    source: str = ""
-
-
 COMMANDS = {
-    "Run": (
-        CommandEntry("run", "Run a rack until its task ends, and report on the run."),
-        CommandEntry("stop", "End a run and wait until it is gone."),
-        CommandEntry("pause", "Pause a rack, or the motion of its arm."),
-        CommandEntry("resume", "Let a paused rack go on.", "rack.tools.commands.pause:resume"),
-        CommandEntry("step", "Let a rack in lockstep go on by single cycles."),
-        CommandEntry("rewind", "Go back to any tick of a recorded run, and branch off."),
-        CommandEntry(
-            "list", "List the racks on this machine.", "rack.tools.commands.list:list_racks"
-        ),
-        CommandEntry("clean", "Remove the shared memory that killed racks left behind."),
-    ),
-    "Watch": (
-        CommandEntry("status", "Show a running rack once."),
-        CommandEntry("top", "Watch a running rack until its end."),
-        CommandEntry("watch", "Show signals of a running rack, or what was around a moment."),
-        CommandEntry("mailbox", "Show what is in a mailbox of a running rack."),
-        CommandEntry("record", "Record a running rack."),
-        CommandEntry("replay", "Open recordings in the viewer, of several racks on one time line."),
-        CommandEntry("export", "Write a recorded run as an MCAP file."),
-        CommandEntry("report", "Report on a recorded run, or compare two runs."),
-    ),
-    "Command and disturb": (
-        CommandEntry("command", "Command one level of a running rack."),
-        CommandEntry(
-            "set", "Set a live parameter of a running rack.", "rack.tools.commands.set:set_param"
-        ),
-        CommandEntry("prompt", "Open a Python prompt on the host side of a rack."),
-        CommandEntry("estop", "Engage the brakes of the arm at once, until --reset."),
-        CommandEntry(
-            "inject", "Inject a fault into a running rack.", "rack.tools.commands.inject:app"
-        ),
-        CommandEntry("campaign", "Inject random faults into many runs, and judge each."),
-    ),
-    "Predict": (
-        CommandEntry("check", "Validate a config and predict its timing."),
-        CommandEntry("analyze", "Compare a run with the timing model, equation by equation."),
-        CommandEntry("gantt", "Draw a Gantt chart of a config's schedule, or of a run."),
-    ),
-    "Compare": (
-        CommandEntry("bench", "Measure costs on this machine."),
-        CommandEntry("reproduce", "Reproduce the paper, claim by claim, as one page."),
-    ),
-    "Bring up": (
-        CommandEntry(
-            "robot", "Bring up any arm, from a model file.", "rack.tools.commands.robot:app"
-        ),
-    ),
-    "Reach others": (
-        CommandEntry(
-            "lan",
-            "Prepare racks that work together over a network.",
-            "rack.tools.network.group:app",
-        ),
-    ),
-    "Look up": (
-        CommandEntry("schema", "Show the keys of a config with their units and defaults."),
-    ),
+    "Run": {
+        "run": "Run a rack until its task ends, and report on the run.",
+        "stop": "End a run and wait until it is gone.",
+        "pause": "Pause a rack, or the motion of its arm.",
+        "resume": "Let a paused rack go on.",
+        "step": "Let a rack in lockstep go on by single cycles.",
+        "rewind": "Go back to any tick of a recorded run, and branch off.",
+        "list": "List the racks on this machine.",
+        "clean": "Remove the shared memory that killed racks left behind.",
+    },
+    "Watch": {
+        "status": "Show a running rack once.",
+        "top": "Watch a running rack until its end.",
+        "watch": "Show signals of a running rack, or what was around a moment.",
+        "mailbox": "Show what is in a mailbox of a running rack.",
+        "record": "Record a running rack.",
+        "replay": "Open recordings in the viewer, of several racks on one time line.",
+        "export": "Write a recorded run as an MCAP file.",
+        "report": "Report on a recorded run, or compare two runs.",
+    },
+    "Command and disturb": {
+        "command": "Command one level of a running rack.",
+        "set": "Set a live parameter of a running rack.",
+        "prompt": "Open a Python prompt on the host side of a rack.",
+        "estop": "Engage the brakes of the arm at once, until --reset.",
+        "inject": "Inject a fault into a running rack.",
+        "campaign": "Inject random faults into many runs, and judge each.",
+    },
+    "Predict": {
+        "check": "Validate a config and predict its timing.",
+        "analyze": "Compare a run with the timing model, equation by equation.",
+        "gantt": "Draw a Gantt chart of a config's schedule, or of a run.",
+    },
+    "Compare": {
+        "bench": "Measure costs on this machine.",
+        "reproduce": "Reproduce the paper, claim by claim, as one page.",
+    },
+    "Bring up": {
+        "robot": "Bring up any arm, from a model file.",
+    },
+    "Reach others": {
+        "lan": "Prepare racks that work together over a network.",
+    },
+    "Look up": {
+        "schema": "Show the keys of a config with their units and defaults.",
+    },
 }
-"""All commands, by what one would do with them."""
+"""All commands with one line of help, by what one would do with them."""
+SOURCES = {
+    "resume": "rack.tools.commands.pause:resume",
+    "list": "rack.tools.commands.list:list_racks",
+    "set": "rack.tools.commands.set:set_param",
+    "inject": "rack.tools.commands.inject:app",
+    "robot": "rack.tools.commands.robot:app",
+    "lan": "rack.tools.network.group:app",
+}
+"""Where a command is, a function or a `typer.Typer`, as "module:attribute", unless it is the function
+of its name in the module of its name."""
 MAX_ARGUMENT = 4096
 """Characters, as in the longest path; longer values belong in the config file."""
 COMPLETION = "_RACK_COMPLETE"
@@ -249,20 +235,14 @@ def commands() -> TyperGroup:
             """Write a table of the commands for each group."""
             for group, found in COMMANDS.items():
                 with formatter.section(group):
-                    formatter.write_dl([(f"{one.name:9}", one.line) for one in found])
+                    formatter.write_dl([(f"{name:9}", line) for name, line in found.items()])
 
     class LazyCommand(TyperCommand):
         """A command of which only the name and one line of help are known."""
 
-        def __init__(self, command: CommandEntry) -> None:
-            super().__init__(command.name, short_help=command.line)
-            self._command = command
-
-        def make_context(
-            self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
-        ) -> Any:
+        def make_context(self, *given: Any, **named: Any) -> Any:
             """Load the command; from here on it takes this one's place."""
-            return _loaded(self._command).make_context(info_name, args, parent, **extra)
+            return _loaded(str(self.name)).make_context(*given, **named)
 
     def show_version(is_asked: bool) -> None:
         from importlib.metadata import version
@@ -297,8 +277,8 @@ def commands() -> TyperGroup:
     app.callback()(rack)
     group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup), "it has a callback"
-    for command in chain.from_iterable(COMMANDS.values()):
-        group.add_command(LazyCommand(command))
+    for name, line in chain.from_iterable(found.items() for found in COMMANDS.values()):
+        group.add_command(LazyCommand(name, short_help=line))
     return group
 
 
@@ -308,16 +288,16 @@ def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
     return typer.Typer(add_completion=add_completion, rich_markup_mode=None, **settings)
 
 
-def _loaded(command: CommandEntry) -> Any:
+def _loaded(name: str) -> Any:
     """Import a command."""
     import typer
 
-    source = command.source or f"rack.tools.commands.{command.name}:{command.name}"
+    source = SOURCES.get(name, f"rack.tools.commands.{name}:{name}")
     path, _, attribute = source.partition(":")
     found = getattr(import_module(path), attribute)
     if not isinstance(found, typer.Typer):
         app = _app()
-        app.command(command.name)(found)
+        app.command(name)(found)
         found = app
     return typer.main.get_command(found)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Self
 
 from rack.backplane.json_text import encode_json
 from rack.boards.events import CONTINUES
-from rack.tools.console.answer import Document, Failure
+from rack.tools.console.answer import Document
 from rack.tools.recording.checksums import read_file
 from rack.tools.recording.recorder_process import ORIGIN
 
@@ -40,16 +40,12 @@ class Origin:
     @classmethod
     def of(cls, recording: Recording) -> Self | None:
         """Return it for a recorded run; None for one that goes on from no other. Raises `Failure`
-        for a file that is not one of these."""
+        for a damaged file."""
         path = recording.folder / ORIGIN
         if not path.exists():
             return None
         recording.checksums.verify(ORIGIN)
-        try:
-            found = json.loads(read_file(path))
-            return cls(str(found["folder"]), int(found["tick"]), int(found["launched_ns"]))
-        except (ValueError, TypeError, KeyError) as error:
-            raise Failure(f"{path}: not the origin of a run: {error!r}", 2) from None
+        return cls(**json.loads(read_file(path)))
 
     def is_of(self, run: Recording) -> bool:
         """Return whether it is this run, and no other one of that name."""
