@@ -83,8 +83,8 @@ SOURCES = {
     "robot": "rack.tools.commands.robot:app",
     "lan": "rack.tools.network.group:app",
 }
-"""Where a command is, a function or a `typer.Typer`, as "module:attribute", unless it is the function
-of its name in the module of its name."""
+"""Where a command is, a function or a `typer.Typer`, as "module:attribute". Any other one is the
+function of its name in the module of its name."""
 MAX_ARGUMENT = 4096
 """Characters, as in the longest path; longer values belong in the config file."""
 COMPLETION = "_RACK_COMPLETE"

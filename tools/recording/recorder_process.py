@@ -108,9 +108,9 @@ class RecorderProcess:
         """Process id of the recorder."""
         return self._process.pid
 
-    def attach(self, rack: str, port: int | None, words: memoryview) -> bool:
+    def attach(self, rack: str, port: int | None, words: memoryview | None = None) -> bool:
         """Record that rack, and serve a viewer on that port; return False if it has not begun in
-        time. A rack in lockstep, whose `words` these are, waits for it in any case."""
+        time. With the `words` of a rack in lockstep, that waits for it, in any case."""
         self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
         self._words = words
         self._ask()
