@@ -6,17 +6,16 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from rack.backplane.process import COPY, die_with_parent, is_alive, readable
+from rack.backplane.process import COPY, die_with_parent, is_alive
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Failure
-from rack.tools.console.interrupt import descendants
+from rack.tools.console.interrupt import await_ends, descendants
 
 BOUND_S = 2.0
 """Time that killed processes get to end."""
@@ -41,7 +40,7 @@ def left_behind(rack: str, before: set[int]) -> list[str]:
 
     `before`: descendants of this process that were there before the rack.
     """
-    _await_end({*_named(rack), *(children() - before)})
+    await_ends({*_named(rack), *(children() - before)}, BOUND_S)
     processes = _named(rack) | (children() - before)
     files = [str(path) for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
     return files + [f"process {pid} ({_name(pid)})" for pid in sorted(processes)]
@@ -58,19 +57,6 @@ def _name(pid: int) -> str:
     with suppress(FileNotFoundError, ProcessLookupError):
         return Path(f"/proc/{pid}/comm").read_text().rstrip("\n")
     return ""
-
-
-def _await_end(pids: set[int]) -> None:
-    deadline = time.monotonic() + BOUND_S
-    for pid in pids:
-        try:
-            descriptor = os.pidfd_open(pid)
-        except ProcessLookupError:
-            continue
-        try:
-            readable(descriptor, deadline - time.monotonic())
-        finally:
-            os.close(descriptor)
 
 
 def examine(config: RackConfig) -> None:

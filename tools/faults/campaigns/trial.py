@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
+from rack.backplane.layout import Layout
+from rack.backplane.message import State, reason_of, state_name
 from rack.backplane.process import is_alive, start_time
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
@@ -18,19 +20,13 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import BoardError, ConfigError
-from rack.boards.events import Event, Outcome
+from rack.boards.events import Event, Outcome, statuses
+from rack.boards.faults.bounds import struck_mailboxes
+from rack.levels.messages import Error
 from rack.tools.faults.campaigns.base import BaseRack, Start
 from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
-from rack.tools.faults.ending import (
-    ArmEnd,
-    Strike,
-    arm_of,
-    is_late,
-    kill_from_outside,
-    levels_of,
-    strikes,
-)
+from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, arm_of, strikes
 from rack.tools.faults.judge import Circumstances, certain_from
 
 MAX_LENGTH = 4
@@ -123,6 +119,20 @@ class Killer:
         block = self._segment.block(board)
         is_up = block[Block.STATE] == TaskState.RUNNING and not block[Block.LOST]
         return block[Block.PID] if is_up else 0
+
+
+def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
+    """Return the kill of a board at `tick` and at CLOCK_MONOTONIC `time_ns`."""
+    return Strike(
+        fault=-1,
+        kind=EXTERNAL,
+        board=board,
+        began=tick,
+        ends=tick,
+        tick=tick,
+        time_ns=time_ns,
+        mailboxes=tuple(box.name for box in struck_mailboxes(layout, -1, board)),
+    )
 
 
 @dataclass(frozen=True)
@@ -226,6 +236,22 @@ def run_trial(
         again=again,
         start=start,
         is_cut=is_cut,
+    )
+
+
+def levels_of(segment: Segment) -> str:
+    """Return the last state of each level, with its reason, as one readable text."""
+    states = []
+    for writer, status in statuses(segment, "state"):
+        reason = f" ({why})" if (why := reason_of(status)) else ""
+        states.append(f"{writer} {state_name(status.state)}{reason}")
+    return ", ".join(states)
+
+
+def is_late(segment: Segment) -> bool:
+    """Return whether a level gave up because it cannot meet a time."""
+    return any(
+        s.state == State.ERROR and s.error == Error.TOO_LATE for _, s in statuses(segment, "error")
     )
 
 
