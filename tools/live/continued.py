@@ -37,10 +37,9 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
-from rack.tools.recording.code import check_code
 from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
 from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
-from rack.tools.recording.origin import Origin, continued_at
+from rack.tools.recording.origin import Origin, check_code, continued_at
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 

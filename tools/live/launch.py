@@ -28,8 +28,7 @@ from rack.tools.live.other_racks import OtherEnd, OtherRacks
 from rack.tools.live.queues import queue_fills
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.live.verdict import list_failures
-from rack.tools.recording.code import write_code
-from rack.tools.recording.origin import Origin
+from rack.tools.recording.origin import Origin, write_code
 from rack.tools.recording.recorder_process import RecorderProcess
 
 COUNTED = (
