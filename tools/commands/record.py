@@ -4,29 +4,35 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
+from shutil import copyfile
 from threading import Event
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.commands.replay import merge
+from rack.tools.commands.status import recorded_by
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, View, named_here, option
 from rack.tools.live.folder import folder_of
-from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.checksums import CHECKSUMS
+from rack.tools.recording.parquet import CONFIG, PUBLISHED
 from rack.tools.recording.recorder_process import (
+    CODE,
+    ORIGIN,
+    SPOOL,
     RecorderProcess,
-    recorded_by,
     recorded_line,
     size_of,
     size_text,
     sizes,
 )
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import save as save_run
+from rack.tools.recording.run_files import EVENTS, mend
+from rack.tools.recording.spool import STRETCHES, stretch_files
 from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
@@ -109,6 +115,18 @@ def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
     line = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {much}"
     times = {"since_s": since_s, "until_s": until_s}
     return {"rack": name, "folder": str(folder), **times, "bytes": size}, line
+
+
+def save_run(folder: Path, into: Path) -> None:
+    """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
+    on."""
+    stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
+    for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
+        (into / name).parent.mkdir(parents=True, exist_ok=True)
+        # The flight recorder may have removed it meanwhile; few runs have an origin.
+        with suppress(FileNotFoundError):
+            copyfile(folder / name, into / name)
+    mend(into)
 
 
 def _begin(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:

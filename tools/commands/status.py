@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rack.backplane.segment import Segment, racks
+from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import Json, named_here, rack_names
 from rack.tools.console.tables import console
 from rack.tools.live.display import RackView
 from rack.tools.live.snapshot import RackMonitor
-from rack.tools.recording.recorder_process import recorded_by, recorded_line, size_of
+from rack.tools.recording.recorder_process import SPOOL, recorded_line, size_of
 
 OnlyRack = Annotated[
     str | None,
@@ -61,3 +63,18 @@ def only_rack() -> str:
     if len(running) > 1:
         raise Failure(f"RACK is missing; racks: {', '.join(running)}", 2)
     return running[0]
+
+
+def recorded_by(segment: Segment) -> Path | None:
+    """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
+    seen from this PID namespace."""
+    if not segment.launcher:
+        return None
+    pid = segment.words[System.FOLLOWER_PID]
+    with suppress(OSError):
+        for file in Path(f"/proc/{pid}/fd").iterdir():
+            # Descriptors come and go.
+            with suppress(OSError):
+                if (path := file.readlink()).name == SPOOL:
+                    return path.parent
+    return None

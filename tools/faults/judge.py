@@ -113,19 +113,12 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
     is not found yet. A fault of the arm that is over before its bound, and is not found, has not
     struck; nor has one whose run ends before the bound of its recovery.
     """
-    return _Judge(strikes, events, run).verdict()
+    return Judge(strikes, events, run).verdict()
 
 
-def certain_from(
-    strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances, tick: int
-) -> int | None:
-    """Return the tick from which nothing that happens later can change the judgement of a run's
-    faults, as far as is known before `tick`; a later one at which to ask again; None: its end."""
-    now = Event(0, tick, "end", "", "")
-    return _Judge(strikes, [*events, now], run).certain_from(tick)
+class Judge:
+    """The judge of one run's faults."""
 
-
-class _Judge:
     def __init__(
         self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
     ) -> None:
@@ -140,6 +133,7 @@ class _Judge:
         self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
 
     def verdict(self) -> FaultVerdict:
+        """Return the judgement of each fault, and what none of them explains."""
         used: set[int] = set()
         judged = []
         windows = [self._window(strike) for strike in self._strikes]
@@ -170,32 +164,6 @@ class _Judge:
             misses=tuple(event for event in stray if event.kind == "miss"),
         )
 
-    def certain_from(self, tick: int) -> int | None:
-        latest = tick
-        for strike, found in zip(self._strikes, self.verdict().faults, strict=True):
-            closes = self._closes(strike, found, tick)
-            if closes is None:
-                return None
-            latest = max(latest, closes)
-        return latest
-
-    def _closes(self, strike: Strike, found: Judgement, tick: int) -> int | None:
-        """Return the tick from which the judgement of a fault is certain, as in `certain_from`."""
-        again = tick + self._settle
-        if strike.began < 0:
-            return again
-        if strike.ends >= NEVER:
-            return None
-        ends = _end_of(strike)
-        if strike.tick < 0 and ends >= tick:
-            return again
-        closes = self._last_trace(strike, ends) + 1
-        if closes > tick:
-            return closes
-        # Its writer may find the fault of a plan at any later time, or have something to write.
-        is_open = self._window(strike)[1] >= tick and found.seen != "detected"
-        return again if is_open or not found.is_recovered else tick
-
     def _bound(self, strike: Strike, reader: str | None = None) -> int | None:
         """Return the ticks from its strike within which a fault must be found, by a reader or,
         None, by any process.
@@ -215,7 +183,7 @@ class _Judge:
         if strike.record.takes_mailbox and self._layout.task(strike.board).role == "planner":
             # The plan's writer itself may find the fault, when it makes the next plan.
             return strike.first - 1, self._last
-        return strike.first - 1, self._last_trace(strike, min(_end_of(strike), self._last))
+        return strike.first - 1, self._last_trace(strike, min(end_of(strike), self._last))
 
     def _last_trace(self, strike: Strike, ends: int) -> int:
         """Return the last tick at which an event may come of a fault that ends at a tick."""
@@ -282,7 +250,7 @@ class _Judge:
         after = aftermath(strike, self._events, horizon, owed)
         found = best.event.tick if best else strike.tick
         # Ticks from the strike within which every reaction must be undone.
-        ends = max(min(_end_of(strike), self._last), found)
+        ends = max(min(end_of(strike), self._last), found)
         recovery_bound = ends - strike.tick + self._recovery(strike)
         if not all(map(self._is_periodic, owed)):
             # Nothing says when its writer has something to write.
@@ -346,7 +314,7 @@ class _Judge:
         return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
 
 
-def _end_of(strike: Strike) -> int:
+def end_of(strike: Strike) -> int:
     """Return the tick at which a fault ends, in the run or as planned."""
     # A task that hangs is killed as soon as that is found, however long it was to hang.
     return strike.tick if strike.record.consequence.ends_process else strike.ends

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from rack.backplane.json_text import encode_json
 from rack.backplane.process import STOPPED, processor_ns, readable, state_of
-from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 
@@ -228,21 +227,6 @@ class RecorderProcess:
         self._has_begun |= BEGUN in texts
         self._lines += [line for line in texts if line != BEGUN]
         return bool(block)
-
-
-def recorded_by(segment: Segment) -> Path | None:
-    """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
-    seen from this PID namespace."""
-    if not segment.launcher:
-        return None
-    pid = segment.words[System.FOLLOWER_PID]
-    with suppress(OSError):
-        for file in Path(f"/proc/{pid}/fd").iterdir():
-            # Descriptors come and go.
-            with suppress(OSError):
-                if (path := file.readlink()).name == SPOOL:
-                    return path.parent
-    return None
 
 
 def size_of(folder: Path) -> int:

@@ -24,10 +24,11 @@ from rack.boards.events import Event, Outcome, statuses
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.levels.messages import Error
 from rack.tools.faults.campaigns.base import BaseRack, Start
+from rack.tools.faults.campaigns.certainty import Certainty
 from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
 from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, arm_of, strikes
-from rack.tools.faults.judge import Circumstances, certain_from
+from rack.tools.faults.judge import Circumstances
 
 MAX_LENGTH = 4
 GRACE_S = 60.0
@@ -266,42 +267,6 @@ def _circumstances(rack: Rack, plan: Plan) -> Circumstances:
         has_failed=rack.outcome is not None and not rack.outcome.worked,
         moving=tuple(motion.body for motion in config.scene.motion),
     )
-
-
-class Certainty:
-    """Ends a trial in lockstep as soon as nothing that follows can change the verdict on a fault.
-
-    It holds the rack before the ticks at which that may be so. `is_reached`: it has ended the
-    trial.
-    """
-
-    def __init__(self, rack: Rack, joints: Sequence[str], run: Circumstances) -> None:
-        self.is_reached = False
-        self._rack = rack
-        self._joints = joints
-        self._run = run
-        self._words = rack.segment.words
-        self._hold(max(0, rack.begins_at))
-
-    def look(self) -> None:
-        """Judge, if the rack is held; then let it go on, or end."""
-        tick = self._words[System.HELD] - 1
-        if tick < 0 or self.is_reached:
-            return
-        struck = strikes(self._rack.segment, self._joints)
-        certain_at = certain_from(struck, self._rack.events, self._run, tick)
-        if certain_at is None:
-            # It runs to its end.
-            self._words[System.HOLD_AT] = 0
-        elif certain_at > tick:
-            self._hold(certain_at)
-        else:
-            self.is_reached = True
-            self._words[System.STOP_TICK] = max(tick, 1)
-            self._words[System.HOLD_AT] = 0
-
-    def _hold(self, tick: int) -> None:
-        self._words[System.HOLD_AT] = tick + 1
 
 
 def _watch(
