@@ -183,13 +183,7 @@ def run_trial(
     start = Start(whole="as asked") if base is None else base.start_of(plan, crate, seconds)
     before = children()
     started = time.monotonic()
-    snapshots = None if base is None else base.snapshots_for(plan)
-    rack = Rack(
-        plan.config(config, rack_name),
-        crate=crate,
-        snapshots=snapshots,
-        continues=start.continues,
-    )
+    rack = Rack(plan.config(config, rack_name), crate=crate, continues=start.continues)
     refused = ""
     is_cut = False
     levels = ""
