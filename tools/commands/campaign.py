@@ -109,11 +109,7 @@ def campaign(
         injections = 0
     if sizes is None:
         sizes = 0 if kills or realtime else SIZES
-    modes: tuple[bool, ...] = (True, False)
-    if lockstep:
-        modes = (True,)
-    elif realtime:
-        modes = (False,)
+    modes = (lockstep,) if lockstep or realtime else (True, False)
     loads = (True,) if load else (False, True)
     order = Order(
         name=config,

@@ -13,7 +13,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
 from rack.backplane.layout import Layout
 from rack.backplane.message import State, reason_of, state_name
-from rack.backplane.process import is_alive, start_time
+from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
@@ -95,22 +95,14 @@ class Killer:
 
     def _kill(self, board: str) -> bool:
         pid = self._pid(board)
-        started = start_time(pid)
-        if not started:
+        if not is_alive(pid):
             return False
+        tick = self._words[System.TICK]
+        kill = kill_from_outside(self._segment.layout, board, tick, time.monotonic_ns())
         with suppress(ProcessLookupError):
-            descriptor = os.pidfd_open(pid)
-            try:
-                # The number may have become another process's between the two looks.
-                if self._pid(board) == pid and is_alive(pid, started):
-                    layout = self._segment.layout
-                    tick = self._words[System.TICK]
-                    kill = kill_from_outside(layout, board, tick, time.monotonic_ns())
-                    signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-                    self.done.append(kill)
-                    return True
-            finally:
-                os.close(descriptor)
+            os.kill(pid, signal.SIGKILL)
+            self.done.append(kill)
+            return True
         return False
 
     def _pid(self, board: str) -> int:
@@ -278,13 +270,13 @@ def _watch(
         killer.advance()
         if certainty is not None:
             certainty.look()
-        if words[System.TICK] != seen and not stopped:
-            seen = words[System.TICK]
-            deadline = time.monotonic() + STILL_S
-        is_overdue = time.monotonic() > deadline
-        if stopped and is_overdue:
+        now = time.monotonic()
+        if stopped and now > deadline:
             return
-        if not stopped and (is_overdue or seen > most_ticks):
+        if not stopped and words[System.TICK] != seen:
+            seen = words[System.TICK]
+            deadline = now + STILL_S
+        if not stopped and (now > deadline or seen > most_ticks):
             rack.stop("the trial takes too long")
             stopped = True
-            deadline = time.monotonic() + STUCK_S
+            deadline = now + STUCK_S
