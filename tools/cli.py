@@ -154,14 +154,14 @@ def _open_closed_streams() -> None:
 
 def run_commands() -> None:
     """Run the command line in this process, without handling signals."""
-    from rack.tools.console.answer import Failure, exit_status, fail
+    from rack.tools.console.answer import Failure, as_failure, fail
 
     arguments = sys.argv[1:]
     if sys.flags.optimize > 1 and "--help" in arguments:
         print("help lacks its texts: PYTHONOPTIMIZE=2 (python -OO) removes them", file=sys.stderr)
     try:
         _check_arguments(arguments)
-        with _head_start(arguments) as crate:
+        with as_failure(), _head_start(arguments) as crate:
             sys.exit(commands()(prog_name="rack", obj=crate, standalone_mode=False))
     except Failure as failure:
         fail(str(failure), failure.status)
@@ -169,13 +169,10 @@ def run_commands() -> None:
         _fail_on_system_error(error)
     except Exception as error:
         # The parser's own, of a wrong usage; it is not imported for this.
-        if hasattr(error, "show"):
-            error.show(usage := StringIO())
-            fail(usage.getvalue().rstrip(), 2)
-        known = exit_status(error)
-        if known is None:
+        if not hasattr(error, "show"):
             raise
-        fail(str(error), known)
+        error.show(usage := StringIO())
+        fail(usage.getvalue().rstrip(), 2)
 
 
 def _fail_on_system_error(error: OSError) -> NoReturn:
