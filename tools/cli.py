@@ -1,24 +1,21 @@
 """The `rack` command line. A command's module is imported only when that command runs or shows its
 help.
 
-The parser, typer, takes longer to import than short commands take to run: what needs none goes past
-it, and `rack run` starts its crate before it.
+The parser, typer, takes long to import: `rack run` starts its crate before it.
 """
 
 from __future__ import annotations
 
 import errno
-import gc
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import partial
 from importlib import import_module
 from io import StringIO, TextIOBase
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from rack.tools.console.interrupt import INTERRUPT, Interrupted
 
@@ -29,151 +26,65 @@ if TYPE_CHECKING:
     from rack.boards.crate.line import CrateLine
 
 
-class CommandEntry(NamedTuple):
-    """A command.
-
-    Attributes:
-        name: Name on the command line.
-        source: Module and function, or `typer.Typer`, in it.
-        line: One line of help.
-    """
-
-    name: str
-    source: str
-    line: str
-
-
 COMMANDS = {
-    "Run": (
-        CommandEntry(
-            "run",
-            "rack.tools.commands.run:run",
-            "Run a rack until its task ends, and report on the run.",
-        ),
-        CommandEntry(
-            "stop", "rack.tools.commands.stop:stop", "End a run and wait until it is gone."
-        ),
-        CommandEntry(
-            "pause", "rack.tools.commands.pause:pause", "Pause a rack, or the motion of its arm."
-        ),
-        CommandEntry("resume", "rack.tools.commands.pause:resume", "Let a paused rack go on."),
-        CommandEntry(
-            "step",
-            "rack.tools.commands.step:step",
-            "Let a rack in lockstep go on by single cycles.",
-        ),
-        CommandEntry(
-            "rewind",
-            "rack.tools.commands.rewind:rewind",
-            "Go back to any tick of a recorded run, and branch off.",
-        ),
-        CommandEntry(
-            "list", "rack.tools.commands.list:list_racks", "List the racks on this machine."
-        ),
-        CommandEntry(
-            "clean",
-            "rack.tools.commands.clean:clean",
-            "Remove the shared memory that killed racks left behind.",
-        ),
-    ),
-    "Watch": (
-        CommandEntry("status", "rack.tools.commands.status:status", "Show a running rack once."),
-        CommandEntry("top", "rack.tools.commands.top:top", "Watch a running rack until its end."),
-        CommandEntry(
-            "watch",
-            "rack.tools.commands.watch:watch",
-            "Show signals of a running rack, or what was around a moment.",
-        ),
-        CommandEntry(
-            "mailbox",
-            "rack.tools.commands.mailbox:mailbox",
-            "Show what is in a mailbox of a running rack.",
-        ),
-        CommandEntry("record", "rack.tools.commands.record:record", "Record a running rack."),
-        CommandEntry(
-            "replay",
-            "rack.tools.commands.replay:replay",
-            "Open recordings in the viewer, of several racks on one time line.",
-        ),
-        CommandEntry(
-            "export", "rack.tools.commands.export:export", "Write a recorded run as an MCAP file."
-        ),
-        CommandEntry(
-            "report",
-            "rack.tools.commands.report:report",
-            "Report on a recorded run, or compare two runs.",
-        ),
-    ),
-    "Command and disturb": (
-        CommandEntry(
-            "command", "rack.tools.commands.command:command", "Command one level of a running rack."
-        ),
-        CommandEntry(
-            "set", "rack.tools.commands.set:set_param", "Set a live parameter of a running rack."
-        ),
-        CommandEntry(
-            "prompt",
-            "rack.tools.commands.prompt:prompt",
-            "Open a Python prompt on the host side of a rack.",
-        ),
-        CommandEntry(
-            "estop",
-            "rack.tools.commands.estop:estop",
-            "Engage the brakes of the arm at once, until --reset.",
-        ),
-        CommandEntry(
-            "inject", "rack.tools.commands.inject:app", "Inject a fault into a running rack."
-        ),
-        CommandEntry(
-            "campaign",
-            "rack.tools.commands.campaign:campaign",
-            "Inject random faults into many runs, and judge each.",
-        ),
-    ),
-    "Predict": (
-        CommandEntry(
-            "check", "rack.tools.commands.check:check", "Validate a config and predict its timing."
-        ),
-        CommandEntry(
-            "analyze",
-            "rack.tools.commands.analyze:analyze",
-            "Compare a run with the timing model, equation by equation.",
-        ),
-        CommandEntry(
-            "gantt",
-            "rack.tools.commands.gantt:gantt",
-            "Draw a Gantt chart of a config's schedule, or of a run.",
-        ),
-    ),
-    "Compare": (
-        CommandEntry("bench", "rack.tools.commands.bench:bench", "Measure costs on this machine."),
-        CommandEntry(
-            "reproduce",
-            "rack.tools.commands.reproduce:reproduce",
-            "Reproduce the paper, claim by claim, as one page.",
-        ),
-    ),
-    "Bring up": (
-        CommandEntry(
-            "robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."
-        ),
-    ),
-    "Reach others": (
-        CommandEntry(
-            "lan",
-            "rack.tools.network.group:app",
-            "Prepare racks that work together over a network.",
-        ),
-    ),
-    "Look up": (
-        CommandEntry(
-            "schema",
-            "rack.tools.commands.schema:schema",
-            "Show the keys of a config with their units and defaults.",
-        ),
-    ),
+    "Run": {
+        "run": "Run a rack until its task ends, and report on the run.",
+        "stop": "End a run and wait until it is gone.",
+        "pause": "Pause a rack, or the motion of its arm.",
+        "resume": "Let a paused rack go on.",
+        "step": "Let a rack in lockstep go on by single cycles.",
+        "rewind": "Go back to any tick of a recorded run, and branch off.",
+        "list": "List the racks on this machine.",
+        "clean": "Remove the shared memory that killed racks left behind.",
+    },
+    "Watch": {
+        "status": "Show a running rack once.",
+        "top": "Watch a running rack until its end.",
+        "watch": "Show signals of a running rack, or what was around a moment.",
+        "mailbox": "Show what is in a mailbox of a running rack.",
+        "record": "Record a running rack.",
+        "replay": "Open recordings in the viewer, of several racks on one time line.",
+        "export": "Write a recorded run as an MCAP file.",
+        "report": "Report on a recorded run, or compare two runs.",
+    },
+    "Command and disturb": {
+        "command": "Command one level of a running rack.",
+        "set": "Set a live parameter of a running rack.",
+        "prompt": "Open a Python prompt on the host side of a rack.",
+        "estop": "Engage the brakes of the arm at once, until --reset.",
+        "inject": "Inject a fault into a running rack.",
+        "campaign": "Inject random faults into many runs, and judge each.",
+    },
+    "Predict": {
+        "check": "Validate a config and predict its timing.",
+        "analyze": "Compare a run with the timing model, equation by equation.",
+        "gantt": "Draw a Gantt chart of a config's schedule, or of a run.",
+    },
+    "Compare": {
+        "bench": "Measure costs on this machine.",
+        "reproduce": "Reproduce the paper, claim by claim, as one page.",
+    },
+    "Bring up": {
+        "robot": "Bring up any arm, from a model file.",
+    },
+    "Reach others": {
+        "lan": "Prepare racks that work together over a network.",
+    },
+    "Look up": {
+        "schema": "Show the keys of a config with their units and defaults.",
+    },
 }
-"""All commands, by what one would do with them."""
+"""All commands with one line of help, by what one would do with them."""
+SOURCES = {
+    "resume": "rack.tools.commands.pause:resume",
+    "list": "rack.tools.commands.list:list_racks",
+    "set": "rack.tools.commands.set:set_param",
+    "inject": "rack.tools.commands.inject:app",
+    "robot": "rack.tools.commands.robot:app",
+    "lan": "rack.tools.network.group:app",
+}
+"""Where a command is, a function or a `typer.Typer`, as "module:attribute". Any other one is the
+function of its name in the module of its name."""
 MAX_ARGUMENT = 4096
 """Characters, as in the longest path; longer values belong in the config file."""
 COMPLETION = "_RACK_COMPLETE"
@@ -209,9 +120,6 @@ def main() -> None:
             raise
         finally:
             _flush()
-        # After a short answer. What it imported need not be taken apart: that would be another
-        # tenth of its time.
-        os._exit(0)
     except Interrupted:
         return
     finally:
@@ -246,31 +154,25 @@ def _open_closed_streams() -> None:
 
 def run_commands() -> None:
     """Run the command line in this process, without handling signals."""
-    from rack.tools.console.answer import Failure, exit_status, fail
+    from rack.tools.console.answer import Failure, as_failure, fail
 
     arguments = sys.argv[1:]
     if sys.flags.optimize > 1 and "--help" in arguments:
         print("help lacks its texts: PYTHONOPTIMIZE=2 (python -OO) removes them", file=sys.stderr)
     try:
         _check_arguments(arguments)
-        if answer := _short_answer(arguments):
-            _print(answer)
-        else:
-            with _head_start(arguments) as crate:
-                sys.exit(commands()(prog_name="rack", obj=crate, standalone_mode=False))
+        with as_failure(), _head_start(arguments) as crate:
+            sys.exit(commands()(prog_name="rack", obj=crate, standalone_mode=False))
     except Failure as failure:
         fail(str(failure), failure.status)
     except OSError as error:
         _fail_on_system_error(error)
     except Exception as error:
         # The parser's own, of a wrong usage; it is not imported for this.
-        if hasattr(error, "show"):
-            error.show(usage := StringIO())
-            fail(usage.getvalue().rstrip(), 2)
-        known = exit_status(error)
-        if known is None:
+        if not hasattr(error, "show"):
             raise
-        fail(str(error), known)
+        error.show(usage := StringIO())
+        fail(usage.getvalue().rstrip(), 2)
 
 
 def _fail_on_system_error(error: OSError) -> NoReturn:
@@ -287,48 +189,6 @@ def _fail_on_system_error(error: OSError) -> NoReturn:
     if error.errno not in (errno.EAGAIN, errno.EMFILE):
         raise error
     fail(refusal(error), 1)
-
-
-def _short_answer(arguments: Sequence[str]) -> Callable[[], None] | None:
-    """Return what answers a command that is given with a name and --json at most; None for any
-    other."""
-    command, *rest = arguments or [""]
-    if command == "--version":
-        return _show_version
-    names = [argument for argument in rest if argument != "--json"]
-    if COMPLETION in os.environ or any(not name or name.startswith("-") for name in names):
-        return None
-    as_json = "--json" in rest
-    match command, names:
-        case "list", []:
-            from rack.tools.commands.answers import list_racks
-
-            return partial(list_racks, as_json)
-        case "status", [] | [_] if "/" not in "".join(names):
-            from rack.tools.commands.answers import show_status
-
-            name = names[0] if names else None
-            return partial(show_status, name, as_json)
-        case "report", [folder]:
-            from rack.tools.timing.analysis.stored import show_report
-
-            return partial(show_report, folder, as_json)
-    return None
-
-
-def _show_version() -> None:
-    from importlib.metadata import version
-
-    print(f"rack {version('nasrem-rack')}")
-
-
-def _print(answer: Callable[[], None]) -> None:
-    """Print an answer, without collecting garbage: that would be a tenth of its time."""
-    gc.disable()
-    try:
-        answer()
-    finally:
-        gc.enable()
 
 
 def _flush(text: str = "") -> None:
@@ -372,26 +232,32 @@ def commands() -> TyperGroup:
             """Write a table of the commands for each group."""
             for group, found in COMMANDS.items():
                 with formatter.section(group):
-                    formatter.write_dl([(f"{one.name:9}", one.line) for one in found])
+                    formatter.write_dl([(f"{name:9}", line) for name, line in found.items()])
 
     class LazyCommand(TyperCommand):
         """A command of which only the name and one line of help are known."""
 
-        def __init__(self, command: CommandEntry) -> None:
-            super().__init__(command.name, short_help=command.line)
-            self._command = command
-
-        def make_context(
-            self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any
-        ) -> Any:
+        def make_context(self, *given: Any, **named: Any) -> Any:
             """Load the command; from here on it takes this one's place."""
-            return _loaded(self._command).make_context(info_name, args, parent, **extra)
+            return _loaded(str(self.name)).make_context(*given, **named)
+
+    def show_version(is_asked: bool) -> None:
+        from importlib.metadata import version
+
+        if is_asked:
+            print(f"rack {version('nasrem-rack')}")
+            raise typer.Exit
 
     def rack(
-        version: bool = typer.Option(False, "--version", help="Show the version and exit."),
+        version: bool = typer.Option(
+            False,
+            "--version",
+            help="Show the version and exit.",
+            callback=show_version,
+            is_eager=True,
+        ),
     ) -> None:
-        # It is answered before.
-        assert not version
+        """Take the options that stand before a command."""
 
     app = _app(
         cls=Grouped,
@@ -408,8 +274,8 @@ def commands() -> TyperGroup:
     app.callback()(rack)
     group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup), "it has a callback"
-    for command in chain.from_iterable(COMMANDS.values()):
-        group.add_command(LazyCommand(command))
+    for name, line in chain.from_iterable(found.items() for found in COMMANDS.values()):
+        group.add_command(LazyCommand(name, short_help=line))
     return group
 
 
@@ -419,15 +285,16 @@ def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
     return typer.Typer(add_completion=add_completion, rich_markup_mode=None, **settings)
 
 
-def _loaded(command: CommandEntry) -> Any:
+def _loaded(name: str) -> Any:
     """Import a command."""
     import typer
 
-    path, _, attribute = command.source.partition(":")
+    source = SOURCES.get(name, f"rack.tools.commands.{name}:{name}")
+    path, _, attribute = source.partition(":")
     found = getattr(import_module(path), attribute)
     if not isinstance(found, typer.Typer):
         app = _app()
-        app.command(command.name)(found)
+        app.command(name)(found)
         found = app
     return typer.main.get_command(found)
 

@@ -21,7 +21,7 @@ from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
 
 LONG = "a" * 5000
-NAMES = [one.name for found in COMMANDS.values() for one in found]
+NAMES = [name for found in COMMANDS.values() for name in found]
 
 
 def run_process(
@@ -181,7 +181,7 @@ def test_no_campaign_lasts_for_ever_or_less_than_nothing(option: str) -> None:
 
 def test_help_has_a_whole_line_for_every_command_by_groups() -> None:
     listed = "".join(
-        f" {group}: " + "".join(f"{one.name} {one.line} " for one in found)
+        f" {group}: " + "".join(f"{name} {line} " for name, line in found.items())
         for group, found in COMMANDS.items()
     )
     assert len({*NAMES}) == len(NAMES)

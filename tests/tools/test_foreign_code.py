@@ -176,7 +176,7 @@ def guarded(spied: Spied, monkeypatch: pytest.MonkeyPatch) -> Iterator[Spied]:
 
 
 def test_every_command_is_tried_or_said_to_run_what_a_config_names() -> None:
-    assert {one.name for found in COMMANDS.values() for one in found} == {
+    assert {name for found in COMMANDS.values() for name in found} == {
         *RUNS_THEM,
         *ARGUMENTS,
         *AS_PROCESSES,

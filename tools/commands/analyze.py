@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from rack.tools.console.answer import print_json, write_json
-from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.parameters import Json, RunFolder, option
 from rack.tools.console.progress import reading_progress
 from rack.tools.console.tables import print_blocks
 from rack.tools.recording.recording import Recording
@@ -20,32 +17,18 @@ from rack.tools.timing.operator_response import show
 
 def analyze(
     run: RunFolder,
-    percentile: Annotated[
-        float,
-        typer.Option(
-            metavar="P",
-            min=1.0,
-            max=100.0,
-            help=(
-                "judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as"
-                " in eq. 3.6"
-            ),
-        ),
-    ] = 100.0,
-    response: Annotated[
-        bool,
-        typer.Option(
-            "--response", help="instead: the response to an operator's commands, with its bounds"
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="folder for the results; default: the run's own"),
-    ] = None,
-    verbose: Annotated[
-        bool,
-        typer.Option("--verbose", help="add the tables of levels, tasks and equations"),
-    ] = False,
+    percentile: float = option(
+        "--percentile P",
+        "judge by the longest of P in 100 cycles, as in 99.9; 100: of all cycles, as in eq. 3.6",
+        100.0,
+        min=1.0,
+        max=100.0,
+    ),
+    response: bool = option(
+        "--response", "instead: the response to an operator's commands, with its bounds", False
+    ),
+    out: Path | None = option("--out DIR", "folder for the results; default: the run's own"),
+    verbose: bool = option("--verbose", "add the tables of levels, tasks and equations", False),
     as_json: Json = False,
 ) -> None:
     """Compare a run with the timing model: every equation that `rack check` predicts, with its

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, config_names
+from rack.tools.console.parameters import Json, config_names, option
 from rack.tools.lab.benches.harness import show
 
 Config = Annotated[
@@ -46,13 +46,10 @@ def interruptible(context: typer.Context) -> None:
 @bench.command()
 def machine(
     config: Config = "nasrem",
-    rate: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--rate", metavar="HZ", min=1, max=10_000, help="rate; may be given several times"
-        ),
-    ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="time of one run")] = 5.0,
+    rate: list[float] | None = option(
+        "--rate HZ", "rate; may be given several times", min=1, max=10_000
+    ),
+    seconds: float = option("--seconds S", "time of one run", 5.0, min=0.1),
     rounds: Rounds = 2,
     share: Share = False,
     as_json: Json = False,
@@ -86,9 +83,7 @@ def machine(
 
 @bench.command()
 def mailbox(
-    rounds: Annotated[
-        int, typer.Option(metavar="N", min=1, help="turns of every contestant")
-    ] = 200,
+    rounds: int = option("--rounds N", "turns of every contestant", 200, min=1),
     as_json: Json = False,
 ) -> None:
     """What does a message cost, next to iceoryx2 and pipes?
@@ -104,9 +99,7 @@ def mailbox(
 @bench.command()
 def cycle(
     against: Against = None,
-    seconds: Annotated[
-        float, typer.Option(metavar="S", min=2.0, max=1e9, help="simulated seconds of one run")
-    ] = 6.0,
+    seconds: float = option("--seconds S", "simulated seconds of one run", 6.0, min=2.0, max=1e9),
     rounds: Rounds = 3,
     share: Share = False,
     as_json: Json = False,
@@ -126,10 +119,9 @@ def cycle(
 @bench.command()
 def lockstep(
     against: Against = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(metavar="S", min=1.0, max=1e9, help="simulated seconds of one run, at most"),
-    ] = None,
+    seconds: float | None = option(
+        "--seconds S", "simulated seconds of one run, at most", min=1.0, max=1e9
+    ),
     rounds: Rounds = 3,
     as_json: Json = False,
 ) -> None:
@@ -149,7 +141,7 @@ def lockstep(
 def launch(
     config: Config = "nasrem",
     rounds: Rounds = 10,
-    kills: Annotated[int, typer.Option(metavar="N", min=1, help="kills of the board")] = 10,
+    kills: int = option("--kills N", "kills of the board", 10, min=1),
     against: Against = None,
     share: Share = False,
     as_json: Json = False,

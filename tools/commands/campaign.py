@@ -6,12 +6,10 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from rack.tools.console.answer import Failure, print_json, write_json
-from rack.tools.console.parameters import ConfigName, Json, Settings
+from rack.tools.console.parameters import ConfigName, Json, Settings, option
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 
 if TYPE_CHECKING:
@@ -28,80 +26,40 @@ MOST = 100_000
 
 def campaign(
     config: ConfigName,
-    injections: Annotated[
-        int,
-        typer.Option(
-            "--injections", metavar="N", min=0, max=MOST, help="strikes of each kind, at least"
-        ),
-    ] = INJECTIONS,
-    seed: Annotated[
-        int,
-        typer.Option("--seed", metavar="S", min=0, help="seed; the same seed draws the same plans"),
-    ] = 0,
-    kinds: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="only these kinds; default: all that the rack can have"),
-    ] = None,
-    kills: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, max=MOST, help="instead: only N kills from outside"),
-    ] = None,
-    lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="trials in lockstep only; default: both")
-    ] = False,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="trials in real time only; default: both")
-    ] = False,
-    faultless: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S",
-            min=0.0,
-            max=1e6,
-            help=f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
-        ),
-    ] = None,
-    load: Annotated[
-        bool,
-        typer.Option(
-            "--load", help="without faults: only under load, by stress-ng where installed"
-        ),
-    ] = False,
-    sizes: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            min=0,
-            max=MOST,
-            help=f"sizes on each curve of size against delay; default {SIZES}",
-        ),
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S",
-            min=1.0,
-            max=1e9,
-            help="simulated seconds of a run, for a rack that no task ends",
-        ),
-    ] = None,
+    injections: int = option(
+        "--injections N", "strikes of each kind, at least", INJECTIONS, min=0, max=MOST
+    ),
+    seed: int = option("--seed S", "seed; the same seed draws the same plans", 0, min=0),
+    kinds: str | None = option(
+        "--kinds A,B", "only these kinds; default: all that the rack can have"
+    ),
+    kills: int | None = option("--kills N", "instead: only N kills from outside", min=1, max=MOST),
+    lockstep: bool = option("--lockstep", "trials in lockstep only; default: both", False),
+    realtime: bool = option("--realtime", "trials in real time only; default: both", False),
+    faultless: float | None = option(
+        "--faultless S",
+        f"seconds without faults, alone and under load; default {FAULTLESS_S:g}",
+        min=0.0,
+        max=1e6,
+    ),
+    load: bool = option(
+        "--load", "without faults: only under load, by stress-ng where installed", False
+    ),
+    sizes: int | None = option(
+        "--sizes N", f"sizes on each curve of size against delay; default {SIZES}", min=0, max=MOST
+    ),
+    seconds: float | None = option(
+        "--seconds S", "simulated seconds of a run, for a rack that no task ends", min=1.0, max=1e9
+    ),
     settings: Settings = [],  # noqa: B006  typer copies it
-    whole: Annotated[
-        bool,
-        typer.Option(
-            "--whole",
-            help=(
-                "run each trial from its beginning; default: from a snapshot before its first fault"
-            ),
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="folder, also to continue a campaign in; default: runs/campaign-<time>",
-        ),
-    ] = None,
+    whole: bool = option(
+        "--whole",
+        "run each trial from its beginning; default: from a snapshot before its first fault",
+        False,
+    ),
+    out: Path | None = option(
+        "--out DIR", "folder, also to continue a campaign in; default: runs/campaign-<time>"
+    ),
     as_json: Json = False,
 ) -> None:
     """Inject random faults of all kinds into runs of a rack, and judge each of them.
@@ -151,11 +109,7 @@ def campaign(
         injections = 0
     if sizes is None:
         sizes = 0 if kills or realtime else SIZES
-    modes: tuple[bool, ...] = (True, False)
-    if lockstep:
-        modes = (True,)
-    elif realtime:
-        modes = (False,)
+    modes = (lockstep,) if lockstep or realtime else (True, False)
     loads = (True,) if load else (False, True)
     order = Order(
         name=config,

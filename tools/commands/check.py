@@ -7,9 +7,7 @@ import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from rack.boards.config import load, shared_out
 from rack.boards.config.cell import built_cell
@@ -17,7 +15,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
 from rack.levels.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.parameters import ConfigName, Faults, Json, Settings
+from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, option
 from rack.tools.console.tables import TextTable, print_blocks
 from rack.tools.live.folder import folder_of
 from rack.tools.timing.inventory import arm_lines, inventory, inventory_blocks
@@ -34,37 +32,24 @@ def check(
     config: ConfigName,
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
-    run: Annotated[
-        Path | None,
-        typer.Option(
-            "--from", metavar="RUN", help="use the budgets measured in this run, not the config's"
-        ),
-    ] = None,
-    percentile: Annotated[
-        float,
-        typer.Option(
-            metavar="P",
-            min=0.0,
-            max=100.0,
-            help=(
-                "with --from: the longest of P in 100 cycles, to leave out cycles stalled by"
-                " the host"
-            ),
-        ),
-    ] = 100.0,
-    fix: Annotated[
-        bool,
-        typer.Option(
-            "--fix", help="print only the config, with the cheapest changes that make it fit"
-        ),
-    ] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose",
-            help="add slots, mailboxes, every equation, and what an arm does while no torque comes",
-        ),
-    ] = False,
+    run: Path | None = option(
+        "--from RUN", "use the budgets measured in this run, not the config's"
+    ),
+    percentile: float = option(
+        "--percentile P",
+        "with --from: the longest of P in 100 cycles, to leave out cycles stalled by the host",
+        100.0,
+        min=0.0,
+        max=100.0,
+    ),
+    fix: bool = option(
+        "--fix", "print only the config, with the cheapest changes that make it fit", False
+    ),
+    verbose: bool = option(
+        "--verbose",
+        "add slots, mailboxes, every equation, and what an arm does while no torque comes",
+        False,
+    ),
     as_json: Json = False,
 ) -> None:
     """Validate a config, and predict whether its levels meet their cycles.

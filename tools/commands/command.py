@@ -12,7 +12,7 @@ import typer
 
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName, Timeout, check_timeout
+from rack.tools.console.parameters import Json, RackName, Timeout, argument, check_timeout, option
 
 if TYPE_CHECKING:
     from rack.tools.live.replies import Reply
@@ -27,47 +27,33 @@ At = Annotated[
 
 def command(
     rack: RackName,
-    level: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="LEVEL", help="task, elemental_move, primitive, servo, or a level of your own"
-        ),
-    ] = None,
-    what: Annotated[
-        str | None,
-        typer.Argument(metavar="WHAT", help="hold, resume, setpoint, goto, enable, ...; see above"),
-    ] = None,
-    goal: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="GOAL",
-            help=(
-                "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for"
-                " modify: NAME on|off; for table: NAME; for do: the level's command; for set:"
-                " KEY=VALUE"
-            ),
-        ),
-    ] = None,
+    level: str | None = argument(
+        "LEVEL", "task, elemental_move, primitive, servo, or a level of your own", None
+    ),
+    what: str | None = argument(
+        "WHAT", "hold, resume, setpoint, goto, enable, ...; see above", None
+    ),
+    goal: list[str] | None = argument(
+        "GOAL",
+        "home, or as in joints=0.2,1.3,... position=0.4,0.1,0.9 direction=0,0,-1; for"
+        " modify: NAME on|off; for table: NAME; for do: the level's command; for set:"
+        " KEY=VALUE",
+        None,
+    ),
     tick: Tick = None,
     at: At = None,
-    wait: Annotated[
-        bool,
-        typer.Option("--wait", help="wait until it is done: the arm is at rest, or at its goal"),
-    ] = False,
+    wait: bool = option(
+        "--wait", "wait until it is done: the arm is at rest, or at its goal", False
+    ),
     timeout: Timeout = None,
-    lease: Annotated[
-        bool,
-        typer.Option(
-            "--lease",
-            help="stay while it is in force; where this command ends before, the level holds",
-        ),
-    ] = False,
-    is_list: Annotated[
-        bool,
-        typer.Option(
-            "--list", help="list the levels, the commands each takes, and the one in force"
-        ),
-    ] = False,
+    lease: bool = option(
+        "--lease",
+        "stay while it is in force; where this command ends before, the level holds",
+        False,
+    ),
+    is_list: bool = option(
+        "--list", "list the levels, the commands each takes, and the one in force", False
+    ),
     as_json: Json = False,
 ) -> None:
     """Command one level of a running rack, overriding the level above it.

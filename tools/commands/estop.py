@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Annotated
-
-import typer
 
 from rack.backplane.lines import UtilityLines
 from rack.backplane.process import readable
@@ -15,50 +12,32 @@ from rack.backplane.words import Demand, Run, System
 from rack.tools.console.address import OPERATOR, Operator, RackAddress
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.held import waits
-from rack.tools.console.parameters import Json, named, rack_names
+from rack.tools.console.parameters import Json, argument, named, option, rack_names
 
 OBEY_S = 2.0
 """Longest wait for the clock, which reads the latch every tick."""
 
 
 def estop(
-    rack: Annotated[
-        str,
-        typer.Argument(
-            metavar="RACK",
-            help=(
-                "running rack by name, as 'rack list' shows it; on another machine:"
-                " HOST[:PORT]/RACK"
-            ),
-            autocompletion=rack_names,
-            callback=named,
-        ),
-    ],
-    reset: Annotated[
-        bool, typer.Option("--reset", help="clear the latch, so that the arm may move again")
-    ] = False,
-    ready: Annotated[
-        bool,
-        typer.Option(
-            "--ready", help="for HOST/RACK: connect now, and set it when Enter is pressed"
-        ),
-    ] = False,
-    certificates: Annotated[
-        str,
-        typer.Option(
-            metavar="DIR",
-            envvar="RACK_CERTIFICATES",
-            help="for HOST/RACK: folder with certificates; see rack lan certificates --help",
-        ),
-    ] = "",
-    name: Annotated[
-        str,
-        typer.Option(
-            "--as",
-            metavar="NAME",
-            help="for HOST/RACK: your name, as in adapter.lan.estop_from of that rack",
-        ),
-    ] = OPERATOR,
+    rack: str = argument(
+        "RACK",
+        "running rack by name, as 'rack list' shows it; on another machine: HOST[:PORT]/RACK",
+        autocompletion=rack_names,
+        callback=named,
+    ),
+    reset: bool = option("--reset", "clear the latch, so that the arm may move again", False),
+    ready: bool = option(
+        "--ready", "for HOST/RACK: connect now, and set it when Enter is pressed", False
+    ),
+    certificates: str = option(
+        "--certificates DIR",
+        "for HOST/RACK: folder with certificates; see rack lan certificates --help",
+        "",
+        envvar="RACK_CERTIFICATES",
+    ),
+    name: str = option(
+        "--as NAME", "for HOST/RACK: your name, as in adapter.lan.estop_from of that rack", OPERATOR
+    ),
     as_json: Json = False,
 ) -> None:
     """Engage the brakes of the arm at once, and keep them engaged until --reset.

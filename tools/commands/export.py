@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
+from typing import Literal
 
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.parameters import Json, RunFolder, option
 from rack.tools.console.progress import reading_progress
 from rack.tools.recording.recording import Recording
 
 
 def export(
     run: RunFolder,
-    to: Annotated[Literal["mcap"], typer.Option("--to", help="kind of the file")] = "mcap",
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="file to write; default: RUN/run.mcap")
-    ] = None,
+    to: Literal["mcap"] = option("--to", "kind of the file", "mcap"),
+    out: Path | None = option("--out FILE", "file to write; default: RUN/run.mcap"),
     as_json: Json = False,
 ) -> None:
     """Write a recorded run as an MCAP file, which Foxglove and others read.

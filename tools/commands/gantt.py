@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from rack.tools.console.answer import Document, Failure, print_answer
-from rack.tools.console.parameters import Json, Settings
+from rack.tools.console.parameters import Json, Settings, argument, option
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import reading_progress
 from rack.tools.timing.charts import figure5
@@ -23,41 +20,25 @@ MANY_SPANS = 10_000
 
 
 def gantt(
-    subject: Annotated[
-        str,
-        typer.Argument(
-            metavar="CONFIG|RUN",
-            help="config by name or path, or the folder of a run, as in runs/fig2-...",
-        ),
-    ],
-    from_ms: Annotated[
-        float | None,
-        typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="start of the window, ms"),
-    ] = None,
-    to_ms: Annotated[
-        float | None,
-        typer.Option(metavar="MS", min=0.0, max=LATEST_MS, help="end of the window, ms"),
-    ] = None,
-    process: Annotated[
-        list[str],
-        typer.Option(
-            metavar="LEVEL=MS,MS",
-            help="times of X in the schedule of a level, one a cycle, in turn; repeatable",
-        ),
-    ] = [],  # noqa: B006  typer copies it
-    figure: Annotated[
-        int | None,
-        typer.Option(
-            metavar="5", help="instead: the paper's figure 5 with the levels of this rack"
-        ),
-    ] = None,
+    subject: str = argument(
+        "CONFIG|RUN", "config by name or path, or the folder of a run, as in runs/fig2-..."
+    ),
+    from_ms: float | None = option(
+        "--from-ms MS", "start of the window, ms", min=0.0, max=LATEST_MS
+    ),
+    to_ms: float | None = option("--to-ms MS", "end of the window, ms", min=0.0, max=LATEST_MS),
+    process: list[str] = option(
+        "--process LEVEL=MS,MS",
+        "times of X in the schedule of a level, one a cycle, in turn; repeatable",
+        [],
+    ),
+    figure: int | None = option(
+        "--figure 5", "instead: the paper's figure 5 with the levels of this rack"
+    ),
     settings: Settings = [],  # noqa: B006
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="folder for the pictures; default: the run's, or runs/<rack>-gantt"
-        ),
-    ] = None,
+    out: Path | None = option(
+        "--out DIR", "folder for the pictures; default: the run's, or runs/<rack>-gantt"
+    ),
     as_json: Json = False,
 ) -> None:
     """Draw a Gantt chart of the schedule that follows from a config's budgets, or of the trace of a

@@ -3,78 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from typer.core import TyperCommand
 
 from rack.tools.console.answer import Document, Failure, print_answer
-from rack.tools.console.parameters import Json, Timeout, check_timeout, named
+from rack.tools.console.parameters import Json, Timeout, argument, check_timeout, named, option
 from rack.tools.console.tables import fitted
 
 
 def inject(
-    rack: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="RACK", help="running rack by name, as 'rack list' shows it", callback=named
-        ),
-    ] = None,
-    board: Annotated[
-        str | None,
-        typer.Argument(metavar="BOARD", help="task to strike: servo, servo.planner, ..., or clock"),
-    ] = None,
-    kind: Annotated[
-        str | None, typer.Argument(metavar="KIND", help="kind of fault; the kinds are listed below")
-    ] = None,
-    parameters: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="KEY=VALUE", help="parameters of the kind, as in size=0.05"),
-    ] = None,
-    lasts: Annotated[
-        str | None,
-        typer.Option(
-            "--for", metavar="TIME", help="duration in simulated time, as in 0.5s or 20ms"
-        ),
-    ] = None,
-    cycles: Annotated[
-        str | None, typer.Option(metavar="N", help="duration in cycles of the task")
-    ] = None,
-    mailbox: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="mailbox to strike; default: all that the task writes"),
-    ] = None,
-    tick: Annotated[
-        str | None, typer.Option(metavar="T", help="tick at which it begins; default: the next one")
-    ] = None,
-    when: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CONDITION", help='begin when this holds, as in "task.status.action == 2"'
-        ),
-    ] = None,
-    phase: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X", help="part of its first tick that passes before it strikes, 0 to below 1"
-        ),
-    ] = None,
-    seed: Annotated[
-        str | None, typer.Option(metavar="N", help="seed of its random choices")
-    ] = None,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="wait until the fault, or the run, is over")
-    ] = False,
+    rack: str | None = argument(
+        "RACK", "running rack by name, as 'rack list' shows it", None, callback=named
+    ),
+    board: str | None = argument(
+        "BOARD", "task to strike: servo, servo.planner, ..., or clock", None
+    ),
+    kind: str | None = argument("KIND", "kind of fault; the kinds are listed below", None),
+    parameters: list[str] | None = argument(
+        "KEY=VALUE", "parameters of the kind, as in size=0.05", None
+    ),
+    lasts: str | None = option("--for TIME", "duration in simulated time, as in 0.5s or 20ms"),
+    cycles: str | None = option("--cycles N", "duration in cycles of the task"),
+    mailbox: str | None = option(
+        "--mailbox NAME", "mailbox to strike; default: all that the task writes"
+    ),
+    tick: str | None = option("--tick T", "tick at which it begins; default: the next one"),
+    when: str | None = option(
+        "--when CONDITION", 'begin when this holds, as in "task.status.action == 2"'
+    ),
+    phase: str | None = option(
+        "--phase X", "part of its first tick that passes before it strikes, 0 to below 1"
+    ),
+    seed: str | None = option("--seed N", "seed of its random choices"),
+    wait: bool = option("--wait", "wait until the fault, or the run, is over", False),
     timeout: Timeout = None,
-    withdraw: Annotated[
-        int | None,
-        typer.Option(
-            metavar="NO", help="withdraw a fault that still waits; --list shows its number"
-        ),
-    ] = None,
-    is_list: Annotated[
-        bool, typer.Option("--list", help="list the kinds; with RACK, the faults of that rack")
-    ] = False,
+    withdraw: int | None = option(
+        "--withdraw NO", "withdraw a fault that still waits; --list shows its number"
+    ),
+    is_list: bool = option("--list", "list the kinds; with RACK, the faults of that rack", False),
     as_json: Json = False,
 ) -> None:
     """Inject a fault into a running rack.

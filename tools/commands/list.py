@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from rack.tools.commands import answers
+import time
+from contextlib import closing
+
+from rack.backplane.checked import as_named
+from rack.backplane.errors import SegmentError
+from rack.backplane.segment import Segment, racks
+from rack.backplane.words import Head, Run, System
+from rack.tools.console.answer import Document, print_answer
 from rack.tools.console.parameters import Json
+from rack.tools.console.tables import fitted
 
 
 def list_racks(as_json: Json = False) -> None:
@@ -19,4 +27,34 @@ def list_racks(as_json: Json = False) -> None:
       rack list
       rack list --json
     """
-    answers.list_racks(as_json)
+    found = [describe(name) for name in racks()]
+    rows = [[rack["rack"], rack["state"], rack["detail"]] for rack in found]
+    text = fitted(("rack", "state", ""), rows) if rows else "no racks"
+    print_answer(found, text, as_json)
+
+
+def describe(name: str) -> Document:
+    """Return the name, as "rack", the state and details of a rack; its age is in seconds. The
+    launcher's process id is None in another PID namespace."""
+    try:
+        segment = Segment.attach(name)
+    except SegmentError as error:
+        return {"rack": name, "state": "foreign", "detail": str(error)}
+    with closing(segment):
+        words = segment.words
+        age_s = time.time() - words[Head.CREATED_NS] * 1e-9
+        state = "dead"
+        by = "its launcher is gone: 'rack clean' removes it"
+        if segment.launcher_is_alive:
+            state = as_named(Run, words[System.STATE]).name.lower()
+            by = f"launched {age_s:.0f} s ago by {segment.launcher_text}"
+        boards = len({task.board for task in segment.layout.tasks})
+        hosts = len(segment.layout.hosts)
+        side = f" and {hosts} on the host side" if hosts else ""
+        return {
+            "rack": name,
+            "state": state,
+            "detail": f"{boards} boards{side}, tick {words[System.TICK]}, {by}",
+            "launcher": segment.launcher or None,
+            "age_s": round(age_s, 3),
+        }

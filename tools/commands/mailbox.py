@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import Annotated
-
-import typer
 
 from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.parameters import Json, RackName
+from rack.tools.console.parameters import Json, RackName, argument, option
 from rack.tools.console.tables import console, fitted_records
 from rack.tools.live.message_text import DROPPED, MessageText, list_mailboxes
 from rack.tools.live.watched import looks
@@ -25,12 +22,8 @@ PLAIN_S = 1.0
 
 def mailbox(
     rack: RackName,
-    name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="mailbox; default: all are listed")
-    ] = None,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="show each message, until Ctrl-C or the end of the run")
-    ] = False,
+    name: str | None = argument("NAME", "mailbox; default: all are listed", None),
+    watch: bool = option("--watch", "show each message, until Ctrl-C or the end of the run", False),
     as_json: Json = False,
 ) -> None:
     """Show the newest message in a mailbox of a running rack, field by field with units; or list

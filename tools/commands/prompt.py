@@ -10,9 +10,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from rack.backplane.segment import Segment
 from rack.boards.classes import find_class
@@ -23,23 +21,17 @@ from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT, SIGNALS
-from rack.tools.console.parameters import RackName
+from rack.tools.console.parameters import RackName, argument
 
 
 def prompt(
     rack: RackName,
-    board: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="BOARD", help="external host board; not needed when the rack has one"
-        ),
-    ] = None,
-    script: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="SCRIPT", help="Python script to run, in place of a prompt", dir_okay=False
-        ),
-    ] = None,
+    board: str | None = argument(
+        "BOARD", "external host board; not needed when the rack has one", None
+    ),
+    script: Path | None = argument(
+        "SCRIPT", "Python script to run, in place of a prompt", None, dir_okay=False
+    ),
 ) -> None:
     """Open a Python prompt on the host side of a running rack, or run a script there.
 

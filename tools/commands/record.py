@@ -2,66 +2,52 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import Annotated, NoReturn
-
-import typer
+from shutil import copyfile
+from threading import Event
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config.layout import KEPT_S
 from rack.tools.commands.replay import merge
-from rack.tools.console.answer import Document, Failure, fail, print_answer
+from rack.tools.commands.status import recorded_by
+from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName, View, named_here
+from rack.tools.console.parameters import Json, RackName, View, named_here, option
 from rack.tools.live.folder import folder_of
-from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder.recorder import Recorder, SafeSink, is_opening
+from rack.tools.recording.checksums import CHECKSUMS
+from rack.tools.recording.parquet import CONFIG, PUBLISHED
 from rack.tools.recording.recorder_process import (
-    recorded_by,
+    CODE,
+    ORIGIN,
+    SPOOL,
+    RecorderProcess,
     recorded_line,
     size_of,
     size_text,
     sizes,
-    unwritable,
 )
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import save as save_run
+from rack.tools.recording.run_files import EVENTS, mend
+from rack.tools.recording.spool import STRETCHES, stretch_files
 from rack.tools.viewer.parts import FILE
-from rack.tools.viewer.sink import ViewSink
 from rack.tools.viewer.window import ViewerWindow, free_port, url
 
 LOOK_S = 0.1
-"""Longest time until a signal is handled that came to another thread than the first."""
+"""Time between two looks at the racks, and at their recorders."""
 
 
 def record(
     rack: RackName,
-    others: Annotated[
-        list[str],
-        typer.Option(
-            "--with",
-            metavar="RACK",
-            help="record this rack as well; repeatable",
-        ),
-    ] = [],  # noqa: B006  typer copies it
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="folder of the recording; default: runs/<rack>-<time>"),
-    ] = None,
+    others: list[str] = option("--with RACK", "record this rack as well; repeatable", []),
+    out: Path | None = option("--out DIR", "folder of the recording; default: runs/<rack>-<time>"),
     view: View = False,
-    save: Annotated[
-        bool,
-        typer.Option(
-            "--save",
-            help="save what the recorder of its run has taken so far; the run is untouched",
-        ),
-    ] = False,
+    save: bool = option(
+        "--save", "save what the recorder of its run has taken so far; the run is untouched", False
+    ),
     as_json: Json = False,
 ) -> None:
     """Record a running rack until its run is over, or until Ctrl-C.
@@ -101,21 +87,12 @@ def record(
             return
         clock_ns = segment.layout.clock_ns
         begun = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
-        with _ending_when_full(segment, folder):
-            notes = _record(found, folder, view)
+        notes = _record(found, folder, view)
         lasted_s = (segment.words[System.TICK] - begun) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
     answer = {"rack": rack, "folder": str(folder), "notes": notes, **sizes(folder, lasted_s)}
     print_answer(answer, recorded_line(folder, lasted_s), as_json)
-    if is_opening():
-        _end_at_once(0)
-
-
-def _end_at_once(status: int) -> NoReturn:
-    """End the process without the viewer's library, which would wait, maybe for ever."""
-    sys.stdout.flush()
-    os._exit(status)
 
 
 def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
@@ -140,32 +117,37 @@ def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
     return {"rack": name, "folder": str(folder), **times, "bytes": size}, line
 
 
-def _begin(segment: Segment, folder: Path, notes: list[str], port: int | None) -> Recorder:
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG).write_text(segment.config)
-    view = SafeSink.of(segment, port, lambda: ViewSink(segment, folder, port), notes.append)
-    return Recorder(segment, folder, view)
+def save_run(folder: Path, into: Path) -> None:
+    """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
+    on."""
+    stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
+    for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
+        (into / name).parent.mkdir(parents=True, exist_ok=True)
+        # The flight recorder may have removed it meanwhile; few runs have an origin.
+        with suppress(FileNotFoundError):
+            copyfile(folder / name, into / name)
+    mend(into)
 
 
-@contextmanager
-def _ending_when_full(segment: Segment, folder: Path) -> Iterator[None]:
-    """End the process with one line when files cannot be written: the viewer's library would wait,
-    maybe for ever, for a file of its own."""
+def _begin(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
+    """Begin to record a rack into a folder; return its recorder. Raises `Failure`."""
     try:
-        yield
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / CONFIG).write_text(segment.config)
     except OSError as error:
         if error.filename is not None:
             raise
-        try:
-            fail(unwritable(folder, error, segment.words[System.FOLLOWER_TICK]), 1)
-        finally:
-            _end_at_once(1)
+        raise Failure(f"{folder}: {error.strerror}") from None
+    recorder = RecorderProcess(folder)
+    if not recorder.attach(segment.layout.rack, port):
+        recorder.finish()
+        raise Failure(f"{folder}: the recorder has not begun")
+    return recorder
 
 
 def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
     """Record a rack into a folder; or each of several into its own, then all of them into one
     file. Return messages for the user."""
-    notes: list[str] = []
     names = [rack.layout.rack for rack in racks]
     if twice := [name for at, name in enumerate(names) if name in names[:at]]:
         raise Failure(f"--with {twice[0]}: this rack is to be recorded already", 2)
@@ -174,15 +156,16 @@ def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
     if len(racks) > 1:
         unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' makes it"
     port = free_port() if view else None
-    # Ctrl-C ends the recording, not the run; leaving the inner context finishes the files.
+    # Ctrl-C ends the recording, not the run.
     with INTERRUPT.orderly(unfinished=unfinished):
+        recorders = []
         with ExitStack() as stack:
-            pairs = zip(racks, folders, strict=True)
-            begun = (_begin(rack, into, notes, port) for rack, into in pairs)
-            recorders = [stack.enter_context(recorder) for recorder in begun]
+            for rack, into in zip(racks, folders, strict=True):
+                recorders.append(_begin(rack, into, port))
+                stack.callback(recorders[-1].finish)
             if port is not None:
                 ViewerWindow(url(port))
-            _follow(recorders, unfinished)
+            notes = _follow(racks, recorders, unfinished)
         if len(racks) == 1:
             return notes
         if INTERRUPT.number:
@@ -195,25 +178,16 @@ def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
             ) from None
 
 
-def _follow(recorders: Sequence[Recorder], unfinished: str) -> None:
-    """Record until the runs of all are over; Ctrl-C, or an error of one, ends all recordings."""
-
-    def stop() -> None:
-        for recorder in recorders:
-            recorder.stop()
-
-    def follow(recorder: Recorder) -> None:
-        try:
-            recorder.follow()
-        except BaseException:
-            stop()
-            raise
-
-    # A thread each: a slow one keeps none of the others waiting.
-    with INTERRUPT.orderly(stop, unfinished), ThreadPoolExecutor(len(recorders)) as pool:
-        following = [pool.submit(follow, recorder) for recorder in recorders]
-        # A signal that the kernel gives to another thread does not wake this one to handle it.
-        while wait(following, LOOK_S).not_done:
-            continue
-        for ended in following:
-            ended.result()
+def _follow(
+    racks: Sequence[Segment], recorders: Sequence[RecorderProcess], unfinished: str
+) -> list[str]:
+    """Record until the runs of all are over, or until Ctrl-C; return messages of the recorders."""
+    notes: list[str] = []
+    ended = Event()
+    with INTERRUPT.orderly(ended.set, unfinished):
+        while not all(rack.run_is_over for rack in racks) and not ended.wait(LOOK_S):
+            notes += [text for recorder in recorders for text in recorder.news()]
+    for recorder in recorders:
+        recorder.finish(in_a_hurry=INTERRUPT.number != 0)
+        notes += recorder.news()
+    return notes

@@ -6,12 +6,10 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
-
-import typer
 
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
+from rack.tools.console.parameters import argument, option
 from rack.tools.console.progress import reading_progress
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.divergence import other_run
@@ -25,30 +23,16 @@ Places = Callable[[Sequence[Recording]], list[RackPlace]]
 
 
 def replay(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN...",
-            help="folder of a run, as in runs/nasrem-20250101-120000; one for each rack",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.rrd",
-            help="make the viewer's file from what is recorded, and open nothing",
-        ),
-    ] = None,
-    against: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="RUN",
-            help=(
-                "another run of the same rack, or 'origin', the one that RUN continues: both,"
-                " tick by tick"
-            ),
-        ),
-    ] = None,
+    runs: list[Path] = argument(
+        "RUN...", "folder of a run, as in runs/nasrem-20250101-120000; one for each rack"
+    ),
+    out: Path | None = option(
+        "--out FILE.rrd", "make the viewer's file from what is recorded, and open nothing"
+    ),
+    against: Path | None = option(
+        "--against RUN",
+        "another run of the same rack, or 'origin', the one that RUN continues: both, tick by tick",
+    ),
 ) -> None:
     """Open the recording of a run in the viewer; return when it is closed.
 

@@ -4,42 +4,29 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from rack.tools.console.answer import Failure
-from rack.tools.console.parameters import Json, RunFolder
+from rack.tools.console.parameters import Json, RunFolder, option
 from rack.tools.timing.analysis.stored import print_report, show_report
 
 
 def report(
     run: RunFolder,
-    against: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="RUN",
-            help=(
-                "another run, or 'origin', the one that RUN continues: where the two diverge,"
-                " and why"
-            ),
-        ),
-    ] = None,
-    of: Annotated[
-        str,
-        typer.Option(
-            metavar="MAILBOX",
-            help="with --against: from where this mailbox first differs, back to the cause",
-        ),
-    ] = "",
-    repeat: Annotated[
-        bool,
-        typer.Option(
-            "--repeat",
-            help="with --against: if the recordings leave it open, run both racks again, with the"
-            " levels that their configs name",
-        ),
-    ] = False,
+    against: Path | None = option(
+        "--against RUN",
+        "another run, or 'origin', the one that RUN continues: where the two diverge, and why",
+    ),
+    of: str = option(
+        "--of MAILBOX",
+        "with --against: from where this mailbox first differs, back to the cause",
+        "",
+    ),
+    repeat: bool = option(
+        "--repeat",
+        "with --against: if the recordings leave it open, run both racks again, with the"
+        " levels that their configs name",
+        False,
+    ),
     as_json: Json = False,
 ) -> None:
     """Report on a run, from its recording.

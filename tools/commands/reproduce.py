@@ -6,13 +6,10 @@ from __future__ import annotations
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json
+from rack.tools.console.parameters import Json, option
 from rack.tools.live.folder import RUNS
 
 PAGE = RUNS / "paper"
@@ -23,30 +20,18 @@ STAYS = "{}: what is finished is kept; the same command goes on from there"
 
 
 def reproduce(
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="folder of the page; one that exists is continued")
-    ] = PAGE,
-    only: Annotated[
-        list[str],
-        typer.Option(
-            "--only",
-            metavar="SECTION",
-            help='only this section, as in 3.4 or "abstract"; repeatable',
-        ),
-    ] = [],  # noqa: B006  typer copies it
-    again: Annotated[
-        bool,
-        typer.Option(
-            "--again", help="repeat finished experiments: of the sections of --only, or of all"
-        ),
-    ] = False,
-    share: Annotated[
-        bool,
-        typer.Option(
-            "--share",
-            help="run even on cores held by another rack's real-time boards: figures suffer",
-        ),
-    ] = False,
+    out: Path = option("--out DIR", "folder of the page; one that exists is continued", PAGE),
+    only: list[str] = option(
+        "--only SECTION", 'only this section, as in 3.4 or "abstract"; repeatable', []
+    ),
+    again: bool = option(
+        "--again", "repeat finished experiments: of the sections of --only, or of all", False
+    ),
+    share: bool = option(
+        "--share",
+        "run even on cores held by another rack's real-time boards: figures suffer",
+        False,
+    ),
     as_json: Json = False,
 ) -> None:
     """Reproduce the paper on this machine, and write a page that goes through it claim by claim.

@@ -11,14 +11,14 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from rack.boards.config import load, names
 from rack.levels.errors import RobotError
 from rack.tools.console.answer import Document, Failure, print_answer
-from rack.tools.console.parameters import Json
+from rack.tools.console.parameters import Json, argument, option
 from rack.tools.console.tables import fitted_records
 from rack.tools.robot.rack_name import derive_name, is_free_name
 
@@ -34,33 +34,17 @@ app = typer.Typer(
 
 @app.command("new")
 def new(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="model file: MJCF, or URDF")],
-    name: Annotated[
-        str, typer.Option(metavar="NAME", help="name of the rack; default: the model's")
-    ] = "",
-    tip: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="body or site at the end of the arm, if there are two"),
-    ] = "",
-    joints: Annotated[
-        str,
-        typer.Option(metavar="J,J,...", help="joints of the arm, base to tool, in place of --tip"),
-    ] = "",
-    tool: Annotated[
-        str, typer.Option(metavar="NAME", help="site or body whose pose is the tool's, z outward")
-    ] = "",
-    gripper: Annotated[
-        str, typer.Option(metavar="NAME|none", help="joint that drives the gripper, or none")
-    ] = "",
-    home: Annotated[
-        str, typer.Option(metavar="NAME|Q,Q,...", help="keyframe, or positions of the joints, rad")
-    ] = "",
-    torque: Annotated[
-        str, typer.Option(metavar="T,T,...", help="torque limits, N m, for a model without any")
-    ] = "",
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="new folder; default: NAME")
-    ] = None,
+    model: Path = argument("MODEL", "model file: MJCF, or URDF"),
+    name: str = option("--name NAME", "name of the rack; default: the model's", ""),
+    tip: str = option("--tip NAME", "body or site at the end of the arm, if there are two", ""),
+    joints: str = option(
+        "--joints J,J,...", "joints of the arm, base to tool, in place of --tip", ""
+    ),
+    tool: str = option("--tool NAME", "site or body whose pose is the tool's, z outward", ""),
+    gripper: str = option("--gripper NAME|none", "joint that drives the gripper, or none", ""),
+    home: str = option("--home NAME|Q,Q,...", "keyframe, or positions of the joints, rad", ""),
+    torque: str = option("--torque T,T,...", "torque limits, N m, for a model without any", ""),
+    out: Path | None = option("--out DIR", "new folder; default: NAME"),
     as_json: Json = False,
 ) -> None:
     """Write a folder with a config, a scene and a task for the arm of a model file.
@@ -102,12 +86,8 @@ def new(
 
 @app.command("check")
 def check(
-    model: Annotated[
-        str, typer.Argument(metavar="MODEL|CONFIG", help="model file, or config by name or path")
-    ],
-    out: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="file of the picture; default: NAME.png")
-    ] = None,
+    model: str = argument("MODEL|CONFIG", "model file, or config by name or path"),
+    out: Path | None = option("--out PNG", "file of the picture; default: NAME.png"),
     as_json: Json = False,
 ) -> None:
     """Examine an arm before it moves, and draw it: everything at once.

@@ -6,7 +6,7 @@ import sys
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -15,7 +15,16 @@ from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.requests import Preload
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Anyway, Faults, Json, Settings, View, config_names
+from rack.tools.console.parameters import (
+    Anyway,
+    Faults,
+    Json,
+    Settings,
+    View,
+    argument,
+    config_names,
+    option,
+)
 
 if TYPE_CHECKING:
     from rack.boards.config.schema import RackConfig
@@ -26,79 +35,46 @@ if TYPE_CHECKING:
 
 def run(
     context: typer.Context,
-    config: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="CONFIG",
-            help="config by name, or path to a .toml file",
-            autocompletion=config_names,
-        ),
-    ] = None,
-    lockstep: Annotated[
-        bool,
-        typer.Option(
-            "--lockstep",
-            help="start a tick only when every due task has finished: exact and repeatable",
-        ),
-    ] = False,
-    step: Annotated[
-        bool,
-        typer.Option(
-            "--step", help="with --lockstep: hold before tick 0; 'rack step' lets the rack go on"
-        ),
-    ] = False,
-    seconds: Annotated[
-        float | None,
-        typer.Option(
-            metavar="S", min=0.0, max=1e9, help="simulated seconds to run; default: until its end"
-        ),
-    ] = None,
-    speed: Annotated[
-        float | None,
-        typer.Option(metavar="X", help="run X times as fast as real time, as in 2 or 0.5"),
-    ] = None,
+    config: str | None = argument(
+        "CONFIG", "config by name, or path to a .toml file", None, autocompletion=config_names
+    ),
+    lockstep: bool = option(
+        "--lockstep",
+        "start a tick only when every due task has finished: exact and repeatable",
+        False,
+    ),
+    step: bool = option(
+        "--step", "with --lockstep: hold before tick 0; 'rack step' lets the rack go on", False
+    ),
+    seconds: float | None = option(
+        "--seconds S", "simulated seconds to run; default: until its end", min=0.0, max=1e9
+    ),
+    speed: float | None = option("--speed X", "run X times as fast as real time, as in 2 or 0.5"),
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
-    entries: Annotated[
-        Path | None,
-        typer.Option(
-            "--entries",
-            metavar="RUN",
-            help=(
-                "start no host boards and no other racks: what they sent in this recorded run"
-                " enters again, at the same ticks; for host boards in real time, or with a prompt:"
-                " other runs repeat in lockstep by themselves"
-            ),
-        ),
-    ] = None,
-    origin: Annotated[
-        str | None,
-        typer.Option(
-            "--from",
-            metavar="RUN@TIME",
-            help=(
-                "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or"
-                " --faults a branch of it from there; the rack runs again in lockstep, from the"
-                " beginning to TIME"
-            ),
-        ),
-    ] = None,
+    entries: Path | None = option(
+        "--entries RUN",
+        "start no host boards and no other racks: what they sent in this recorded run"
+        " enters again, at the same ticks; for host boards in real time, or with a prompt:"
+        " other runs repeat in lockstep by themselves",
+    ),
+    origin: str | None = option(
+        "--from RUN@TIME",
+        "continue a run, in place of CONFIG, from TIME s, bit for bit; with --set or"
+        " --faults a branch of it from there; the rack runs again in lockstep, from the"
+        " beginning to TIME",
+    ),
     anyway: Anyway = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="folder of the run; default: runs/<rack>-<time>"),
-    ] = None,
-    no_record: Annotated[
-        bool, typer.Option("--no-record", help="leave no folder: no trace, no signals, no report")
-    ] = False,
+    out: Path | None = option("--out DIR", "folder of the run; default: runs/<rack>-<time>"),
+    no_record: bool = option(
+        "--no-record", "leave no folder: no trace, no signals, no report", False
+    ),
     view: View = False,
-    share: Annotated[
-        bool,
-        typer.Option(
-            "--share",
-            help="run even on cores held by another rack's real-time boards: both will be late",
-        ),
-    ] = False,
+    share: bool = option(
+        "--share",
+        "run even on cores held by another rack's real-time boards: both will be late",
+        False,
+    ),
     as_json: Json = False,
 ) -> None:
     """Run a rack until its task ends, and report on the run.
@@ -163,7 +139,7 @@ def run(
     if step and found.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
     folder = None if no_record else folder_of(out, found.name)
-    begins = None
+    begins = Beginning(crate=crate)
     with ExitStack() as stack:
         if origin is not None:
             warm = crate if isinstance(crate, WarmCrate) else None
@@ -174,17 +150,9 @@ def run(
         stack.enter_context(INTERRUPT.orderly(unfinished=unfinished))
         with display_for(silent=as_json) as display:
             if entries is not None:
-                begins = Beginning(entries=recorded_entries(found, entries))
+                begins = Beginning(crate=crate, entries=recorded_entries(found, entries))
             result = run_rack(
-                found,
-                seconds,
-                folder,
-                display,
-                view=view,
-                share=share,
-                crate=crate,
-                step=step,
-                begins=begins,
+                found, seconds, folder, display, view=view, share=share, step=step, begins=begins
             )
         report = _report(found, folder, result, as_json)
     if not report["worked"]:

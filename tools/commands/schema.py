@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.parameters import Json, config_names
+from rack.tools.console.parameters import Json, argument, config_names, option
 from rack.tools.console.tables import fitted
 
 if TYPE_CHECKING:
@@ -20,21 +18,15 @@ DROPPED = ("default", "permitted", "type")
 
 
 def schema(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[TABLE]", help="table, such as clock, board.budget or board.servo.params"
-        ),
-    ] = None,
-    config: Annotated[
-        str,
-        typer.Option(
-            "--config",
-            metavar="CONFIG",
-            help="config whose levels declare [task] and params",
-            autocompletion=config_names,
-        ),
-    ] = "nasrem",
+    name: str | None = argument(
+        "[TABLE]", "table, such as clock, board.budget or board.servo.params", None
+    ),
+    config: str = option(
+        "--config CONFIG",
+        "config whose levels declare [task] and params",
+        "nasrem",
+        autocompletion=config_names,
+    ),
     as_json: Json = False,
 ) -> None:
     """Show the keys of a config: type, unit, permitted values, default and meaning.

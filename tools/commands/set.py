@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from contextlib import closing
-from typing import Annotated
-
-import typer
 
 from rack.backplane.segment import Segment
 from rack.tools.commands.command import At, Tick, print_reply
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName
+from rack.tools.console.parameters import Json, RackName, argument
 from rack.tools.live.desk import LiveDesk
 
 
 def set_param(
     rack: RackName,
-    setting: Annotated[
-        str,
-        typer.Argument(metavar="KEY=VALUE", help="as in board.servo.params.bandwidth=80"),
-    ],
+    setting: str = argument("KEY=VALUE", "as in board.servo.params.bandwidth=80"),
     tick: Tick = None,
     at: At = None,
     as_json: Json = False,

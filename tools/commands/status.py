@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import closing, suppress
+from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rack.tools.commands.answers import show_status
+from rack.backplane.segment import Segment, racks
+from rack.backplane.words import System
+from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import Json, named_here, rack_names
+from rack.tools.console.tables import console
+from rack.tools.live.display import RackView
+from rack.tools.live.snapshot import RackMonitor
+from rack.tools.recording.recorder_process import SPOOL, recorded_line, size_of
 
 OnlyRack = Annotated[
     str | None,
@@ -34,4 +43,38 @@ def status(rack: OnlyRack = None, as_json: Json = False) -> None:
       rack status
       rack status nasrem --json
     """
-    show_status(rack, as_json)
+    with closing(Segment.attach(rack or only_rack())) as segment:
+        found = RackMonitor(segment).look()
+        run = recorded_by(segment)
+    if as_json:
+        recording = None if run is None else {"folder": str(run), "bytes": size_of(run)}
+        print_json({**asdict(found), "recording": recording})
+        return
+    console().print(RackView(found))
+    if run is not None:
+        print(recorded_line(run, found.time_s))
+
+
+def only_rack() -> str:
+    """Return the only rack on this machine. Raises `Failure` if there is not exactly one."""
+    running = racks()
+    if not running:
+        raise Failure("no rack is running")
+    if len(running) > 1:
+        raise Failure(f"RACK is missing; racks: {', '.join(running)}", 2)
+    return running[0]
+
+
+def recorded_by(segment: Segment) -> Path | None:
+    """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
+    seen from this PID namespace."""
+    if not segment.launcher:
+        return None
+    pid = segment.words[System.FOLLOWER_PID]
+    with suppress(OSError):
+        for file in Path(f"/proc/{pid}/fd").iterdir():
+            # Descriptors come and go.
+            with suppress(OSError):
+                if (path := file.readlink()).name == SPOOL:
+                    return path.parent
+    return None

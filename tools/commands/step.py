@@ -4,36 +4,24 @@ did."""
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
-
-import typer
 
 from rack.backplane.segment import Segment
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.parameters import Json, RackName
-from rack.tools.live.stepper import Stepper
+from rack.tools.console.parameters import Json, RackName, argument, option
+from rack.tools.live.pausing import Stepper
 
 
 def step(
     rack: RackName,
-    count: Annotated[
-        int | None,
-        typer.Argument(metavar="N", min=1, max=1_000_000, help="cycles; the same as --cycles"),
-    ] = None,
-    cycles: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", min=1, max=1_000_000, help="cycles of the slowest level, or of --until"
-        ),
-    ] = None,
-    ticks: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, max=10**9, help="ticks of the clock, instead of cycles"),
-    ] = None,
-    until: Annotated[
-        str | None, typer.Option(metavar="LEVEL", help="hold after the next cycle of this level")
-    ] = None,
-    run: Annotated[bool, typer.Option("--run", help="let the rack run on without steps")] = False,
+    count: int | None = argument("N", "cycles; the same as --cycles", None, min=1, max=1_000_000),
+    cycles: int | None = option(
+        "--cycles N", "cycles of the slowest level, or of --until", min=1, max=1_000_000
+    ),
+    ticks: int | None = option(
+        "--ticks N", "ticks of the clock, instead of cycles", min=1, max=10**9
+    ),
+    until: str | None = option("--until LEVEL", "hold after the next cycle of this level"),
+    run: bool = option("--run", "let the rack run on without steps", False),
     as_json: Json = False,
 ) -> None:
     """Let a rack in lockstep go on by single cycles, and show each level's state, and the row of

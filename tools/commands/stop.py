@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import os
 from contextlib import ExitStack, closing, suppress
-from typing import Annotated
-
-import typer
 
 from rack.backplane.process import readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.parameters import Json, RackName
+from rack.tools.console.parameters import Json, RackName, option
 
 
 def stop(
     rack: RackName,
-    wait: Annotated[
-        float, typer.Option(metavar="S", min=0.0, max=1e9, help="seconds to wait for the run's end")
-    ] = 10.0,
+    wait: float = option("--wait S", "seconds to wait for the run's end", 10.0, min=0.0, max=1e9),
     as_json: Json = False,
 ) -> None:
     """End a run and wait until it is gone.

@@ -7,8 +7,7 @@ import threading
 from contextlib import closing
 from importlib.util import find_spec
 
-from rack.tools.commands.answers import only_rack
-from rack.tools.commands.status import OnlyRack
+from rack.tools.commands.status import OnlyRack, only_rack
 from rack.tools.console.interrupt import INTERRUPT
 
 LOOK_S = 0.2

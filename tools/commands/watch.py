@@ -7,16 +7,13 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.faults.config import as_seconds
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName
+from rack.tools.console.parameters import Json, RackName, argument, option
 from rack.tools.console.tables import console
 from rack.tools.live.signals import Lines, Plot, Rows, Strip, cell
 from rack.tools.live.watched import looks
@@ -32,33 +29,16 @@ MOST_S = 600.0
 
 def watch(
     rack: RackName,
-    signals: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SIGNAL...", help="as in servo.status.position[2], or a whole field"
-        ),
-    ],
-    when: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CONDITION",
-            help='wait until this holds, as in "servo.status.position[2] > 1.2"',
-        ),
-    ] = None,
-    before: Annotated[
-        str, typer.Option(metavar="TIME", help="with --when: simulated time to save before it")
-    ] = "0.5s",
-    after: Annotated[
-        str, typer.Option(metavar="TIME", help="with --when: simulated time to save after it")
-    ] = "1s",
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="with --when: CSV file; default: RACK-TICK.csv"),
-    ] = None,
-    every: Annotated[
-        str,
-        typer.Option(metavar="TIME", help="simulated time between two lines; 0s: a line a message"),
-    ] = "0.1s",
+    signals: list[str] = argument("SIGNAL...", "as in servo.status.position[2], or a whole field"),
+    when: str | None = option(
+        "--when CONDITION", 'wait until this holds, as in "servo.status.position[2] > 1.2"'
+    ),
+    before: str = option("--before TIME", "with --when: simulated time to save before it", "0.5s"),
+    after: str = option("--after TIME", "with --when: simulated time to save after it", "1s"),
+    out: Path | None = option("--out FILE", "with --when: CSV file; default: RACK-TICK.csv"),
+    every: str = option(
+        "--every TIME", "simulated time between two lines; 0s: a line a message", "0.1s"
+    ),
     as_json: Json = False,
 ) -> None:
     """Show signals of a running rack until its run is over, or until Ctrl-C.

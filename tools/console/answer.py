@@ -26,27 +26,21 @@ class Failure(Exception):
         self.status = status
 
 
-def exit_status(error: Exception) -> int | None:
-    """Return the exit status of an error that the project raises on purpose; None for any other."""
-    from rack.backplane.errors import BackplaneError
-    from rack.boards.errors import BoardError, ConfigError, SnapshotError
-    from rack.levels.errors import LevelError
-
-    if isinstance(error, ConfigError | SnapshotError):
-        return 2
-    return 1 if isinstance(error, BackplaneError | BoardError | LevelError) else None
-
-
 @contextmanager
 def as_failure() -> Iterator[None]:
-    """Raise as `Failure` what a command would end with, with the same text and status."""
+    """Raise as `Failure`, with its exit status, what the project raises on purpose."""
     try:
         yield
     except Exception as error:
-        status = exit_status(error)
-        if status is None:
-            raise
-        raise Failure(str(error), status) from None
+        from rack.backplane.errors import BackplaneError
+        from rack.boards.errors import BoardError, ConfigError, SnapshotError
+        from rack.levels.errors import LevelError
+
+        if isinstance(error, ConfigError | SnapshotError):
+            raise Failure(str(error), 2) from None
+        if isinstance(error, BackplaneError | BoardError | LevelError):
+            raise Failure(str(error)) from None
+        raise
 
 
 def write_file(path: Path, text: str) -> None:

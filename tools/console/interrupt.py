@@ -15,7 +15,7 @@ import signal
 import stat
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -154,18 +154,22 @@ def _leave_terminal() -> None:
 def _kill(family: list[int]) -> None:
     """Kill every descendant in this session and wait for it; a viewer window has its own session
     and stays."""
-    ends = select.poll()
-    left = 0
     for pid in family:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-            ends.register(os.pidfd_open(pid), select.POLLIN)
-            left += 1
-    deadline = time.monotonic() + GONE_S
-    while left and (ended := ends.poll(max(0.0, deadline - time.monotonic()) * 1000)):
-        for pidfd, _ in ended:
-            ends.unregister(pidfd)
-            left -= 1
+    await_ends(family, GONE_S)
+
+
+def await_ends(pids: Iterable[int], bound_s: float) -> None:
+    """Wait until processes have ended, for so long at most."""
+    deadline = time.monotonic() + bound_s
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            end = os.pidfd_open(pid)
+            waiting = select.poll()
+            waiting.register(end, select.POLLIN)
+            waiting.poll(max(0.0, deadline - time.monotonic()) * 1000)
+            os.close(end)
 
 
 def descendants(pid: int, session: int | None = None) -> Iterator[int]:

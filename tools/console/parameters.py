@@ -1,17 +1,31 @@
-"""Arguments and options that several commands have.
-
-They are apart from the answers of commands because typer takes as long to import as numpy: what
-needs no parser does without it.
-"""
+"""Arguments and options that several commands have."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from rack.tools.console.answer import Failure
+
+
+def option(declared: str, meaning: str, default: Any = None, **more: Any) -> Any:
+    """Return an option of a command, the default value of a parameter of its function.
+
+    Args:
+        declared: Its name, and that of its value if it takes one, as in "--seconds S".
+        meaning: What `--help` says of it.
+        default: Its value if it is not given; `...` if it must be given.
+        more: Whatever else `typer.Option` takes, such as `min` and `max`.
+    """
+    name, _, metavar = declared.partition(" ")
+    return typer.Option(default, name, metavar=metavar or None, help=meaning, **more)
+
+
+def argument(name: str, meaning: str, default: Any = ..., **more: Any) -> Any:
+    """Return an argument of a command, which must be given unless it has a default; as `option`."""
+    return typer.Argument(default, metavar=name, help=meaning, **more)
 
 
 def config_names(start: str) -> list[str]:

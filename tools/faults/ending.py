@@ -11,13 +11,11 @@ import numpy as np
 from rack.backplane.checked import as_whole
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.layout import Layout
-from rack.backplane.message import State, reason_of, state_name
 from rack.backplane.segment import Segment
 from rack.boards.events import arm_states, statuses
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
 from rack.boards.faults.kind import KINDS, Kind, kind_of
-from rack.levels.messages import Error
 from rack.tools.console.answer import Failure
 
 EXTERNAL = "external kill"
@@ -96,20 +94,6 @@ def strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
     )
 
 
-def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
-    """Return the kill of a board at `tick` and at CLOCK_MONOTONIC `time_ns`."""
-    return Strike(
-        fault=-1,
-        kind=EXTERNAL,
-        board=board,
-        began=tick,
-        ends=tick,
-        tick=tick,
-        time_ns=time_ns,
-        mailboxes=tuple(box.name for box in struck_mailboxes(layout, -1, board)),
-    )
-
-
 def arm_of(segment: Segment) -> ArmEnd:
     """Return the arm of a rack as its state and its levels last told; a rack without one violates
     no limit."""
@@ -119,22 +103,6 @@ def arm_of(segment: Segment) -> ArmEnd:
         violations=max((arm.violations for arm in counted), default=0),
         touches=max((arm.touches for arm in counted), default=0),
         is_at_rest=all(np.abs(arm.velocity).max() < AT_REST for arm in seen),
-    )
-
-
-def levels_of(segment: Segment) -> str:
-    """Return the last state of each level, with its reason, as one readable text."""
-    states = []
-    for writer, status in statuses(segment, "state"):
-        reason = f" ({why})" if (why := reason_of(status)) else ""
-        states.append(f"{writer} {state_name(status.state)}{reason}")
-    return ", ".join(states)
-
-
-def is_late(segment: Segment) -> bool:
-    """Return whether a level gave up because it cannot meet a time."""
-    return any(
-        s.state == State.ERROR and s.error == Error.TOO_LATE for _, s in statuses(segment, "error")
     )
 
 

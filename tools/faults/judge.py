@@ -113,19 +113,12 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
     is not found yet. A fault of the arm that is over before its bound, and is not found, has not
     struck; nor has one whose run ends before the bound of its recovery.
     """
-    return _Judge(strikes, events, run).verdict()
+    return Judge(strikes, events, run).verdict()
 
 
-def certain_from(
-    strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances, tick: int
-) -> int | None:
-    """Return the tick from which nothing that happens later can change the judgement of a run's
-    faults, as far as is known before `tick`; a later one at which to ask again; None: its end."""
-    now = Event(0, tick, "end", "", "")
-    return _Judge(strikes, [*events, now], run).certain_from(tick)
+class Judge:
+    """The judge of one run's faults."""
 
-
-class _Judge:
     def __init__(
         self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
     ) -> None:
@@ -140,23 +133,23 @@ class _Judge:
         self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
 
     def verdict(self) -> FaultVerdict:
+        """Return the judgement of each fault, and what none of them explains."""
         used: set[int] = set()
         judged = []
         windows = [self._window(strike) for strike in self._strikes]
         for place, strike in enumerate(self._strikes):
-            found = self._detections(strike, windows[place][1], used)
-            own = [detection for detection in found if not self._is_of(detection, place)]
+            last = windows[place][1]
+            later = self._strikes[place + 1 :]
+            found = self._detections(strike, last, used)
+            own = [detection for detection in found if not self._is_of_any(detection, later)]
+            # Reactions up to this tick are of this fault: then the next one strikes, or it is
+            # long over.
+            horizon = min([*(s.tick for s in later if s.tick > strike.tick), last + 1])
             best = min(own, key=lambda detection: detection.order, default=None)
             if best:
                 used.add(id(best.event))
             elif self._is_brief(strike):
                 strike = replace(strike, tick=-1)
-            # Reactions up to this tick are of this fault: then the next one strikes, or it is
-            # long over.
-            later = [
-                s.tick for s in self._strikes[place + 1 :] if s.tick > self._strikes[place].tick
-            ]
-            horizon = min([*later, windows[place][1] + 1])
             judgement = self._judgement(strike, best, horizon)
             is_too_early = self._last < strike.tick + (judgement.recovery_bound or 0)
             if not judgement.is_recovered and is_too_early and strike.ends < NEVER:
@@ -170,34 +163,6 @@ class _Judge:
             unexplained=tuple(event for event in stray if event.kind != "miss"),
             misses=tuple(event for event in stray if event.kind == "miss"),
         )
-
-    def certain_from(self, tick: int) -> int | None:
-        latest = tick
-        for strike, found in zip(self._strikes, self.verdict().faults, strict=True):
-            closes = self._closes(strike, found, tick)
-            if closes is None:
-                return None
-            latest = max(latest, closes)
-        return latest
-
-    def _closes(self, strike: Strike, found: Judgement, tick: int) -> int | None:
-        """Return the tick from which the judgement of a fault is certain, as in `certain_from`."""
-        again = tick + self._settle
-        if strike.began < 0:
-            return again
-        if strike.ends >= NEVER:
-            return None
-        ends = strike.tick if strike.record.consequence.ends_process else strike.ends
-        if strike.tick < 0 and ends >= tick:
-            return again
-        over = max(ends, strike.first + (self._bound(strike) or 0))
-        read = last_read(strike.mailboxes, self._layout)
-        closes = over + self._recovery(strike) + read + self._settle + 1
-        if closes > tick:
-            return closes
-        # Its writer may find the fault of a plan at any later time, or have something to write.
-        is_open = self._window(strike)[1] >= tick and found.seen != "detected"
-        return again if is_open or not found.is_recovered else tick
 
     def _bound(self, strike: Strike, reader: str | None = None) -> int | None:
         """Return the ticks from its strike within which a fault must be found, by a reader or,
@@ -215,19 +180,16 @@ class _Judge:
 
     def _window(self, strike: Strike) -> tuple[int, int]:
         """Return the first and the last tick at which an event may come of a fault."""
-        first = strike.first
         if strike.record.takes_mailbox and self._layout.task(strike.board).role == "planner":
             # The plan's writer itself may find the fault, when it makes the next plan.
-            return first - 1, self._last
-        over = max(self._ends(strike), first + (self._bound(strike) or 0))
-        read = last_read(strike.mailboxes, self._layout)
-        return first - 1, over + self._recovery(strike) + read + self._settle
+            return strike.first - 1, self._last
+        return strike.first - 1, self._last_trace(strike, min(end_of(strike), self._last))
 
-    def _ends(self, strike: Strike) -> int:
-        # A task that hangs is killed as soon as that is found, however long it was to hang.
-        if strike.record.consequence.ends_process:
-            return strike.tick
-        return min(strike.ends, self._last)
+    def _last_trace(self, strike: Strike, ends: int) -> int:
+        """Return the last tick at which an event may come of a fault that ends at a tick."""
+        over = max(ends, strike.first + (self._bound(strike) or 0))
+        read = last_read(strike.mailboxes, self._layout)
+        return over + self._recovery(strike) + read + self._settle
 
     def _detections(self, strike: Strike, until: int, used: set[int]) -> list[Detection]:
         if not strike.count:
@@ -248,12 +210,12 @@ class _Judge:
             and not box.max_age
         )
 
-    def _is_of(self, late: Detection, place: int) -> bool:
-        """Return whether a detection, too late for one fault, is in time for one that struck after
-        it."""
-        after = (strike for strike in self._strikes[place + 1 :] if fits(late.event, strike))
+    def _is_of_any(self, late: Detection, later: Sequence[Strike]) -> bool:
+        """Return whether a detection, too late for one fault, is in time for one of those that
+        struck after it."""
         return not late.is_within and any(
-            self._detection(late.event, strike).is_within for strike in after
+            fits(late.event, strike) and self._detection(late.event, strike).is_within
+            for strike in later
         )
 
     def _is_brief(self, strike: Strike) -> bool:
@@ -261,7 +223,7 @@ class _Judge:
         found."""
         if strike.record.where != "arm":
             return False
-        until = strike.hidden + strike.count * self._cycles[strike.board]
+        until = strike.hidden + strike.count * cycle_ticks(self._layout, strike.board)
         return not strike.count or until < (self._bound(strike) or 0)
 
     def _detection(self, event: Event, strike: Strike) -> Detection:
@@ -283,54 +245,53 @@ class _Judge:
         return Detection(event, delay, bound, delay_ms, bound_ms)
 
     def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
-        record = strike.record
+        visible_from = strike.record.visible_from
         owed = tuple(filter(self._is_periodic, strike.affected)) or strike.affected
         after = aftermath(strike, self._events, horizon, owed)
         found = best.event.tick if best else strike.tick
         # Ticks from the strike within which every reaction must be undone.
-        bound = max(self._ends(strike), found) - strike.tick + self._recovery(strike)
-        # Only a kind that may end the task with an error has this reaction.
-        is_latched = self._run.has_failed and LATCHED in after.reactions
+        ends = max(min(end_of(strike), self._last), found)
+        recovery_bound = ends - strike.tick + self._recovery(strike)
         if not all(map(self._is_periodic, owed)):
             # Nothing says when its writer has something to write.
-            bound = self._last + 1 - strike.tick
-        is_undone = after.is_undone and (after.recovery or 0) <= bound
-        mailbox = strike.affected[0] if len(strike.affected) == 1 else ""
-        seen: Seen = "not struck" if strike.tick < 0 else "missed"
-        judgement = Judgement(
+            recovery_bound = self._last + 1 - strike.tick
+        # Only a kind that may end the task with an error has this reaction.
+        is_latched = self._run.has_failed and LATCHED in after.reactions
+        is_undone = after.is_undone and (after.recovery or 0) <= recovery_bound
+        return Judgement(
             kind=strike.kind,
             board=strike.board,
-            mailbox=mailbox,
+            mailbox=strike.affected[0] if len(strike.affected) == 1 else "",
             joint=strike.joint,
             size=strike.size,
             began=strike.began,
             struck=strike.tick,
-            seen=seen,
-            is_judged=record.visible_from is None or (strike.size or 0.0) >= record.visible_from,
+            is_judged=visible_from is None or (strike.size or 0.0) >= visible_from,
             cycle=cycle_ticks(self._layout, strike.board),
-            bound=self._bound(strike),
             reactions=after.reactions,
             is_recovered=is_latched or is_undone,
             recovery=after.recovery,
-            recovery_bound=bound,
+            recovery_bound=recovery_bound,
             lacking=after.lacking,
             is_latched=is_latched,
+            **self._seen(strike, best),
         )
+
+    def _seen(self, strike: Strike, best: Detection | None) -> Report:
+        """Return what a judgement says of the detection of a fault."""
         if best is None:
-            return judgement
-        found_by = "the Rack" if best.event.kind == DIED else best.event.board
-        delay_ms = None if best.delay_ms is None else round(best.delay_ms, 3)
-        return replace(
-            judgement,
-            seen="detected",
-            found_by=found_by,
-            found_as=best.event.code or best.event.kind,
-            delay=best.delay,
-            delay_ms=delay_ms,
-            bound=best.bound,
-            bound_ms=best.bound_ms,
-            is_within=best.is_within,
-        )
+            seen = "not struck" if strike.tick < 0 else "missed"
+            return {"seen": seen, "bound": self._bound(strike)}
+        return {
+            "seen": "detected",
+            "found_by": "the Rack" if best.event.kind == DIED else best.event.board,
+            "found_as": best.event.code or best.event.kind,
+            "delay": best.delay,
+            "delay_ms": None if best.delay_ms is None else round(best.delay_ms, 3),
+            "bound": best.bound,
+            "bound_ms": best.bound_ms,
+            "is_within": best.is_within,
+        }
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
         """Return whether no fault explains a detection, a death or a miss."""
@@ -351,6 +312,12 @@ class _Judge:
             f"'{name}'" in event.text for name in self._run.moving
         )
         return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
+
+
+def end_of(strike: Strike) -> int:
+    """Return the tick at which a fault ends, in the run or as planned."""
+    # A task that hangs is killed as soon as that is found, however long it was to hang.
+    return strike.tick if strike.record.consequence.ends_process else strike.ends
 
 
 def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:

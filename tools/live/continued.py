@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,10 +37,9 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.live.display import Display
 from rack.tools.live.launch import Beginning, run_rack
-from rack.tools.recording.code import check_code
 from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
 from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
-from rack.tools.recording.origin import Origin, continued_at
+from rack.tools.recording.origin import Origin, check_code, continued_at
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
@@ -71,12 +71,12 @@ class RunAgain:
         ran = recording.rack_config
         # The rack is about to run again, with the levels that its config names.
         extend_path(ran.python_path)
-        for note in check_code(recording, self._asked, anyway):
-            print(note, file=sys.stderr)
+        check_code(recording, self._asked, anyway)
         self.crate = crate or WarmCrate()
         # It imports while this process reads the run.
         self.crate.ask(Preload(classes(ran), tuple(sys.path), cell_of(ran)))
         self._has_begun = False
+        self._branched_at = continued_at(recording)
 
     def __enter__(self) -> Self:
         return self
@@ -91,10 +91,6 @@ class RunAgain:
             return None
         folder = other_run(self.recording.folder, Path("origin"), self._asked)
         return RunAgain(Recording(folder), self._asked, self.crate, self._anyway)
-
-    @cached_property
-    def _branched_at(self) -> int | None:
-        return continued_at(self.recording)
 
     @cached_property
     def entries(self) -> Mapping[str, Entries] | None:
@@ -123,9 +119,7 @@ class RunAgain:
     def rack_at(self, tick: int, snapshots: SnapshotPolicy | None = None) -> Iterator[Rack]:
         """Yield the rack as it is when it has run, unchanged, to `tick`."""
         begins = self._begin(tick)
-        ran = branched(self.recording, (), None)
-        # The run's own name may be in use.
-        config = ran.model_copy(update={"name": f"{ran.name[:16]}-at-{tick}-{os.getpid()}"})
+        config = self._own_config(f"at-{tick}")
         with (
             INTERRUPT.raising(),
             Rack(
@@ -135,22 +129,22 @@ class RunAgain:
                 snapshots=snapshots,
                 continues=begins.continues,
                 requests=begins.requests,
-                repeats=ran.name,
+                repeats=self.recording.rack_config.name,
             ) as rack,
         ):
             rack.run(tick * config.clock_ns * 1e-9)
             self._has_begun = True
             yield rack
 
+    def _own_config(self, ending: str) -> RackConfig:
+        """Return the run's own config, with another name: that may be in use."""
+        config = branched(self.recording)
+        return config.model_copy(update={"name": f"{config.name[:16]}-{ending}-{os.getpid()}"})
+
     def beginning(self, tick: int) -> Beginning:
         """Return what a rack goes on from at `tick`."""
         self.reach(tick)
-        return Beginning(
-            continues=self._continuation(tick),
-            crate=self.crate,
-            entries=self.entries,
-            origin=Origin.at(self.recording, tick),
-        )
+        return replace(self._begin(tick), origin=Origin.at(self.recording, tick))
 
     def levels(self, tick: int) -> dict[str, Document]:
         """Return the attributes of the levels' own objects before `tick`, by task."""
@@ -162,19 +156,17 @@ class RunAgain:
     def _begin(self, tick: int) -> Beginning:
         """Return what the run's own rack goes on from to come to `tick`."""
         run = self.recording
+        begins = Beginning(crate=self.crate, entries=self.entries)
         if self._has_begun:
-            return Beginning(continues=self._continuation(tick), entries=self.entries)
-        branched_at = self._branched_at
-        if branched_at is None or self._parent is None:
-            if ticks_of(run)[0] > max(task.every for task in run.layout.tasks):
-                raise Failure(f"{self._asked}: its beginning was not kept", 2)
-            return Beginning(requests=recorded_commands(run), entries=self.entries)
-        self._parent.reach(branched_at)
-        return Beginning(
-            continues=self._parent._continuation(branched_at),
-            requests=commands_from(run, branched_at),
-            entries=self.entries,
-        )
+            return replace(begins, continues=self._continuation(tick))
+        if self._branched_at is not None and self._parent is not None:
+            self._parent.reach(self._branched_at)
+            continues = self._parent._continuation(self._branched_at)
+            requests = commands_from(run, self._branched_at)
+            return replace(begins, continues=continues, requests=requests)
+        if ticks_of(run)[0] > max(task.every for task in run.layout.tasks):
+            raise Failure(f"{self._asked}: its beginning was not kept", 2)
+        return replace(begins, requests=recorded_commands(run))
 
     def _continuation(self, tick: int) -> Continuation:
         """Return the snapshot at `tick` or before, with what the tables hold there."""
@@ -202,13 +194,8 @@ class RunAgain:
     def _first_unlike(self, folder: Path, tick: int) -> str:
         """Return the first message that differs until `tick`, as text, from a record of the rack
         that runs again into `folder`."""
-        ran = branched(self.recording, (), None)
-        config = ran.model_copy(update={"name": f"{ran.name[:16]}-again-{os.getpid()}"})
-        begins = Beginning(
-            continues=self._continuation(self._branched_at or 0),
-            crate=self.crate,
-            entries=self.entries,
-        )
+        config = self._own_config("again")
+        begins = self._begin(self._branched_at or 0)
         run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), begins=begins)
         again = Recording(folder)
         first = unlike_messages(self.recording, again)[0]
@@ -272,7 +259,9 @@ def tick_in(recording: Recording, text: str, asked: str = "") -> int:
     return tick
 
 
-def branched(recording: Recording, settings: Sequence[str], faults: str | None) -> RackConfig:
+def branched(
+    recording: Recording, settings: Sequence[str] = (), faults: str | None = None
+) -> RackConfig:
     """Return the config of a branch of a run in lockstep. Raises `ConfigError`."""
     overrides = ["clock.mode=lockstep", "clock.speed=1.0", *settings]
     return load(str(recording.folder / CONFIG), overrides, faults)

@@ -21,28 +21,18 @@ from rack.boards.events import NO_TORQUE, Event
 from rack.boards.exchange import PortAge
 from rack.tools.console.tables import console, decimal, grid
 from rack.tools.live.holds import is_news
-from rack.tools.live.host_side import EntryRow, HostRow
-from rack.tools.live.network import ExportRow, ImportRow, PeerRow
 from rack.tools.live.snapshot import DEAD, LOST, Snapshot, TaskRow
 
 if TYPE_CHECKING:
     from rich.live import Live
 
-Row = HostRow | EntryRow | PeerRow | ImportRow | ExportRow
-"""Row of a table of host boards, other racks, or what passes to and from them."""
-
-
-def _scheduling(priority: int) -> str:
-    if priority == DEADLINE:
-        return "deadline"
-    return f"FIFO {priority}" if priority else "other"
-
+SCHEDULING = {DEADLINE: "deadline", 0: "other"}
 
 COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "slot": lambda row: str(row.slot),
     "task": lambda row: row.task,
     "core": lambda row: str(row.core),
-    "sched": lambda row: _scheduling(row.priority),
+    "sched": lambda row: SCHEDULING.get(row.priority, f"FIFO {row.priority}"),
     "Hz": lambda row: f"{row.rate_hz:g}",
     "tick": lambda row: str(row.tick),
     "cycles": lambda row: str(row.cycles),
@@ -177,19 +167,16 @@ class RackView:
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
         yield grid(list(COLUMNS), cells, width, DROPPED, _style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
-        sides: tuple[Sequence[Row], ...] = (snapshot.hosts, snapshot.entries)
+        sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
         for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
-            if rows:
-                found = [asdict(row) for row in rows]
-                cells = [[_cell(name, value) for name, value in row.items()] for row in found]
+            if found := [asdict(row) for row in rows]:
+                cells = [[_cell(*pair) for pair in row.items()] for row in found]
                 yield Text()
-                yield grid(
-                    [name.replace("_", " ") for name in found[0]], cells, width, style=_style
-                )
+                yield grid([key.replace("_", " ") for key in found[0]], cells, width, style=_style)
         yield from (Text(line, style="red") for line in _reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
-        yield from (Text(_exchange(board, ports)) for board, ports in snapshot.exchanges.items())
+        yield from (Text(_exchange(*found)) for found in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             # In two lines where it is long: a command must not be wrapped.
@@ -250,13 +237,14 @@ def _demanded(snapshot: Snapshot) -> list[str]:
 def _reasons(snapshot: Snapshot) -> list[str]:
     """Return the reasons that tasks give, except those that a hold already shows."""
     held = {hold.level for hold in snapshot.holds}
-    rows = [
-        row
-        for row in snapshot.tasks
-        if row.reason and not (row.state == "holding" and row.task in held)
-    ]
     shown = [hold.why for hold in snapshot.holds]
-    return [f"{row.task}: {row.reason}" for row in rows if is_news(row.reason, shown)]
+    return [
+        f"{row.task}: {row.reason}"
+        for row in snapshot.tasks
+        if row.reason
+        and not (row.state == "holding" and row.task in held)
+        and is_news(row.reason, shown)
+    ]
 
 
 def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:

@@ -7,6 +7,7 @@ import json
 import time
 from contextlib import suppress
 from dataclasses import asdict
+from io import StringIO
 from pathlib import Path
 from typing import TextIO
 
@@ -46,8 +47,8 @@ class EventLog:
 
     def __init__(self, display: Display) -> None:
         self._display = display
-        self._waiting: list[str] = []
-        self._file: TextIO | None = None
+        self._earlier = StringIO()
+        self._file: TextIO = self._earlier
         self.has_failed = False
 
     def add(self, event: Event) -> None:
@@ -59,24 +60,21 @@ class EventLog:
         """Write to a file from now on, earlier events first."""
         # Line-buffered: the log of a killed run is complete up to its end.
         self._file = path.open("w", buffering=1)
-        waiting = self._waiting
-        self._waiting = []
-        self._put("".join(waiting))
+        self._put(self._earlier.getvalue())
 
     def end(self, outcome: Document) -> None:
         """Write the outcome, close the file, and put its events in order: until now they are as
         they became known."""
         self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
-        if self._file is not None and not self.has_failed:
+        if self._file is not self._earlier and not self.has_failed:
             self._put_in_order(Path(self._file.name))
 
     def close(self) -> None:
         """Close the file, with or without an outcome."""
-        if self._file is not None:
-            # Closing retries what could not be written.
-            with suppress(OSError):
-                self._file.close()
+        # Closing retries what could not be written.
+        with suppress(OSError):
+            self._file.close()
 
     def _put_in_order(self, path: Path) -> None:
         """Sort the lines of the file; where there is no room for that, they stay as they are."""
@@ -91,15 +89,11 @@ class EventLog:
         draft.unlink(missing_ok=True)
 
     def _write(self, entry: Document) -> None:
-        line = checked_line(entry)
-        if self._file is None:
-            self._waiting.append(line)
-        else:
-            self._put(line)
+        self._put(checked_line(entry))
 
     def _put(self, text: str) -> None:
         try:
-            if self._file is not None and not self.has_failed:
+            if not self.has_failed:
                 self._file.write(text)
         except OSError as error:
             self.has_failed = True

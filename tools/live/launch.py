@@ -28,8 +28,7 @@ from rack.tools.live.other_racks import OtherEnd, OtherRacks
 from rack.tools.live.queues import queue_fills
 from rack.tools.live.snapshot import RackMonitor
 from rack.tools.live.verdict import list_failures
-from rack.tools.recording.code import write_code
-from rack.tools.recording.origin import Origin
+from rack.tools.recording.origin import Origin, write_code
 from rack.tools.recording.recorder_process import RecorderProcess
 
 COUNTED = (
@@ -57,7 +56,7 @@ News = Callable[[], list[str]]
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a run goes on from: a snapshot in a crate, or, without one, another run's first tick;
+    """What a run goes on from: a snapshot in a crate, which without one is just started earlier;
     the commands that its operators gave; what its host boards and other racks sent, which are not
     started then; and which run that is, for the record."""
 
@@ -66,6 +65,9 @@ class Beginning:
     requests: tuple[Request, ...] = ()
     entries: Mapping[str, Entries] | None = None
     origin: Origin | None = None
+
+
+ANEW = Beginning()
 
 
 @dataclass(frozen=True)
@@ -111,25 +113,21 @@ def run_rack(
     *,
     view: bool = False,
     share: bool = True,
-    crate: CrateLine | None = None,
     step: bool = False,
-    begins: Beginning | None = None,
+    begins: Beginning = ANEW,
 ) -> RunResult:
     """Run a rack for `seconds` of simulated time, or until its task ends; record it into `folder`
     unless that is None.
 
     With `view`, open a viewer on what the recorder serves; it may be closed at any time. With
-    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share` and `crate` are
-    as in `Rack`; `begins`: the run that it continues or repeats, whose crate takes the place of
-    `crate`. Launch the racks that the config names: one that fails ends the run, and a run that
-    does not succeed ends them.
+    `step`, in lockstep, hold before tick 0 until the rack is stepped. `share` is as
+    in `Rack`; `begins`: the crate, and the run that it continues or repeats. Launch the racks that
+    the config names: one that fails ends the run, and a run that does not succeed ends them.
 
     Raises what `Rack` raises; a rack that could not be launched leaves no folder. A recorder that
     dies does not end the run, but files that cannot be written do: raises `Failure`.
     """
     log = EventLog(display)
-    news: list[News] = []
-    begins = begins or Beginning()
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to keep.
         with INTERRUPT.at_once():
@@ -137,7 +135,7 @@ def run_rack(
             # In a replay what they sent enters again.
             launches = lan.launch if lan is not None and begins.entries is None else ()
             others = stack.enter_context(OtherRacks(launches, config, seconds, folder is not None))
-            recorder = None if folder is None else RecorderProcess()
+            recorder = None if folder is None else RecorderProcess(folder)
             if recorder is not None:
                 stack.callback(recorder.finish)
             rack = stack.enter_context(
@@ -145,45 +143,43 @@ def run_rack(
                     config,
                     log.add,
                     share or bool(others),
-                    begins.crate or crate,
+                    begins.crate,
                     begins.entries,
                     continues=begins.continues,
                     requests=begins.requests,
                 )
             )
-            rack.segment.words[System.HOLD_AT] = int(step)
-            if folder is not None and recorder is not None:
-                try:
-                    folder.mkdir(parents=True, exist_ok=True)
-                    (folder / "config.toml").write_text(config.text())
-                    write_code(config, folder)
-                    if begins.origin is not None:
-                        begins.origin.write(folder)
-                    log.open(folder / "events.jsonl")
-                except OSError as error:
-                    raise Failure(f"{folder}: {error.strerror}") from None
+            segment = rack.segment
+            segment.words[System.HOLD_AT] = int(step)
+            news: list[News] = []
+            if recorder is not None:
+                news.append(recorder.news)
+                _begin_folder(recorder.folder, config, begins.origin, log)
                 port = import_module(VIEWER).free_port() if view else None
-                if not recorder.attach(config.name, folder, port, rack.segment.words):
+                if not recorder.attach(config.name, port, segment.words):
                     log.add(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
-                news = [recorder.news, *([] if port is None else [_viewer(port)])]
+                if port is not None:
+                    news.append(_open_viewer(port))
+
+        def log_news() -> None:
+            for text in [text for source in news for text in source()]:
+                log.add(Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text))
+
         unfinished = NO_TIME.format(folder) if folder else ""
         with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             started = time.monotonic()
-            outcome = _watch(rack, seconds, display, log, news, others)
+            outcome = _watch(rack, seconds, display, log, log_news, others)
             wall_s = time.monotonic() - started
-            segment = rack.segment
-        _log_news(news, segment, log)
+        log_news()
         if recorder is not None and not INTERRUPT.number:
             # Later it would find no rack to attach to.
             recorder.await_begun()
         rack.close()
-        recording = "none"
-        rows_lost = dict[str, int]()
-        if folder is not None and recorder is not None:
-            recording, rows_lost = _compared(
-                folder, segment, recorder.finish(in_a_hurry=INTERRUPT.number != 0), outcome.ticks
-            )
-        _log_news(news, segment, log)
+        recording, rows_lost = "none", dict[str, int]()
+        if recorder is not None:
+            ended = recorder.finish(in_a_hurry=INTERRUPT.number != 0)
+            recording, rows_lost = _compare(recorder.folder, segment, ended, outcome.ticks)
+        log_news()
         failed = others.finish()
         result = RunResult(
             rack=config.name,
@@ -213,7 +209,20 @@ def run_rack(
         return cut_off if log.has_failed else result
 
 
-def _viewer(port: int) -> News:
+def _begin_folder(folder: Path, config: RackConfig, origin: Origin | None, log: EventLog) -> None:
+    """Write into the folder of a run what is known of it before it begins. Raises `Failure`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.toml").write_text(config.text())
+        write_code(config, folder)
+        if origin is not None:
+            origin.write(folder)
+        log.open(folder / "events.jsonl")
+    except OSError as error:
+        raise Failure(f"{folder}: {error.strerror}") from None
+
+
+def _open_viewer(port: int) -> News:
     """Open the viewer on what the recorder serves; return its news. Without a viewer the rack runs
     all the same."""
     window = import_module(VIEWER)
@@ -230,7 +239,7 @@ def _watch(
     seconds: float | None,
     display: Display,
     log: EventLog,
-    news: list[News],
+    log_news: Callable[[], None],
     others: OtherRacks,
 ) -> Outcome:
     """Run the rack to its end; show it, and log what only the host side can see."""
@@ -242,7 +251,7 @@ def _watch(
         # The last look is at the rack's end: a run in lockstep may be over between two.
         is_running = rack.watch(display.period_s)
         display.show(monitor.look())
-        _log_news(news, rack.segment, log)
+        log_news()
         for event in standstill.look():
             log.add(event)
         if why := others.failure():
@@ -254,7 +263,7 @@ def _watch(
     return rack.outcome
 
 
-def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str, dict[str, int]]:
+def _compare(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str, dict[str, int]]:
     """Compare the files with what the rings say was written; `why` is how the recorder ended.
 
     Return "complete" or what is missing, and the rows missing by task and by mailbox.
@@ -287,8 +296,3 @@ def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str
     return "; ".join((text, *map(str, gaps), why)), {
         name: found.rows for name, found in missing.items()
     }
-
-
-def _log_news(news: list[News], segment: Segment, log: EventLog) -> None:
-    for text in [text for source in news for text in source()]:
-        log.add(Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text))

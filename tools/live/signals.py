@@ -71,7 +71,8 @@ class Strip:
         self.settles = max(spec.every + spec.delay for spec in specs)
         # One look may bring as much as a ring holds.
         self._span = span + self.settles + max(spec.every * spec.depth for spec in specs)
-        self._rows: dict[str, deque[tuple[int, list[Any]]]] = defaultdict(deque)
+        self._changes: dict[str, deque[tuple[int, dict[str, Any]]]] = defaultdict(deque)
+        """Of each mailbox ticks, and the values of its signals by name."""
         self._tap = SignalTap(segment, [*signals, *followed])
         self.lost = 0
         self.take()
@@ -85,30 +86,23 @@ class Strip:
             self.lost += written.lost
             own = [signal for signal in self.signals if signal.mailbox == written.mailbox]
             if own:
+                names = [signal.name for signal in own]
                 values = zip(*(signal.plain(written.messages) for signal in own), strict=True)
-                rows = self._rows[written.mailbox]
-                rows.extend(zip(written.ticks.tolist(), map(list, values), strict=True))
-                while len(rows) > 1 and rows[1][0] < rows[-1][0] - self._span:
-                    rows.popleft()
+                named = (dict(zip(names, row, strict=True)) for row in values)
+                changes = self._changes[written.mailbox]
+                changes.extend(zip(written.ticks.tolist(), named, strict=True))
+                while len(changes) > 1 and changes[1][0] < changes[-1][0] - self._span:
+                    changes.popleft()
         return found
 
     def table(self, first: int, last: int) -> Rows:
         """Return a row for each tick from `first` to `last` at which one of the signals was
         released."""
-        changes = [
-            (tick, mailbox, values)
-            for mailbox, rows in self._rows.items()
-            for tick, values in rows
-            if tick <= last
-        ]
-        names = {
-            mailbox: [signal.name for signal in self.signals if signal.mailbox == mailbox]
-            for mailbox in self._rows
-        }
+        changes = [one for many in self._changes.values() for one in many if one[0] <= last]
         newest: dict[str, Any] = {}
         table: dict[int, list[Any]] = {}
-        for tick, mailbox, values in sorted(changes, key=lambda change: change[0]):
-            newest.update(zip(names[mailbox], values, strict=True))
+        for tick, values in sorted(changes, key=lambda change: change[0]):
+            newest.update(values)
             if tick >= first:
                 table[tick] = [newest.get(signal.name) for signal in self.signals]
         return [*table.items()]

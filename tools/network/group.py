@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.parameters import Json
+from rack.tools.console.parameters import Json, argument, option
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
 YEAR = 365
@@ -21,21 +20,14 @@ def lan() -> None:
 
 @app.command()
 def certificates(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="folder of the set; made if it does not exist")
-    ],
-    names: Annotated[
-        list[str],
-        typer.Option(
-            "--for",
-            metavar="NAME[=ADDRESS,...]",
-            help=(
-                "rack, or person, that gets a certificate, with the addresses at which others"
-                " reach it; repeatable"
-            ),
-        ),
-    ],
-    days: Annotated[int, typer.Option(metavar="N", min=1, max=3650, help="validity, days")] = YEAR,
+    folder: Path = argument("DIR", "folder of the set; made if it does not exist"),
+    names: list[str] = option(
+        "--for NAME[=ADDRESS,...]",
+        "rack, or person, that gets a certificate, with the addresses at which others"
+        " reach it; repeatable",
+        ...,
+    ),
+    days: int = option("--days N", "validity, days", YEAR, min=1, max=3650),
     as_json: Json = False,
 ) -> None:
     """Make a set of certificates for tests: an authority, and a pair for each name.

@@ -22,50 +22,32 @@ default rack takes 2 to 8 times as long as usual; from the sixth on they are ali
 WORST = 100.0
 """The percentile of eq. 3.6: the longest of all cycles."""
 
-_EXCHANGE, _READ, _PROCESS, _WRITE = range(4)
-
 
 @dataclass(frozen=True)
 class Cycles:
     """The cycles of one task, oldest first; of a planner only those that made a plan.
 
-    `rows` are the trace records, shape (n,). `parts` are processor times, ns, shape (n, 4): C, R,
-    X, W of an executor; 0, reading, P, U of a planner. `is_judged` excludes the start-up of a
-    process, and the `stalled` cycles: those in which the core may have been away (see `stalls_of`);
-    bool, shape (n,). `core` and `priority` are those that the task obtained; `overhead_ns` is the
-    processor time of a cycle outside its parts, for waking up and closing it. `stretches` are those
-    of the recording, shape (n,), see `Recording.stretch_of`.
+    `rows` are the trace records, shape (n,). Processor times, ns, shape (n,): `exchange_ns`, C,
+    reading the plan, 0 of a planner; `read_ns`, R, reading commands and statuses; `process_ns`, X
+    or P; `write_ns`, W or U. `is_judged` excludes the start-up of a process, and the `stalled`
+    cycles: those in which the core may have been away (see `stalls_of`); bool, shape (n,). `core`
+    and `priority` are those that the task obtained; `overhead_ns` is the processor time of a cycle
+    outside its parts, for waking up and closing it. `stretches` are those of the recording, shape
+    (n,), see `Recording.stretch_of`.
     """
 
     task: TaskSpec
     core: int
     priority: int
     rows: np.ndarray
-    parts: np.ndarray
+    exchange_ns: np.ndarray
+    read_ns: np.ndarray
+    process_ns: np.ndarray
+    write_ns: np.ndarray
     is_judged: np.ndarray
     stalled: int
     overhead_ns: int
     stretches: np.ndarray
-
-    @property
-    def exchange_ns(self) -> np.ndarray:
-        """C, reading the plan, shape (n,)."""
-        return self.parts[:, _EXCHANGE]
-
-    @property
-    def read_ns(self) -> np.ndarray:
-        """R, reading commands and statuses, shape (n,)."""
-        return self.parts[:, _READ]
-
-    @property
-    def process_ns(self) -> np.ndarray:
-        """X of an executor, P of a planner, shape (n,)."""
-        return self.parts[:, _PROCESS]
-
-    @property
-    def write_ns(self) -> np.ndarray:
-        """W of an executor, U of a planner, shape (n,)."""
-        return self.parts[:, _WRITE]
 
     @property
     def communication_ns(self) -> np.ndarray:
@@ -75,7 +57,7 @@ class Cycles:
     @property
     def used_ns(self) -> np.ndarray:
         """All parts together, shape (n,)."""
-        return np.asarray(self.parts.sum(axis=1))
+        return np.asarray(self.communication_ns + self.process_ns)
 
 
 def cycles_of(recording: Recording) -> dict[str, Cycles]:
@@ -92,18 +74,29 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
         rows = recording.cycles[task.name]
         rows = plans(rows) if task.role == "planner" else rows
         if len(rows):
-            parts = unit_times(rows, Occupation.union([spans[name] for name in above]))
+            above_it = Occupation.union([spans[name] for name in above])
+            exchange_ns, read_ns, process_ns, write_ns = unit_times(rows, above_it).T
             if task.role == "executor" and f"{task.name}.planner" not in planned:
                 # Without a planner the look for a plan is part of reading.
-                parts[:, _READ] += parts[:, _EXCHANGE]
-                parts[:, _EXCHANGE] = 0
+                read_ns = read_ns + exchange_ns
+                exchange_ns = np.zeros_like(read_ns)
             settled = _settled(recording, task.name, rows["tick"])
             whole = settled & (away[core].within(rows["start_ns"], rows["end_ns"]) == 0)
             judged = whole if whole.any() else settled
-            stalled = int(settled.sum() - judged.sum())
-            stretches = recording.stretch_of(rows["tick"])
-            times = (rows, parts, judged, stalled, overhead_ns(rows), stretches)
-            found[task.name] = Cycles(task, core, priority, *times)
+            found[task.name] = Cycles(
+                task=task,
+                core=core,
+                priority=priority,
+                rows=rows,
+                exchange_ns=exchange_ns,
+                read_ns=read_ns,
+                process_ns=process_ns,
+                write_ns=write_ns,
+                is_judged=judged,
+                stalled=int(settled.sum() - judged.sum()),
+                overhead_ns=overhead_ns(rows),
+                stretches=recording.stretch_of(rows["tick"]),
+            )
     return found
 
 

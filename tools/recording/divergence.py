@@ -133,10 +133,8 @@ def _unlike(
     heads = [_heads(run, box.name, begin) for run in (one, other)]
     length = min(len(head["serial"]) for head in heads)
     apart, chained = (
-        int(
-            np.append(np.flatnonzero(heads[0][name][:length] != heads[1][name][:length]), length)[0]
-        )
-        for name in ("serial", "chain")
+        next(iter(np.flatnonzero(here[:length] != there[:length]).tolist()), length)
+        for here, there in ((heads[0][name], heads[1][name]) for name in ("serial", "chain"))
     )
     # A damaged message is in no recording: the serials are apart where it was. Of any other the
     # chain shows a difference one message later.
@@ -160,9 +158,8 @@ def _unlike(
 def _heads(run: Recording, mailbox: str, begin: int) -> Heads:
     """Return the heads of the messages written from tick `begin` on."""
     columns = {name: run.signal(mailbox, name) for name in HEADS}
-    later = np.flatnonzero(columns["tick"] >= begin)
-    at = later[0] if len(later) else len(columns["tick"])
-    return {name: values[at:] for name, values in columns.items()}
+    is_later = columns["tick"] >= begin
+    return {name: values[is_later] for name, values in columns.items()}
 
 
 def _is_last_equal(one: Recording, other: Recording, box: MailboxSpec, heads: list[Heads]) -> bool:

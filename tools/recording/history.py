@@ -154,15 +154,14 @@ def _holds_of(recording: Recording, level: str) -> Iterator[Document]:
             if is_operators
             else recording.reason(mailbox, end - 1)
         )
-        since = int(ticks[first])
-        until = int(ticks[end]) if end < len(ticks) else None
+        since, until = ticks[[first, min(end, len(ticks) - 1)]].tolist()
         yield {
             "level": level,
             "by": "operator" if is_operators else OWN,
             "why": why,
             "since_s": round(since * tick_s, 6),
-            "until_s": None if until is None else round(until * tick_s, 6),
-            "lasted_s": round(((int(ticks[-1]) if until is None else until) - since) * tick_s, 6),
+            "until_s": round(until * tick_s, 6) if end < len(ticks) else None,
+            "lasted_s": round((until - since) * tick_s, 6),
         }
 
 

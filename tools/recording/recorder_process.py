@@ -13,7 +13,6 @@ from pathlib import Path
 
 from rack.backplane.json_text import encode_json
 from rack.backplane.process import STOPPED, processor_ns, readable, state_of
-from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 
@@ -70,15 +69,16 @@ class IdleLooks:
 
 
 class RecorderProcess:
-    """A recorder for a rack that is about to run; it imports its libraries while the rack is being
-    launched.
+    """A recorder for a rack that is about to run, which records into `folder`; it imports its
+    libraries while the rack is being launched.
 
     One that dies is restarted up to RESTARTS times, in the same folder; one that hangs is killed
     first. Lockstep waits meanwhile. If its files cannot be written, `news` and `finish` raise
     `Failure`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
         # stderr goes to a file in memory: nobody would empty a pipe.
         self._complaints = os.memfd_create("recorder")
         self._request = b""
@@ -107,15 +107,10 @@ class RecorderProcess:
         """Process id of the recorder."""
         return self._process.pid
 
-    def attach(
-        self, rack: str, folder: Path, port: int | None = None, words: memoryview | None = None
-    ) -> bool:
-        """Record that rack into that folder, and serve a viewer on that port; return False if it
-        has not begun in time.
-
-        With the `words` of a rack in lockstep, that waits for it, in any case.
-        """
-        self._request = encode_json([rack, str(folder), port]).encode() + b"\n"
+    def attach(self, rack: str, port: int | None, words: memoryview | None = None) -> bool:
+        """Record that rack, and serve a viewer on that port; return False if it has not begun in
+        time. With the `words` of a rack in lockstep, that waits for it, in any case."""
+        self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
         self._words = words
         self._ask()
         return self.await_begun(ATTACH_S)
@@ -232,21 +227,6 @@ class RecorderProcess:
         self._has_begun |= BEGUN in texts
         self._lines += [line for line in texts if line != BEGUN]
         return bool(block)
-
-
-def recorded_by(segment: Segment) -> Path | None:
-    """Return the folder into which a rack is recorded; None if it is not, or if that cannot be
-    seen from this PID namespace."""
-    if not segment.launcher:
-        return None
-    pid = segment.words[System.FOLLOWER_PID]
-    with suppress(OSError):
-        for file in Path(f"/proc/{pid}/fd").iterdir():
-            # Descriptors come and go.
-            with suppress(OSError):
-                if (path := file.readlink()).name == SPOOL:
-                    return path.parent
-    return None
 
 
 def size_of(folder: Path) -> int:

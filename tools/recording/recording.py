@@ -302,18 +302,13 @@ class Recording:
         a field of its own with such a name is "message.<name>". Raises `KeyError`.
         """
         shape = () if field in HEAD else self._shapes[mailbox][field]
-        read = []
-        for file in self._tables.get(mailbox, ()):
-            with _naming(self.folder / SIGNALS / TABLE.format(mailbox)):
-                read.append(file.read(columns=[field]).column(0).combine_chunks())
-        values = [
-            (block.flatten() if shape else block).to_numpy(zero_copy_only=False)
-            for block in read
-            if len(block)
-        ]
-        if not values:
+        with _naming(self.folder / SIGNALS / TABLE.format(mailbox)):
+            read = [file.read(columns=[field]) for file in self._tables.get(mailbox, ())]
+        if not any(map(len, read)):
             return np.empty((0, *shape))
-        return np.concatenate(values).reshape(-1, *shape)
+        column = pa.concat_tables(read).column(0).combine_chunks()
+        values = column.flatten() if shape else column
+        return np.asarray(values.to_numpy(zero_copy_only=False).reshape(-1, *shape))
 
     def reason(self, mailbox: str, row: int) -> str:
         """Return the reason in a status, for people; empty for one of a user's level without

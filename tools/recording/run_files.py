@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from contextlib import closing, suppress
 from pathlib import Path
-from shutil import copyfile, rmtree
+from shutil import rmtree
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -16,10 +16,10 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Launch, Segment
 from rack.tools.console.answer import Failure
-from rack.tools.recording.checksums import CHECKSUMS, Checksums
+from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
-from rack.tools.recording.parquet import CONFIG, PUBLISHED, SIGNALS, CyclesFile, signal_tables
-from rack.tools.recording.recorder_process import CODE, LOOK_S, ORIGIN, SPOOL
+from rack.tools.recording.parquet import SIGNALS, CyclesFile, signal_tables
+from rack.tools.recording.recorder_process import LOOK_S, SPOOL
 from rack.tools.recording.spool import (
     OPEN,
     STRETCHES,
@@ -32,7 +32,6 @@ from rack.tools.recording.spool import (
     read_head,
     ring_dtypes,
     rings,
-    stretch_files,
 )
 
 CYCLES = "cycles.parquet"
@@ -236,18 +235,6 @@ def tally(folder: Path) -> Tally | None:
                 found.take(part)
     found.end()
     return found
-
-
-def save(folder: Path, into: Path) -> None:
-    """Make a run's folder, `into`, of what the recorder of `folder` has taken so far; that one goes
-    on."""
-    stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
-    for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
-        (into / name).parent.mkdir(parents=True, exist_ok=True)
-        # The flight recorder may have removed it meanwhile; few runs have an origin.
-        with suppress(FileNotFoundError):
-            copyfile(folder / name, into / name)
-    mend(into)
 
 
 def _lock(file: IO[bytes], path: Path) -> None:

@@ -45,10 +45,7 @@ class Signal(Column):
     @classmethod
     def all(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
         """Return every whole field of these mailboxes by its name."""
-        columns = (column for box in boxes for column in columns_of(box))
-        return {
-            one.name: cls(one.name, one.mailbox, one.path, one.shape, one.spec) for one in columns
-        }
+        return {one.name: cls(**vars(one)) for box in boxes for one in columns_of(box)}
 
     @classmethod
     def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:

@@ -76,75 +76,101 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     While the clock's core is away without steal, the whole machine may be: that counts for every
     core.
     """
-    config = recording.rack_config
-    tasks = recording.layout.tasks
-    grid_ns = config.tick_ns
-    home = obtained_core(config.clock.core)
-    traces = [recording.trace(task.name) for task in tasks]
-    rows = np.concatenate(traces)
-    places = [(*recording.place(task), task.every) for task in tasks]
-    on, priority, every = np.repeat(places, [len(trace) for trace in traces], axis=0).T
-    # Releases skipped before a cycle were due before it.
-    due = rows["release_ns"] - skipped(rows) * every * grid_ns
+    clock = recording.rack_config.clock
+    home = obtained_core(clock.core)
+    cycles = _Cycles(recording)
     # In lockstep nothing is due at a time.
-    is_shown = config.clock.mode == "realtime" and config.clock.priority > 0 and priority.any()
-    clock = _late_clock(recording.events if is_shown else [], rows, grid_ns)
-    without_clock = Occupation(*clock)
-    urgent = np.where(is_shown & (priority > 0), due, rows["start_ns"])
-    # What cost releases was over as the next cycle began; what made a cycle late may have come in
-    # its midst.
-    resumed = np.where(is_missed(rows), rows["end_ns"], rows["start_ns"])
-    lost = skipped(rows) + is_missed(rows)
+    is_shown = clock.mode == "realtime" and clock.priority > 0 and cycles.is_urgent.any()
+    late_clock = cycles.late_clock(recording.events if is_shown else [])
+    without_clock = Occupation(*late_clock)
     spans = np.array(recording.cores.stolen or (), np.int64).reshape(-1, 4)
     away = {}
     absences = []
     during_steal = 0
-
-    def lost_during(occupied: Occupation, among: np.ndarray) -> int:
-        return int(lost[among & (occupied.within(due, resumed) > 0)].sum())
-
-    for core in dict.fromkeys([home, *on.tolist()]):
-        here = on == core
+    for core in dict.fromkeys([home, *cycles.core.tolist()]):
+        here = cycles.core == core
         is_home = core == home
         stolen = Occupation(*spans[spans[:, 2] == core, :2].T)
-        since, until = clock if is_home else _unstamped(rows[here], urgent[here])
+        since, until = late_clock if is_home else cycles.unstamped(here, is_shown)
         # Without the clock no task is released: the other cores need not have been away.
         known = stolen if is_home else Occupation.union([stolen, without_clock])
-        is_away = (until - since > grid_ns // LATE_PART) & (known.within(since, until) == 0)
+        is_away = until - since > cycles.grid_ns // LATE_PART
+        is_away &= known.within(since, until) == 0
         unstolen = Occupation(since[is_away], until[is_away])
         if len(lasted := unstolen.ends - unstolen.starts):
-            cycles = lost_during(unstolen, here | is_home)
-            absences.append(Absence(core, len(lasted), int(lasted.max()) / 1e6, cycles))
-        during_steal += lost_during(stolen, here)
+            lost = cycles.lost_during(unstolen, here | is_home)
+            absences.append(Absence(core, len(lasted), int(lasted.max()) / 1e6, lost))
+        during_steal += cycles.lost_during(stolen, here)
         away[core] = Occupation.union([stolen, unstolen, without_clock])
-    # A plan may be due for longer than a stall lasts.
-    counted = (lost > 0) & (rows["flags"] & Flag.PLANNED == 0)
-    cycles_ns = {task.name: task.every * grid_ns for task in tasks if task.role == "executor"}
-    quota = _quota(Occupation(due[counted], resumed[counted]).ends, cycles_ns)
-    return Stalls(int(lost.sum()), during_steal, absences, quota), away
+    levels_ns = {
+        task.name: task.every * cycles.grid_ns
+        for task in recording.layout.tasks
+        if task.role == "executor"
+    }
+    quota = _quota(cycles.ends(), levels_ns)
+    return Stalls(int(cycles.lost.sum()), during_steal, absences, quota), away
 
 
-def _late_clock(
-    events: list[Document], rows: np.ndarray, grid_ns: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return since when the clock's board was away, due at a grid point, and until when; `rows` are
-    on its grid."""
-    late = [
-        (e["since"], e["value"])
-        for e in events
-        if e.get("code") == "clock_late" and e["board"] == CLOCK
-    ]
-    since, late_ns = np.array(late, np.int64).reshape(-1, 2).T
-    due = (rows["release_ns"] - rows["tick"] * grid_ns).max(initial=0) + since * grid_ns
-    return due, due + late_ns
+class _Cycles:
+    """All cycles of a run, task by task.
 
+    Attributes:
+        rows: Trace records, shape (n,), as all that follow.
+        core: Core of the task.
+        is_urgent: Whether it has a real-time priority.
+        due_ns: Release of the first cycle that was skipped before this one, or of this one.
+        resumed_ns: Time at which what cost cycles was over.
+        lost: Cycles that this one and those skipped before it cost.
+        grid_ns: Time of a tick.
+    """
 
-def _unstamped(rows: np.ndarray, due: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return since when each cycle of a core, all its `rows`, was due and no task left a stamp,
-    until it started."""
-    stamps = np.sort(np.concatenate([rows[name] for name in STAMPS]))
-    # Before its first stamp a core is not judged: place -1 is the last stamp of the run.
-    return np.maximum(due, stamps[np.searchsorted(stamps, rows["start_ns"]) - 1]), rows["start_ns"]
+    def __init__(self, recording: Recording) -> None:
+        tasks = recording.layout.tasks
+        traces = [recording.trace(task.name) for task in tasks]
+        places = [(*recording.place(task), task.every) for task in tasks]
+        self.rows = rows = np.concatenate(traces)
+        self.core, priority, every = np.repeat(places, [len(trace) for trace in traces], axis=0).T
+        self.is_urgent = priority > 0
+        self.grid_ns = recording.rack_config.tick_ns
+        self.due_ns = rows["release_ns"] - skipped(rows) * every * self.grid_ns
+        # What cost releases was over as the next cycle began; what made a cycle late may have come
+        # in its midst.
+        self.resumed_ns = np.where(is_missed(rows), rows["end_ns"], rows["start_ns"])
+        self.lost = skipped(rows) + is_missed(rows)
+
+    def lost_during(self, occupied: Occupation, among: np.ndarray) -> int:
+        """Return how many cycles were lost while a core was occupied, `among` some of them."""
+        is_hit = occupied.within(self.due_ns, self.resumed_ns) > 0
+        return int(self.lost[among & is_hit].sum())
+
+    def ends(self) -> np.ndarray:
+        """Return when the spans ended in which cycles of executors were lost."""
+        # A plan may be due for longer than a stall lasts.
+        counted = (self.lost > 0) & (self.rows["flags"] & Flag.PLANNED == 0)
+        return Occupation(self.due_ns[counted], self.resumed_ns[counted]).ends
+
+    def late_clock(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
+        """Return since when the clock's board was away, due at a grid point, and until when."""
+        late = [
+            (e["since"], e["value"])
+            for e in events
+            if e.get("code") == "clock_late" and e["board"] == CLOCK
+        ]
+        since, late_ns = np.array(late, np.int64).reshape(-1, 2).T
+        # All releases are on the clock's grid.
+        begun_ns = (self.rows["release_ns"] - self.rows["tick"] * self.grid_ns).max(initial=0)
+        due_ns = begun_ns + since * self.grid_ns
+        return due_ns, due_ns + late_ns
+
+    def unstamped(self, here: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return since when each cycle of a core was due and no task left a stamp there, until it
+        started."""
+        rows = self.rows[here]
+        starts = rows["start_ns"]
+        due_ns = np.where(is_shown & self.is_urgent, self.due_ns, self.rows["start_ns"])[here]
+        stamps = np.sort(np.concatenate([rows[name] for name in STAMPS]))
+        # Before its first stamp a core is not judged: place -1 is the last stamp of the run.
+        return np.maximum(due_ns, stamps[np.searchsorted(stamps, starts) - 1]), starts
 
 
 def _quota(ends: np.ndarray, cycles_ns: dict[str, int]) -> Quota | None:

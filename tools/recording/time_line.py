@@ -14,7 +14,7 @@ one wrote.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -97,25 +97,15 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class RackPlace:
-    """A recorded rack on the time line: by what shifts its clock leads to the first rack's; in
-    lockstep, or `by_ticks`, by none."""
+    """A recorded rack on the time line: by what shifts its clock leads to the first rack's; without
+    any it is there tick by tick, as the first one itself, racks in lockstep, and, `by_ticks`, two
+    runs of one rack. `marks`: what a user should know of it, unless it is the first one."""
 
     own: RackGrid
     line: RackGrid
     shifts: tuple[Shift, ...] = ()
     by_ticks: bool = False
-    marked: tuple[Mark, ...] = ()
-
-    @property
-    def marks(self) -> tuple[Mark, ...]:
-        """What a user should know of it; of the first rack nothing."""
-        if self.own is self.line:
-            return ()
-        return self.marked or (Mark(0, self.note),)
-
-    @property
-    def _shares_ticks(self) -> bool:
-        return self.own.is_lockstep or self.by_ticks
+    marks: tuple[Mark, ...] = ()
 
     @property
     def uncertainty_ns(self) -> int:
@@ -143,13 +133,13 @@ class RackPlace:
     def times_ns(self, ticks: Ints, within_ns: Ints | int) -> Ints:
         """Return simulated times on the line of its ticks, and `within_ns` of its own simulated
         time later."""
-        if self.own is self.line or self._shares_ticks:
+        if not self.shifts:
             return ticks * self.own.clock_ns + within_ns
         return self.line.time_ns(self.stamps_ns(self.own.stamp_ns(ticks, within_ns)))
 
     def wall_ns(self, stamps_ns: Ints) -> Ints:
         """Return stamps of its machine on the line's wall clock; without shifts on its own."""
-        launch = self.own.launch if self._shares_ticks else self.line.launch
+        launch = self.line.launch if self.shifts else self.own.launch
         return self.stamps_ns(stamps_ns) + launch.wall_offset_ns
 
 
@@ -175,7 +165,8 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
                 2,
             )
         a, b, shifts = found
-        placed[b] = RackPlace(grids[b], grids[0], (*shifts, *placed[a].shifts))
+        place = RackPlace(grids[b], grids[0], (*shifts, *placed[a].shifts))
+        placed[b] = replace(place, marks=(Mark(0, place.note),))
     return [placed[at] for at in range(len(grids))]
 
 
@@ -206,7 +197,7 @@ def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     line = grids[0]
     return [
         RackPlace(line, line, by_ticks=True),
-        RackPlace(grids[1], line, by_ticks=True, marked=tuple(marks)),
+        RackPlace(grids[1], line, by_ticks=True, marks=tuple(marks)),
     ]
 
 

@@ -180,9 +180,9 @@ class AttachedRack:
         path = folder_of(wanted, self._segment.rack)
         path.mkdir(parents=True, exist_ok=True)
         (path / CONFIG).write_text(self._segment.config)
-        recorder = RecorderProcess()
+        recorder = RecorderProcess(path)
         self._closing.callback(recorder.finish)
-        if not recorder.attach(self._segment.rack, path, words=self._segment.words):
+        if not recorder.attach(self._segment.rack, None, self._segment.words):
             raise Failure(f"{path}: the recorder has not begun")
         return path
 

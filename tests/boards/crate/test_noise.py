@@ -32,7 +32,8 @@ from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.patience import RackAwaited
 from rack.boards.events import Ending, Journal
-from rack.tools.faults.ending import arm_of, levels_of, strikes
+from rack.tools.faults.campaigns.trial import levels_of
+from rack.tools.faults.ending import arm_of, strikes
 from rack.tools.faults.live import LiveRack
 from rack.tools.live.desk import LiveDesk
 from rack.tools.live.snapshot import RackMonitor

@@ -80,13 +80,14 @@ def imported(*arguments: object) -> set[str]:
 def test_a_command_starts_without_libraries_that_it_does_not_need(
     small: Path, rack_name: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    assert imported("run", "--help") <= {"typer", "pydantic"}
-    assert imported("list") == set()
+    parser = {"typer", "pydantic"}
+    assert imported("run", "--help") <= parser
+    assert imported("list") <= parser
     with Rack(load(small, [f"name={rack_name}"])):
-        assert imported("status", rack_name, "--json") <= {"numpy"}
+        assert imported("status", rack_name, "--json") <= {"numpy", *parser}
     folder = small_run(tmp_path_factory)
     rack("report", folder)
-    assert imported("report", folder) == set()
+    assert imported("report", folder) <= parser
 
 
 @pytest.mark.slow

@@ -118,9 +118,9 @@ def test_a_rack_that_nothing_records_has_nothing_to_save(
 ) -> None:
     with Rack(load(small, [f"name={rack_name}"])):
         with pytest.raises(Failure, match=f"--save {rack_name}: nothing records it"):
-            record(rack_name, out=tmp_path / "saved", save=True)
+            record(rack_name, others=[], out=tmp_path / "saved", save=True)
         with pytest.raises(Failure, match="--save, --view: give one of them"):
-            record(rack_name, view=True, save=True)
+            record(rack_name, others=[], out=None, view=True, save=True)
 
 
 @pytest.mark.slow
@@ -220,7 +220,7 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
 def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path) -> None:
     out = tmp_path / "both.rrd"
     runs = [recorded(A, [B], tmp_path / "a").folder, recorded(B, [], tmp_path / "b").folder]
-    replay(runs, out)
+    replay(runs, out, against=None)
     made = out.read_bytes()
     for given, file, why in (
         (runs, out, "both.rrd: exists already"),
@@ -230,11 +230,11 @@ def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path)
         ([runs[0], runs[0]], tmp_path / "new.rrd", "both are of rack 'a'"),
     ):
         with pytest.raises(Failure, match=why) as refused:
-            replay(given, file)
+            replay(given, file, against=None)
         assert refused.value.status == 2
     assert out.read_bytes() == made
     # A folder of such runs stands for all of them.
-    replay([tmp_path], tmp_path / "again.rrd")
+    replay([tmp_path], tmp_path / "again.rrd", against=None)
     for name in "ab":
         lane = f"/{name}/boards/2-pulse/executor"
         again, first = (read(f, lane, "StateChange:state") for f in (tmp_path / "again.rrd", out))
@@ -242,7 +242,7 @@ def test_replay_makes_a_file_only_where_none_is_and_only_of_runs(tmp_path: Path)
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(Failure, match=r"it has no run\.rrd"):
-        replay([empty])
+        replay([empty], out=None, against=None)
 
 
 def test_a_window_without_a_screen_says_what_to_do_elsewhere(

@@ -13,15 +13,8 @@ from rack.backplane.segment import Segment
 from rack.boards.config.layout import field_specs
 from rack.boards.faults.kind import KINDS
 from rack.levels.messages import ArmState, Error, ServoStatus, TaskStatus
-from rack.tools.faults.ending import (
-    AT_REST,
-    EXTERNAL,
-    arm_of,
-    is_late,
-    kill_from_outside,
-    levels_of,
-    strikes,
-)
+from rack.tools.faults.campaigns.trial import is_late, kill_from_outside, levels_of
+from rack.tools.faults.ending import AT_REST, EXTERNAL, arm_of, strikes
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 

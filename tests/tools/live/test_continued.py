@@ -12,6 +12,7 @@ from shutil import copytree
 import pytest
 
 from rack.tools.console.answer import Failure
+from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.recorder_process import ORIGIN
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.analysis.report import write_report
@@ -192,8 +193,13 @@ def test_what_is_no_run_is_refused(arguments: tuple[object, ...], why: str, tmp_
 def test_a_run_of_an_older_version_is_refused_unless_it_is_wanted_anyway(
     run: Path, tmp_path: Path
 ) -> None:
-    (run / "code.json").unlink()
     again = ("run", "--from", f"{run}@1.2", "--seconds", SECONDS, "--no-record", "--json")
+    code = run / "code.json"
+    code.write_text(code.read_text().replace('"rack": "', '"rack": "0'))
+    Checksums(run).store(code.name)
+    refused = rack(*again)
+    assert "since it was recorded, these have changed: the code of rack; --any" in refused.stderr
+    code.unlink()
     refused = rack(*again)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert "it has no code.json: 'rack record' or an older version recorded it" in refused.stderr

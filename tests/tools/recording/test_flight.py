@@ -15,6 +15,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load
+from rack.tools.commands.record import save_run
 from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
 from rack.tools.live.display import Display
@@ -26,7 +27,7 @@ from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import find_missing, save, tally
+from rack.tools.recording.run_files import find_missing, tally
 from rack.tools.recording.spool import STRETCHES
 from rack.tools.timing.analysis.report import write_report
 from rack.tools.viewer.parts import FILE
@@ -119,7 +120,7 @@ def test_what_is_removed_is_neither_lost_nor_a_gap_and_all_say_so(
     with pytest.raises(Failure, match=r"the rest was not kept.*cannot be compared"):
         first_difference(recording, recording)
     assert not (folder / FILE).exists()
-    replay([folder], made)
+    replay([folder], made, against=None)
     shown = read(made, "/signals/lower.status/count")
     assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
     # No age is shown where nothing was kept.
@@ -206,7 +207,7 @@ def test_what_is_kept_is_saved_while_the_run_goes_on(config: RackConfig, tmp_pat
     with Rack(config) as rack:
         recorder = fly(rack, run, seconds=6.0)
         left = sorted(path.name for path in (run / STRETCHES).iterdir())
-        save(run, saved)
+        save_run(run, saved)
         recorder.close()
         assert left[:3] == sorted(path.name for path in (run / STRETCHES).iterdir())[:3]
     part, whole = Recording(saved), Recording(run)

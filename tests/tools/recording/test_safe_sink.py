@@ -11,7 +11,7 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.recording.recorder.recorder import SafeSink, is_opening
+from rack.tools.recording.recorder.recorder import SafeSink
 
 WATCHDOG_S = 30.0
 
@@ -118,7 +118,7 @@ def test_a_recorder_does_not_wait_for_ever_for_a_sink_whose_opening_hangs(
     if hurries:
         safe.hurry()
     safe.close(1, {})
-    assert is_opening()
+    assert safe._opening.is_alive()
     opening.may.set()
     assert opening.sink.calls == []
     (note,) = notes
@@ -135,6 +135,7 @@ def test_neither_mode_waits_for_the_library_of_the_viewer(
     for mode in ("lockstep", "realtime"):
         config = load(small, [f"name={rack_name}", f"clock.mode={mode}"])
         with Rack(config) as running:
-            assert SafeSink.of(running.segment, None, opening, pytest.fail) is not None
-            assert is_opening()
+            safe = SafeSink.of(running.segment, None, opening, pytest.fail)
+            assert safe is not None
+            assert safe._opening.is_alive()
     opening.may.set()

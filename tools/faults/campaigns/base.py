@@ -51,16 +51,9 @@ class BaseRack:
     def __init__(self, config: RackConfig, name: str) -> None:
         self.name = name
         self._config = config
-        every = max(1, round(EVERY_S * 1e9 / config.clock_ns))
-        self._snapshots = SnapshotPolicy(part=0, every=every)
         self._crate: WarmCrate | None = None
         self._events: Sequence[Event] = ()
         self._why_none = config.outside
-
-    def snapshots_for(self, plan: Plan) -> SnapshotPolicy | None:
-        """Return the snapshots that a trial takes: the faultless run is the base of the others."""
-        is_base = plan.purpose == "nominal" and plan.lockstep and not self._why_none
-        return self._snapshots if is_base else None
 
     def start_of(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
         """Return where the trial of a plan starts; run the base, for `seconds` where no task ends
@@ -72,19 +65,19 @@ class BaseRack:
         if not plan.first:
             return Start(whole="a fault prevents the launch")
         if not self._why_none and self._crate is not crate:
-            nominal = Plan(0, "nominal", lockstep=True)
-            config = nominal.config(self._config, self.name)
-            with Rack(config, crate=crate, snapshots=self._snapshots) as rack:
-                rack.run(seconds)
-            self.keep(crate, rack.events)
+            self._run(crate, seconds)
         if self._why_none:
             return Start(whole=f"{UNKEPT}{self._why_none}")
         known = Continuation(plan.first, len(self._config.fault), len(self._config.command))
         return Start(continues=known, events=tuple(self._events))
 
-    def keep(self, crate: WarmCrate, events: Sequence[Event]) -> None:
-        """Take over the events of the base, which has run in a crate."""
+    def _run(self, crate: WarmCrate, seconds: float | None) -> None:
+        """Run the base in a crate, which keeps its snapshots."""
+        config = Plan(0, "nominal", lockstep=True).config(self._config, self.name)
+        every = max(1, round(EVERY_S * 1e9 / config.clock_ns))
+        with Rack(config, crate=crate, snapshots=SnapshotPolicy(part=0, every=every)) as rack:
+            rack.run(seconds)
         self._crate = crate
-        self._events = events
-        found = (e.text.removeprefix(UNKEPT) for e in events if e.text.startswith(UNKEPT))
+        self._events = rack.events
+        found = (e.text.removeprefix(UNKEPT) for e in rack.events if e.text.startswith(UNKEPT))
         self._why_none = next(found, "")

@@ -54,13 +54,15 @@ class RackUnderTest:
     second: float
     restart_s: float
 
+    @property
     def first(self) -> int:
-        """Return the first tick at which a fault may begin."""
+        """The first tick at which a fault may begin."""
         return round(LEAD_S * self.second)
 
-    def last(self) -> int:
-        """Return the tick up to which faults may begin, and their consequences last."""
-        return max(self.first() + 1, self.ticks - round(TAIL_S * self.second))
+    @property
+    def room(self) -> int:
+        """The ticks from there in which faults may begin, and their consequences last."""
+        return max(1, self.ticks - round(TAIL_S * self.second) - self.first)
 
     def window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
         """Return the ticks from the beginning of a fault to the next: it is found, over, and
@@ -86,13 +88,15 @@ class Card:
     """One fault that waits for its place in a trial.
 
     `ticks`: its length, 0 for a kind that strikes once. `may_repeat`: its mailbox may be struck
-    again in the same trial, since after its window readers tell of the next fault, too.
+    again in the same trial, since after its window readers tell of the next fault, too. `room`: the
+    ticks of a faultless run that it takes, without those by which it makes the task end later.
     """
 
     target: Target
     ticks: int
     parameters: Mapping[str, float]
     window: int
+    room: int
     may_repeat: bool
     seed: int
     phase: float
@@ -118,19 +122,18 @@ class Card:
             told = ticks + round(held) + EPISODE * max(target.reader, target.cycle)
         if window < told <= window + MORE_S * rack.second:
             window = told
+        is_stop = parameters.get("size", 0.0) >= (record.visible_from or 0.0)
+        holds_up = round(HOLDS_UP_S * rack.second) if record.where == "arm" and is_stop else 0
         return cls(
-            target, ticks, parameters, window, window >= told, rng.randrange(SEEDS), _phase(rng)
+            target=target,
+            ticks=ticks,
+            parameters=parameters,
+            window=window,
+            room=window - holds_up,
+            may_repeat=window >= told,
+            seed=rng.randrange(SEEDS),
+            phase=_phase(rng),
         )
-
-    def prolongs(self, rack: RackUnderTest) -> int:
-        """Return the ticks by which the task ends later."""
-        record = self.target.record
-        is_stop = self.parameters.get("size", 0.0) >= (record.visible_from or 0.0)
-        return round(HOLDS_UP_S * rack.second) if record.where == "arm" and is_stop else 0
-
-    def room(self, rack: RackUnderTest) -> int:
-        """Return the ticks of a faultless run that it takes."""
-        return self.window - self.prolongs(rack)
 
     def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> Document:
         """Return the fault as a `[[fault]]` table that begins at `tick`."""
@@ -171,7 +174,7 @@ def kill_plans(
     rng = Random(f"{seed} kills")
     targets = rack.targets.by_kind[EXTERNAL]
     gap = KILL_GAP_S * rack.second
-    a_run = max(1, int((rack.last() - rack.first()) / gap))
+    a_run = max(1, int(rack.room / gap))
     plans = list[Plan]()
     for done in range(0, count, a_run):
         boards = [rng.choice(targets).board for _ in range(min(a_run, count - done))]
@@ -205,10 +208,9 @@ def swept_sizes(kind: str, count: int) -> list[float]:
 class Share:
     """The faults that one trial is given. `room`: ticks that are left for more."""
 
-    def __init__(self, rack: RackUnderTest) -> None:
+    def __init__(self, room: int) -> None:
         self.cards: list[Card] = []
-        self.room = rack.last() - rack.first()
-        self._rack = rack
+        self.room = room
         self._struck: dict[str, bool] = {}  # mailboxes, and whether others may follow
 
     def takes(self, card: Card) -> bool:
@@ -216,13 +218,13 @@ class Share:
         box = card.target.mailbox
         if box in self._struck and not (self._struck[box] and card.may_repeat):
             return False
-        fits = card.room(self._rack) <= self.room and len(self.cards) < MOST_FAULTS
+        fits = card.room <= self.room and len(self.cards) < MOST_FAULTS
         return fits or not self.cards
 
     def add(self, card: Card) -> None:
         """Take a fault in."""
         self.cards.append(card)
-        self.room -= card.room(self._rack)
+        self.room -= card.room
         if card.target.mailbox is not None:
             self._struck[card.target.mailbox] = card.may_repeat
 
@@ -240,12 +242,12 @@ def _packed(
     trials = [
         share.cards
         for at in range(0, len(shared), BATCH)
-        for share in _shared_out(rack, shared[at : at + BATCH])
+        for share in _shared_out(rack.room, shared[at : at + BATCH])
     ]
     trials += [[card] for card in cards if not card.target.record.recoverable]
     plans = list[Plan]()
     for chosen in trials:
-        chosen = _ordered(rack, chosen, rng)
+        chosen = _ordered(rack.room, chosen, rng)
         starts = _starts(rack, [card.window for card in chosen], rng)
         faults = list[Document]()
         kills = list[Kill]()
@@ -258,27 +260,27 @@ def _packed(
     return plans
 
 
-def _shared_out(rack: RackUnderTest, cards: Sequence[Card]) -> list[Share]:
+def _shared_out(room: int, cards: Sequence[Card]) -> list[Share]:
     """Share faults out between trials: the longest first, each where least room is left."""
     shares: list[Share] = []
     for card in sorted(cards, key=lambda card: -card.window):
         fitting = [share for share in shares if share.takes(card)]
         if not fitting:
-            fitting = [Share(rack)]
+            fitting = [Share(room)]
             shares += fitting
         min(fitting, key=lambda share: share.room).add(card)
     return shares
 
 
-def _ordered(rack: RackUnderTest, cards: Sequence[Card], rng: Random) -> list[Card]:
+def _ordered(room: int, cards: Sequence[Card], rng: Random) -> list[Card]:
     """Return faults in the best of some random orders: if possible each begins before the end of a
     task that those before it have prolonged, and those of the arm late: at first it is at rest."""
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 
     def quality(order: list[Card]) -> tuple[bool, int]:
-        needed = max(accumulate(card.room(rack) for card in order))
+        needed = max(accumulate(card.room for card in order))
         before = takewhile(lambda card: card.target.record.where != "arm", order)
-        return needed <= rack.last() - rack.first(), sum(card.window for card in before)
+        return needed <= room, sum(card.window for card in before)
 
     return max(orders, key=quality)
 
@@ -286,8 +288,8 @@ def _ordered(rack: RackUnderTest, cards: Sequence[Card], rng: Random) -> list[Ca
 def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
     """Return a tick for each window, one after the other from a random tick on: a trial goes on
     from the snapshot before its first fault."""
-    free = max(round(LEAD_S * rack.second), rack.last() - rack.first() - sum(windows))
-    earliest = accumulate(windows, initial=rack.first() + rng.randint(0, free))
+    free = max(rack.first, rack.room - sum(windows))
+    earliest = accumulate(windows, initial=rack.first + rng.randint(0, free))
     return list(earliest)[:-1]
 
 

@@ -1,29 +1,21 @@
 """The surroundings of trials: a load on the machine, leftovers of racks, and a check of the
-violation counter.
-
-As a program, `python -m rack.tools.faults.campaigns.environment PARENT WHAT`: one process of the
-load, or stress-ng; it ends with its parent.
-"""
+violation counter."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from rack.backplane.process import COPY, die_with_parent, is_alive, name_process, readable
+from rack.backplane.process import COPY, die_with_parent, is_alive
 from rack.backplane.segment import SHM_FOLDER
+from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Failure
-from rack.tools.console.interrupt import descendants
-
-if TYPE_CHECKING:
-    from rack.boards.config.schema import RackConfig
+from rack.tools.console.interrupt import await_ends, descendants
 
 BOUND_S = 2.0
 """Time that killed processes get to end."""
@@ -31,7 +23,8 @@ COMM_LENGTH = 15
 """Characters that the kernel keeps of a process's name."""
 FACTOR = 2.0
 """Velocity that the violation counter must count, as a multiple of the limit."""
-DISKS = "disks"
+BUSY = ("sh", "-c", "while :; do :; done")
+WRITING = ("sh", "-c", "while :; do sync; done")
 
 
 def children() -> set[int]:
@@ -47,7 +40,7 @@ def left_behind(rack: str, before: set[int]) -> list[str]:
 
     `before`: descendants of this process that were there before the rack.
     """
-    _await_end({*_named(rack), *(children() - before)})
+    await_ends({*_named(rack), *(children() - before)}, BOUND_S)
     processes = _named(rack) | (children() - before)
     files = [str(path) for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
     return files + [f"process {pid} ({_name(pid)})" for pid in sorted(processes)]
@@ -66,26 +59,13 @@ def _name(pid: int) -> str:
     return ""
 
 
-def _await_end(pids: set[int]) -> None:
-    deadline = time.monotonic() + BOUND_S
-    for pid in pids:
-        try:
-            descriptor = os.pidfd_open(pid)
-        except ProcessLookupError:
-            continue
-        try:
-            readable(descriptor, deadline - time.monotonic())
-        finally:
-            os.close(descriptor)
-
-
 def examine(config: RackConfig) -> None:
     """Check the violation counter: move every joint at twice its limit for one tick.
 
     A campaign that says "no limit violated" must be able to see a violation. Raises `Failure` where
     it is not counted.
     """
-    # Only here: a process of the load needs none of them.
+    # Only here: the workers, which make the trials, need none of them.
     from numpy import isfinite
 
     from rack.levels.arm import SimulatedArm
@@ -121,49 +101,28 @@ def load() -> Iterator[str]:
 
     Uses `stress-ng` where it is installed.
     """
-    cores = sorted(os.sched_getaffinity(0))
-    parts = [*([str(core)] for core in cores), [DISKS]]
+    cores = os.sched_getaffinity(0)
     words = f"{len(cores)} busy processes and one that writes"
+    commands: list[tuple[Sequence[str], set[int]]]
+    commands = [*((BUSY, {core}) for core in cores), (WRITING, cores)]
     if shutil.which("stress-ng") is not None:
         words = f"stress-ng --cpu {len(cores)} --io 1"
-        parts = [words.split()]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "rack.tools.faults.campaigns.environment",
-        str(os.getpid()),
-    ]
-    busy = [
-        subprocess.Popen(
-            [*command, *part], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        for part in parts
-    ]
-    try:
-        yield words
-    finally:
-        for process in busy:
+        commands = [(words.split(), cores)]
+    with ExitStack() as stack:
+        for command, its_cores in commands:
+            process = subprocess.Popen(
+                command,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                preexec_fn=partial(_begin, os.getpid(), its_cores),
+            )
+            stack.callback(process.wait)
             # Terminated, not killed: stress-ng then ends its own processes.
-            process.terminate()
-            process.wait()
+            stack.callback(process.terminate)
+        yield words
 
 
-def main() -> None:
-    """Run a part of the load until the parent ends."""
-    parent = int(sys.argv[1])
-    what = sys.argv[2]
+def _begin(parent: int, cores: set[int]) -> None:
+    """Begin as a process of the load, on these cores, which ends with its parent."""
     die_with_parent(parent)
-    if what == "stress-ng":
-        os.execvp(what, sys.argv[2:])
-    name_process("campaign load")
-    if what != DISKS:
-        os.sched_setaffinity(0, {int(what)})
-    while True:
-        if what == DISKS:
-            os.sync()
-
-
-if __name__ == "__main__":
-    main()
+    os.sched_setaffinity(0, cores)

@@ -11,27 +11,24 @@ from dataclasses import dataclass, field, replace
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
-from rack.backplane.process import is_alive, start_time
+from rack.backplane.layout import Layout
+from rack.backplane.message import State, reason_of, state_name
+from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import BoardError, ConfigError
-from rack.boards.events import Event, Outcome
+from rack.boards.events import Event, Outcome, statuses
+from rack.boards.faults.bounds import struck_mailboxes
+from rack.levels.messages import Error
 from rack.tools.faults.campaigns.base import BaseRack, Start
+from rack.tools.faults.campaigns.certainty import Certainty
 from rack.tools.faults.campaigns.environment import children, left_behind
 from rack.tools.faults.campaigns.plan import Kill, Plan
-from rack.tools.faults.ending import (
-    ArmEnd,
-    Strike,
-    arm_of,
-    is_late,
-    kill_from_outside,
-    levels_of,
-    strikes,
-)
-from rack.tools.faults.judge import Circumstances, certain_from
+from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, arm_of, strikes
+from rack.tools.faults.judge import Circumstances
 
 MAX_LENGTH = 4
 GRACE_S = 60.0
@@ -98,22 +95,14 @@ class Killer:
 
     def _kill(self, board: str) -> bool:
         pid = self._pid(board)
-        started = start_time(pid)
-        if not started:
+        if not is_alive(pid):
             return False
+        tick = self._words[System.TICK]
+        kill = kill_from_outside(self._segment.layout, board, tick, time.monotonic_ns())
         with suppress(ProcessLookupError):
-            descriptor = os.pidfd_open(pid)
-            try:
-                # The number may have become another process's between the two looks.
-                if self._pid(board) == pid and is_alive(pid, started):
-                    layout = self._segment.layout
-                    tick = self._words[System.TICK]
-                    kill = kill_from_outside(layout, board, tick, time.monotonic_ns())
-                    signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-                    self.done.append(kill)
-                    return True
-            finally:
-                os.close(descriptor)
+            os.kill(pid, signal.SIGKILL)
+            self.done.append(kill)
+            return True
         return False
 
     def _pid(self, board: str) -> int:
@@ -123,6 +112,20 @@ class Killer:
         block = self._segment.block(board)
         is_up = block[Block.STATE] == TaskState.RUNNING and not block[Block.LOST]
         return block[Block.PID] if is_up else 0
+
+
+def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
+    """Return the kill of a board at `tick` and at CLOCK_MONOTONIC `time_ns`."""
+    return Strike(
+        fault=-1,
+        kind=EXTERNAL,
+        board=board,
+        began=tick,
+        ends=tick,
+        tick=tick,
+        time_ns=time_ns,
+        mailboxes=tuple(box.name for box in struck_mailboxes(layout, -1, board)),
+    )
 
 
 @dataclass(frozen=True)
@@ -172,13 +175,7 @@ def run_trial(
     start = Start(whole="as asked") if base is None else base.start_of(plan, crate, seconds)
     before = children()
     started = time.monotonic()
-    snapshots = None if base is None else base.snapshots_for(plan)
-    rack = Rack(
-        plan.config(config, rack_name),
-        crate=crate,
-        snapshots=snapshots,
-        continues=start.continues,
-    )
+    rack = Rack(plan.config(config, rack_name), crate=crate, continues=start.continues)
     refused = ""
     is_cut = False
     levels = ""
@@ -229,6 +226,22 @@ def run_trial(
     )
 
 
+def levels_of(segment: Segment) -> str:
+    """Return the last state of each level, with its reason, as one readable text."""
+    states = []
+    for writer, status in statuses(segment, "state"):
+        reason = f" ({why})" if (why := reason_of(status)) else ""
+        states.append(f"{writer} {state_name(status.state)}{reason}")
+    return ", ".join(states)
+
+
+def is_late(segment: Segment) -> bool:
+    """Return whether a level gave up because it cannot meet a time."""
+    return any(
+        s.state == State.ERROR and s.error == Error.TOO_LATE for _, s in statuses(segment, "error")
+    )
+
+
 def _circumstances(rack: Rack, plan: Plan) -> Circumstances:
     """Return what the judge must know of a run."""
     config = rack.config
@@ -240,42 +253,6 @@ def _circumstances(rack: Rack, plan: Plan) -> Circumstances:
         has_failed=rack.outcome is not None and not rack.outcome.worked,
         moving=tuple(motion.body for motion in config.scene.motion),
     )
-
-
-class Certainty:
-    """Ends a trial in lockstep as soon as nothing that follows can change the verdict on a fault.
-
-    It holds the rack before the ticks at which that may be so. `is_reached`: it has ended the
-    trial.
-    """
-
-    def __init__(self, rack: Rack, joints: Sequence[str], run: Circumstances) -> None:
-        self.is_reached = False
-        self._rack = rack
-        self._joints = joints
-        self._run = run
-        self._words = rack.segment.words
-        self._hold(max(0, rack.begins_at))
-
-    def look(self) -> None:
-        """Judge, if the rack is held; then let it go on, or end."""
-        tick = self._words[System.HELD] - 1
-        if tick < 0 or self.is_reached:
-            return
-        struck = strikes(self._rack.segment, self._joints)
-        certain_at = certain_from(struck, self._rack.events, self._run, tick)
-        if certain_at is None:
-            # It runs to its end.
-            self._words[System.HOLD_AT] = 0
-        elif certain_at > tick:
-            self._hold(certain_at)
-        else:
-            self.is_reached = True
-            self._words[System.STOP_TICK] = max(tick, 1)
-            self._words[System.HOLD_AT] = 0
-
-    def _hold(self, tick: int) -> None:
-        self._words[System.HOLD_AT] = tick + 1
 
 
 def _watch(
@@ -293,13 +270,13 @@ def _watch(
         killer.advance()
         if certainty is not None:
             certainty.look()
-        if words[System.TICK] != seen and not stopped:
-            seen = words[System.TICK]
-            deadline = time.monotonic() + STILL_S
-        is_overdue = time.monotonic() > deadline
-        if stopped and is_overdue:
+        now = time.monotonic()
+        if stopped and now > deadline:
             return
-        if not stopped and (is_overdue or seen > most_ticks):
+        if not stopped and words[System.TICK] != seen:
+            seen = words[System.TICK]
+            deadline = now + STILL_S
+        if not stopped and (now > deadline or seen > most_ticks):
             rack.stop("the trial takes too long")
             stopped = True
-            deadline = time.monotonic() + STUCK_S
+            deadline = now + STUCK_S

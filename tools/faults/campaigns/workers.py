@@ -122,8 +122,6 @@ class TrialMaker:
         trial = run_trial(
             self._config, job.plan, name, job.ticks, job.seconds, base=base, crate=crate
         )
-        if crate is not None and self._base.snapshots_for(job.plan) and not self._whole:
-            self._base.keep(crate, trial.events)
         keep(trial, job.path)
 
     def _ready(self, lockstep: bool) -> WarmCrate | None:

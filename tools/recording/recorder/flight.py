@@ -11,7 +11,7 @@ import numpy as np
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.tools.recording.occasions import Occasions, Retention, TickRange
+from rack.tools.recording.occasions import Occasions, Retention
 from rack.tools.recording.run_files import Tally
 from rack.tools.recording.spool import Spool, StretchHead
 
@@ -20,10 +20,10 @@ STRETCH_S = 1.0
 
 
 class Sealed(NamedTuple):
-    """A stretch that is finished: its file, and between which ticks its rows are, at the most."""
+    """A stretch that is finished, and near no occasion so far: its file, and its last tick."""
 
     path: Path
-    ticks: TickRange
+    last: int
 
 
 class FlightRecorder:
@@ -41,7 +41,7 @@ class FlightRecorder:
         self._occasions = Occasions(segment)
         self._length = round(STRETCH_S * 1e9 / segment.layout.clock_ns)
         self._sealed: deque[Sealed] = deque()
-        self._windows: list[TickRange] = []
+        self._kept_until = -1
         self._began = 0
         if tally.number:
             # The rings hold what another recorder can no longer take.
@@ -64,10 +64,12 @@ class FlightRecorder:
         # The rows of what has begun meanwhile may be in either of the two.
         next_tick = self._words[System.TICK] + 1
         path = self._begin(next_tick, tick)
-        self._sealed.append(Sealed(self._path, TickRange(self._began, next_tick)))
+        if self._began > self._kept_until:
+            self._sealed.append(Sealed(self._path, next_tick))
         self._path = path
         self._began = tick
-        self._forget(tick - self._retention.keep)
+        while self._sealed and self._sealed[0].last < tick - self._retention.keep:
+            self._sealed.popleft().path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Finish the last stretch. An empty one follows, which says what was taken in all."""
@@ -83,18 +85,8 @@ class FlightRecorder:
         return self._spool.divert(stretch, end)
 
     def _mark(self, tick: int) -> None:
+        """Keep the stretches around an occasion for good."""
         window = self._retention.around(tick)
-        if self._windows and self._windows[-1].first <= window.first <= self._windows[-1].last:
-            last = self._windows.pop()
-            window = TickRange(last.first, max(last.last, window.last))
-        self._windows.append(window)
-
-    def _forget(self, before: int) -> None:
-        """Remove the stretches that ended before a tick and are in no window."""
-        sealed = self._sealed
-        while sealed and sealed[0].ticks.last < before:
-            path, (first, last) = sealed.popleft()
-            if not any(one.first <= last and first <= one.last for one in self._windows):
-                path.unlink(missing_ok=True)
-        begins = sealed[0].ticks.first if sealed else self._began
-        self._windows = [one for one in self._windows if one.last >= begins]
+        self._kept_until = max(self._kept_until, window.last)
+        while self._sealed and self._sealed[-1].last >= window.first:
+            self._sealed.pop()

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from threading import Thread
-from threading import enumerate as enumerate_threads
 from typing import Protocol, Self
 
 import numpy as np
@@ -42,8 +41,6 @@ machine the viewer's library alone may take a minute."""
 OPENING_LOOKS = 25
 """Looks, 0.2 s apart, at a process that uses no processor time, after which a sink that is being
 opened counts as hung: the viewer's library waits for ever for a file that cannot be written."""
-OPENING = "opening a sink"
-"""Name of a thread that does so."""
 HURRIED_S = 0.5
 """Time that a recorder in a hurry waits for a sink that is being opened: an interrupted run ends
 within 2 s."""
@@ -84,7 +81,6 @@ class SafeSink:
         self._opening = Thread(
             target=self._guarded,
             args=(lambda: setattr(self, "_sink", opened()),),
-            name=OPENING,
             daemon=True,
         )
         self._opening.start()
@@ -158,12 +154,6 @@ class SafeSink:
             self._tell(f"run.rrd ends here: {' '.join(str(error).split()) or type(error).__name__}")
 
 
-def is_opening() -> bool:
-    """Return whether a sink of this process is still being opened: the viewer's library would wait
-    for that at the end of the interpreter."""
-    return any(thread.name == OPENING for thread in enumerate_threads())
-
-
 RISKED_PART = 4
 """Lockstep may be ahead of the spool's file by one part in so many of the rings."""
 
@@ -204,7 +194,6 @@ class Recorder:
             self._rings[name].resume(taken)
         # Lockstep has no deadlines that the machine could break.
         self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
-        self._is_stopped = False
         follower = self._words[System.FOLLOWER_PID]
         # The clock cannot see a process of another PID namespace, so it does not wait for it.
         is_visible = bool(segment.launcher)
@@ -260,23 +249,14 @@ class Recorder:
             self._words[System.FOLLOWER_TICK] = self._safe_tick
             self._words[System.FOLLOWER_PID] = os.getpid()
 
-    def follow(self, until: int | None = None) -> None:
-        """Record until the run is over; with a descriptor `until`, until that is readable or
-        closed."""
+    def follow(self, until: int) -> None:
+        """Record until a descriptor is readable or closed."""
         period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
         watched = select.poll()
-        if until is not None:
-            watched.register(until, select.POLLIN)
+        watched.register(until, select.POLLIN)
         while not watched.poll(period_s * 1e3):
             self.drain()
-            over = self._segment.run_is_over
-            if self._is_stopped or (until is None and over):
-                break
         self.drain()
-
-    def stop(self) -> None:
-        """Make `follow` return soon."""
-        self._is_stopped = True
 
     def close(self) -> None:
         """Finish the files; the rack continues without a follower."""
