@@ -61,21 +61,13 @@ unit: `rack schema` shows it. Executor and planner of a board share one table. A
 takes `Operation.SET`: on that command call `set_live`. A level that reads a program from `[task]`
 declares `program = MyProgram`, a `Program`, likewise.
 
-A servo level of your own
-- reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0`
-  until the first set point (while `due` of the command is 0), and again when set points stop: the
-  primitive level waits for this, and motion begins at that `target`. Four primitive cycles after
-  set points began, `holding` must be 0; else it starts over.
-- reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the
-  primitive level waits.
-- writes a status in every primitive cycle, with `position` near `target`: the primitive level holds
-  motion when statuses are missing, or when a joint is farther off than its `following`.
-- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm
-  only through it.
-- need not report what befalls the arm: refused torques, broken limits, contacts and brakes are
-  findings of the arm itself, and counted in its state.
-- advances the arm's time, saves its state, and publishes its scene, without which the world model
-  is stale and motion holds: see `rack.levels.arm.arm`.
+A servo law of your own derives from `rack.levels.servo.ServoLaw` and writes `torques`. A level that
+drives an arm otherwise derives from `ArmDriver`, and what it reports moves the level above:
+- `holding`, `target` (where the arm is held) and `target_velocity` 0 until the first set point, and
+  again when set points stop: the primitive level begins its motion at that `target`.
+- `stopped`, and HOLDING with a `reason`, while it does not follow set points: the primitive level
+  waits. It also holds motion when statuses are missing, or when a joint is farther from its
+  `target` than its `following`.
 
 A level without Python of its own for its decisions is a state table in a file: see
 `rack.levels.systems.state_table.level`.
@@ -116,7 +108,7 @@ from rack.levels.ports import (
     TimedOutput,
     collect_ports,
 )
-from rack.levels.tables import GoalConfig, RobotConfig, SceneConfig, Table, frozen
+from rack.levels.tables import GoalConfig, RobotConfig, SceneConfig, Table, frozen, read_params
 
 __all__ = [
     "Demand",
@@ -245,6 +237,10 @@ class LevelSection:
     """Modules of which every process of the level needs the functions marked `compiled_for`: see
     `rack.levels.compiled`."""
 
+    settings: Any
+    """The parameters: a record of the class `params`, as which a subclass may annotate it,
+    `settings: MyParams`. Replaced by a new one when a live parameter is set."""
+
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
@@ -254,6 +250,8 @@ class LevelSection:
         self.context = context
         self.ports: dict[str, Any] = {}
         """What the board puts into the ports that a config makes, by name."""
+        if self.params is not None:
+            self.settings = read_params(self.params, context.params)
 
     def input_table(self, port: str) -> dict[str, Any]:
         """Return the dict into which the board puts what it has read from a port, by name.

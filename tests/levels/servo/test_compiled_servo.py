@@ -75,10 +75,10 @@ def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
     )
 
 
-def wanted_of(seed: int, limit: float) -> tuple[Any, ...]:
+def wanted_of(seed: int) -> tuple[Any, ...]:
     """Return the arguments of `set_torque`; one seed has a bias that is NaN."""
     inertia, bias = noise(seed, JOINTS, JOINTS), noise(seed + 1) * (np.nan if seed == 9 else 1.0)
-    constants = np.outer((3600.0, 120.0, abs(noise(seed + 2)[0]), limit, 0.0), np.ones(JOINTS))
+    constants = np.outer((3600.0, 120.0, abs(noise(seed + 2)[0]), 0.0), np.ones(JOINTS))
     return constants, noise(seed + 3, 3, JOINTS), noise(seed + 4, 2, JOINTS), inertia, bias
 
 
@@ -113,10 +113,15 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         for k in range(20)
         for following, size in ((0.02, 1), (9, 1), (9, 1e6))
     ],
-    "set_torque": [wanted_of(k, limit) for k in range(10) for limit in (1.0, 1e5)],
+    "set_torque": [wanted_of(k) for k in range(10)],
+    "limit_torques": [
+        (noise(k) * scale, np.full(JOINTS, 1.0), np.zeros(JOINTS))
+        for k in range(5)
+        for scale in (1e-3, 3.0, np.nan)
+    ],
     "servo_joints": [joints_of(k) for k in range(4)],
 }
-VERDICTS = {"check": 3, "left_over": 3, "set_torque": 2}
+VERDICTS = {"check": 3, "left_over": 3, "limit_torques": 2}
 """Kinds of verdicts that the cases reach; else: None."""
 
 
