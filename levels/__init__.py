@@ -10,6 +10,7 @@ level must do.
 - Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OperatorCommand`, `AnsweringStatus`,
   `RelayedCommand`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
+- Report events of its own: `FindingKind`, and `raise_finding` of an executor.
 - Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
 
 Import the rest by module, since MuJoCo takes half a second: `rack.levels.algebra` (arithmetic with
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
         Executor,
         Fault,
         Finding,
+        FindingKind,
         Input,
         Inputs,
         LevelContext,
@@ -77,6 +79,7 @@ __all__ = [
     "Executor",
     "Fault",
     "Finding",
+    "FindingKind",
     "Finite",
     "Goal",
     "Input",
@@ -118,6 +121,7 @@ _PLACES = {
         "Executor",
         "Fault",
         "Finding",
+        "FindingKind",
         "Input",
         "Inputs",
         "LevelContext",

@@ -54,6 +54,10 @@ lists them in `commands`, and follows with `rack.levels.operator.Orders`. Its st
 orders.rests_on(...)`). A level that takes none copies `operator` from the command above to its own
 command and status: without it the system's response to an operator cannot be measured.
 
+Events: what a level finds by itself is declared, `contact = FindingKind(unit="N m", doc="the arm
+touches something")`, and reported by `self.raise_finding("contact", 3.2, text="left finger")`, in
+every cycle in which it holds if you like: the run records one event for each episode.
+
 Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check`
 then reports every mistake before the launch. The text below a field says what it means, with its
 unit: `rack schema` shows it. Executor and planner of a board share one table. A field with
@@ -82,6 +86,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -98,6 +103,7 @@ from rack.levels.faults import Fault
 from rack.levels.messages import ArmState
 from rack.levels.operator import Commands, Operation
 from rack.levels.ports import (
+    FindingKind,
     Input,
     InputPort,
     Inputs,
@@ -115,6 +121,7 @@ __all__ = [
     "Executor",
     "Fault",
     "Finding",
+    "FindingKind",
     "Input",
     "Inputs",
     "LevelContext",
@@ -188,6 +195,7 @@ class Finding(NamedTuple):
     subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular
     value: float = 0.0  # measured, in the unit of the alarm
     since: int | None = None  # tick at which it happened, if that is not the cycle that found it
+    text: str = ""  # of one that the level has declared
 
 
 @dataclass(frozen=True)
@@ -314,6 +322,8 @@ class Executor(LevelSection, ABC):
     commands: ClassVar[Commands] = {}
     """An operator's commands to the level, with the forms of their goals; for a level that reads
     "own.operator"."""
+    finding_kinds: ClassVar[Mapping[str, FindingKind]] = {}
+    """What it may find, by name: collected from the class and its bases."""
     made_last: ClassVar[Executor | None] = None
     """In this process. A board makes one executor, which then makes what it drives."""
 
@@ -332,6 +342,42 @@ class Executor(LevelSection, ABC):
         # Whatever it drives adds its own findings, and completes each cycle, given its `ARM_STATE`.
         self.complete_cycle: list[Callable[[ArmState | None], None]] = []
         Executor.made_last = self
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.finding_kinds = collect_ports(cls, "finding_kinds", (FindingKind,))
+        for name, kind in cls.finding_kinds.items():
+            if kind.mistake:
+                raise LevelError(f"class {cls.__name__}: finding '{name}' {kind.mistake}")
+
+    def raise_finding(
+        self, name: str, value: float = 0.0, *, unit: str = "", text: str = ""
+    ) -> None:
+        """Report something that the level has found, as an event of the run.
+
+        A finding that is raised again within 20 cycles continues its episode, and is no other
+        event.
+
+        Args:
+            name: One of the class's `FindingKind`s.
+            value: What was measured, in the unit declared.
+            unit: That unit, if it shall be checked.
+            text: What is special about this one, in a few words; beyond 144 bytes it is cut.
+
+        Raises:
+            LevelError: The class declares no such finding, or another unit for it.
+        """
+        kind = self.finding_kinds.get(name)
+        what = f"class {type(self).__name__}: finding '{name}' is"
+        if kind is None:
+            near = get_close_matches(name, self.finding_kinds, 1)
+            known = ", ".join(self.finding_kinds) or "none"
+            hint = f"did you mean '{near[0]}'?" if near else f"declared: {known}"
+            raise LevelError(f"{what} not declared; {hint}")
+        if unit and unit != kind.unit:
+            raise LevelError(f"{what} in {kind.unit}, not in {unit}")
+        number = list(self.finding_kinds).index(name)
+        self.findings.append(Finding(Alarm.OWN, number, float(value), text=text))
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:

@@ -13,6 +13,7 @@ import numpy as np
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named, as_whole, pick
 from rack.backplane.fault_table import FaultEntry, FaultTable
+from rack.backplane.message import printable
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
@@ -223,6 +224,14 @@ class AlarmEvents:
             subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
             kind = "reaction" if demand else "recovery"
             text = _demand(demand, subject)
+        elif alarm == Alarm.OWN:
+            declared = self._levels[owner].findings if owner in self._levels else ()
+            found = pick(declared, number, "finding")
+            code = found.name
+            subject = owner
+            measured = f"{value:.6g} {found.unit}".removesuffix(" 1")
+            said = bytes(row["text"]).decode("utf-8", "replace") or found.meaning
+            text = printable(f"{code}: {measured}, {said}")
         else:
             subject, text = self._described(alarm, row, owner)
             text += f" for {self._span(value)}" if alarm == Alarm.BRAKES_CLOSED and value else ""

@@ -15,6 +15,7 @@ from time import monotonic_ns
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag
+from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE, ExchangeRecord
 from rack.boards.run.task import ClockGuard, Task, in_turn, slowed
@@ -56,6 +57,7 @@ class VirtualControlLoop(Task):
         )
         self._guard = ClockGuard(segment, self.alarms, self.block) if wiring.guards_clock else None
         self._has_cycled = False
+        self._raised: dict[int, int] = {}  # ticks of the level's own findings, by number
         self._due = segment.layout.due(self.spec)
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
@@ -111,11 +113,19 @@ class VirtualControlLoop(Task):
     def _report(self, tick: int) -> None:
         executor = self.executor
         for finding in executor.findings:
-            self.alarms.ring(tick, *finding)
+            # A level may raise its own findings in every cycle: an alarm is one per episode.
+            if finding.alarm is not Alarm.OWN or self._begins_episode(finding.subject, tick):
+                self.alarms.ring(tick, *finding)
         executor.findings.clear()
         self.faults.count(executor.acted, tick)
         executor.acted.clear()
         self.faults.burn(tick)
+
+    def _begins_episode(self, number: int, tick: int) -> bool:
+        """Note one of the level's own findings; return whether it begins an episode."""
+        last = self._raised.get(number)
+        self._raised[number] = tick
+        return last is None or tick - last > CLEAN_READS * self.spec.every
 
 
 class PlannerLoop(Task):
