@@ -5,7 +5,7 @@ level must do.
   and `TimedOutput`, with `Reading`, `Verdict`, `Program`, `LevelContext`, `Pace`.
 - Declare messages: `Message`, `Command`, `Status`, `field`, `State`; the default levels' messages
   are in `rack.levels.messages`, and their error codes in `Error`.
-- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`, `LIVE`, `set_live`; arm and
+- Declare parameters: `Table`, `Positive`, `Finite`, `Live`, `read_params`, `set_live`; arm and
   cell: `RobotConfig`, `SceneConfig`.
 - Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OperatorCommand`, `AnsweringStatus`,
   `RelayedCommand`.
@@ -58,8 +58,8 @@ if TYPE_CHECKING:
         RelayedCommand,
     )
     from rack.levels.tables import (
-        LIVE,
         Finite,
+        Live,
         Positive,
         RobotConfig,
         SceneConfig,
@@ -69,7 +69,6 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "LIVE",
     "Alarm",
     "AnsweringStatus",
     "Command",
@@ -86,6 +85,7 @@ __all__ = [
     "Inputs",
     "LevelContext",
     "LevelError",
+    "Live",
     "Message",
     "Operation",
     "OperatorCommand",
@@ -145,8 +145,8 @@ _PLACES = {
         "RelayedCommand",
     ),
     "rack.levels.tables": (
-        "LIVE",
         "Finite",
+        "Live",
         "Positive",
         "RobotConfig",
         "SceneConfig",

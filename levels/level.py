@@ -58,11 +58,13 @@ Events: what a level finds by itself is declared, `contact = FindingKind(unit="N
 touches something")`, and reported by `self.raise_finding("contact", 3.2, text="left finger")`, in
 every cycle in which it holds if you like: the run records one event for each episode.
 
-Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check`
-then reports every mistake before the launch. The text below a field says what it means, with its
-unit: `rack schema` shows it. Executor and planner of a board share one table. A field with
-`json_schema_extra=LIVE`, which the executor alone reads, may be set while the level runs if it
-takes `Operation.SET`: on that command call `set_live`. A level that reads a program from `[task]`
+Parameters: declare `params = MyParams`, a `Table`, and find it in `self.settings`: `rack check`
+reports every mistake before the launch. The text below a field says what it means, with its
+unit: `rack schema` shows it. Executor and planner of a board share one table. A field declared
+`gain: Live[Positive] = 2.0`, which the executor alone reads, may be set while the level runs (`rack
+set`): `self.settings` has the new value in the next cycle, and a status that derives from
+`AnsweringStatus` confirms it. A level that reads its operator's commands itself takes
+`Operation.SET` among them, and calls `set_live`. A level that reads a program from `[task]`
 declares `program = MyProgram`, a `Program`, likewise.
 
 A servo law of your own derives from `rack.levels.servo.ServoLaw` and writes `torques`. A level that
@@ -101,7 +103,13 @@ from rack.levels.compiled import preload
 from rack.levels.errors import LevelError, ProgramError
 from rack.levels.faults import Fault
 from rack.levels.messages import ArmState
-from rack.levels.operator import Commands, Operation
+from rack.levels.operator import (
+    AnsweringStatus,
+    Commands,
+    Operation,
+    OperatorCommand,
+    Orders,
+)
 from rack.levels.ports import (
     FindingKind,
     Input,
@@ -114,7 +122,16 @@ from rack.levels.ports import (
     TimedOutput,
     collect_ports,
 )
-from rack.levels.tables import GoalConfig, RobotConfig, SceneConfig, Table, frozen, read_params
+from rack.levels.tables import (
+    GoalConfig,
+    RobotConfig,
+    SceneConfig,
+    Table,
+    frozen,
+    live_keys,
+    read_params,
+    set_live,
+)
 
 __all__ = [
     "Demand",
@@ -309,6 +326,11 @@ class LevelSection:
         """Release what the level holds; called once, after the last cycle, or plan."""
 
 
+OPERATOR = Input(OperatorCommand, "own.operator")
+"""The port by which the board of a level without one of that name sets its live parameters."""
+OPERATOR.name = "operator"
+
+
 class Executor(LevelSection, ABC):
     """The foreground of a level: runs every cycle, at high priority, in bounded time.
 
@@ -341,6 +363,7 @@ class Executor(LevelSection, ABC):
         self.acted: dict[int, bool] = {}
         # Whatever it drives adds its own findings, and completes each cycle, given its `ARM_STATE`.
         self.complete_cycle: list[Callable[[ArmState | None], None]] = []
+        self._live_orders = Orders(self.commands)
         Executor.made_last = self
 
     def __init_subclass__(cls) -> None:
@@ -349,6 +372,12 @@ class Executor(LevelSection, ABC):
         for name, kind in cls.finding_kinds.items():
             if kind.mistake:
                 raise LevelError(f"class {cls.__name__}: finding '{name}' {kind.mistake}")
+        if "operator" not in cls.inputs and live_keys(cls.params):
+            if hasattr(cls, "operator"):
+                why = "attribute 'operator' has the name of the port that sets live parameters"
+                raise LevelError(f"class {cls.__name__}: {why}; rename the attribute")
+            cls.inputs = {**cls.inputs, OPERATOR.name: OPERATOR}
+            cls.commands = {Operation.SET: ()}
 
     def raise_finding(
         self, name: str, value: float = 0.0, *, unit: str = "", text: str = ""
@@ -378,6 +407,24 @@ class Executor(LevelSection, ABC):
             raise LevelError(f"{what} in {kind.unit}, not in {unit}")
         number = list(self.finding_kinds).index(name)
         self.findings.append(Finding(Alarm.OWN, number, float(value), text=text))
+
+    @property
+    def is_set_by_board(self) -> bool:
+        """Whether it has live parameters, and leaves the operator's commands to its board."""
+        return self.inputs.get(OPERATOR.name) is OPERATOR
+
+    def take_settings(self, tick: int) -> None:
+        """Set live parameters as their operator commands, and answer in a status that can. Called
+        by the board before `process`."""
+        self._live_orders.take(OPERATOR.__get__(self, type(self)), self._set)
+        status = vars(self).get("status")
+        if isinstance(status, AnsweringStatus):
+            self._live_orders.report(status)
+
+    def _set(self, command: OperatorCommand) -> None:
+        self.settings, why = set_live(self.settings, command.name)
+        if why:
+            self._live_orders.refuse(why)
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:

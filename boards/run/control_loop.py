@@ -66,7 +66,8 @@ class VirtualControlLoop(Task):
             message = self.outputs.writers[EXCHANGE].message
             record = ExchangeRecord(self.inputs.taken, message).fill
         reads = in_turn(self.inputs.read_command_and_status, record)
-        self.read_command_and_status = in_turn(self.serve, slowed(reads, times.read_ns))
+        settings = executor.take_settings if executor.is_set_by_board else None
+        self.read_command_and_status = in_turn(self.serve, slowed(reads, times.read_ns), settings)
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
 
     def cycle(self, tick: int) -> None:

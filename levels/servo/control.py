@@ -18,7 +18,7 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
 from rack.levels.servo.curves import Motion, SensedMotion
 from rack.levels.servo.modification import ModifiableParams
-from rack.levels.tables import LIVE, GripperConfig, Positive, Table
+from rack.levels.tables import GripperConfig, Live, Positive, Table
 
 Reacting = Literal["hold", "stop", "brake"]
 
@@ -26,9 +26,9 @@ Reacting = Literal["hold", "stop", "brake"]
 class LoopGains(Table):
     """Gains of the joint loop."""
 
-    bandwidth: Positive = Field(60.0, le=400.0, json_schema_extra=LIVE)
+    bandwidth: Live[Positive] = Field(60.0, le=400.0)
     """natural frequency of the error in every joint, rad/s"""
-    damping: Positive = Field(1.0, le=3.0, json_schema_extra=LIVE)
+    damping: Live[Positive] = Field(1.0, le=3.0)
     """damping ratio of the error"""
 
     def fill(self, table: Array) -> None:
