@@ -155,6 +155,11 @@ COMMANDS = {
     ),
     "Bring up": (
         CommandEntry(
+            "new",
+            "rack.tools.commands.new:new",
+            "Write a level, a servo law or a planner to start from.",
+        ),
+        CommandEntry(
             "robot", "rack.tools.commands.robot:app", "Bring up any arm, from a model file."
         ),
     ),
