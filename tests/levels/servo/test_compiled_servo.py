@@ -72,12 +72,15 @@ def table(seed: int) -> Array:
 
 def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
     """Return the arguments of `left_over`."""
-    before, inertia = noise(seed, 3, JOINTS), noise(seed + 1, 2, JOINTS, JOINTS)
-    table = np.concatenate(
-        (before, rules * np.abs(noise(seed + 2, 5, JOINTS)), np.zeros((5, JOINTS)), inertia[0])
-    )
+    inertia = noise(seed + 1, 2, JOINTS, JOINTS)
+    motors = np.zeros(JOINTS, actuator_monitor.MOTORS)
+    motors["velocity"], motors["bias"], motors["torque"] = noise(seed, 3, JOINTS)
+    constants = ("dry", "friction_s", "exact_noise", "uncertain", "off")
+    for name, row in zip(constants, np.abs(noise(seed + 2, 5, JOINTS)), strict=True):
+        motors[name] = rules * row
     return (
-        table,
+        motors,
+        inertia[0],
         200.0,
         float(following),
         noise(seed + 3, 3, JOINTS),
