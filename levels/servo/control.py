@@ -123,13 +123,14 @@ def set_torque(
             torque[j] += inertia[j, k] * acceleration
 
 
-@compiled_for("f8[::1], f8[::1], f8[::1]")
-def limit_torques(torque: Array, limits: Array, limited: Array) -> bool:
-    """Set `limited`, (joints,), N m, to torques within their limits; return whether one was cut."""
+@compiled_for("f8[::1], f8[::1]")
+def limit_torques(torque: Array, limits: Array) -> bool:
+    """Cut torques, (joints,), N m, at their limits; return whether one was cut. NaN stays."""
     cut = False
     for j in range(len(torque)):
-        limited[j] = np.minimum(np.maximum(torque[j], -limits[j]), limits[j])  # NaN stays
-        cut = cut or abs(torque[j]) > limits[j]
+        if abs(torque[j]) > limits[j]:
+            torque[j] = math.copysign(limits[j], torque[j])
+            cut = True
     return cut
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 from rack.levels.algebra import Array
-from rack.levels.level import LevelContext, Verdict
+from rack.levels.level import LevelContext
+from rack.levels.messages import ServoPlan
 from rack.levels.operator import OperatorCommand
 from rack.levels.servo.control import ComputedTorque, ServoParams, SetPointLaw
 from rack.levels.servo.curves import Motion, SensedMotion
@@ -26,11 +27,10 @@ class ServoExecutor(ServoLaw):
         if self.cell.interface != "torque":
             self.ahead = SetPointLaw(self.cell, self.settings, context.period_s)
 
-    def take_messages(self) -> None:
-        """Take over what is new, and the inertia that the planner has planned."""
-        super().take_messages()
-        if self.plan.verdict is Verdict.NEW:
-            self._loop.inertia = self.plan.message.inertia.copy()
+    def take_plan(self, plan: ServoPlan) -> None:
+        """Take over what the gripper holds, and the inertia with it."""
+        super().take_plan(plan)
+        self._loop.inertia = plan.inertia.copy()
 
     def _obey(self, command: OperatorCommand) -> str:
         """Obey, with the gains as they are set then."""

@@ -80,6 +80,7 @@ class ServoLaw(ArmDriver):
         self.reference.part = self.part
         self._limits = cell.bounds.torque
         self._torque: Array = np.zeros(len(cell.home))  # (joints,), N m: of the law, limited
+        self._shape = self._torque.shape
         self._limit = limit_torques.load()
         self._cut = 0  # cycles in which a limit cut a torque of the law
         self._sensed = SensedMotion(self.sensors.state)
@@ -129,9 +130,7 @@ class ServoLaw(ArmDriver):
         if self.operator.verdict is Verdict.NEW:
             self.operator_control.take(self.operator, self.sensors.position)
         if self.plan.verdict is Verdict.NEW:
-            plan = self.plan.message
-            self._holds = plan.held >= 0
-            self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
+            self.take_plan(self.plan.message)
         if self.above.verdict is Verdict.NEW:
             command = self.above.message
             self.followed = command.id
@@ -139,6 +138,11 @@ class ServoLaw(ArmDriver):
             self.reference.take(command)
             if self._grip is not None:
                 self._grip.take(command)
+
+    def take_plan(self, plan: ServoPlan) -> None:
+        """Take over what the gripper holds."""
+        self._holds = plan.held >= 0
+        self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
 
     def _obey(self, command: OperatorCommand) -> str:
         """Do what leaves the command in force as it is; return why not, empty: it does."""
@@ -201,13 +205,15 @@ class ServoLaw(ArmDriver):
         Raises:
             LevelError: `torques` returned something else than one number for each joint.
         """
-        torque = np.ascontiguousarray(self.torques(set_point, sensed), np.float64)
-        if torque.shape != self._torque.shape:
-            shapes = f"shape {torque.shape}; expected {self._torque.shape}, one for each joint"
+        torque = self._torque
+        found = self.torques(set_point, sensed)
+        if getattr(found, "shape", None) != self._shape:
+            shapes = f"shape {np.shape(found)}; expected {self._shape}, one for each joint"
             raise LevelError(f"class {type(self).__name__}: torques() returned {shapes}")
-        if self._limit(torque, self._limits, self._torque):
+        torque[:] = found
+        if self._limit(torque, self._limits):
             self._cut += 1
-        return self._torque
+        return torque
 
     def brake(self) -> None:
         """Brake, and abandon set points and torques."""
@@ -232,10 +238,11 @@ class ServoLaw(ArmDriver):
     def course(self, reaction: Reaction) -> Course:
         """Return what the status says of set points."""
         operator = self.operator_control
+        stands = operator.stands
         cut = self.reference.refused + self._cut
         kept = self.stopping.reason
-        if operator.stands and not kept:
+        if stands and not kept:
             kept = operator.reason
         holding = self.abandoned or self.reference.holding
-        stopped = self.abandoned or reaction > 0 or operator.stands
+        stopped = self.abandoned or reaction > 0 or stands
         return Course(self.followed, holding, stopped, cut, kept)

@@ -130,9 +130,7 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
     ],
     "set_torque": [wanted_of(k) for k in range(10)],
     "limit_torques": [
-        (noise(k) * scale, np.full(JOINTS, 1.0), np.zeros(JOINTS))
-        for k in range(5)
-        for scale in (1e-3, 3.0, np.nan)
+        (noise(k) * scale, np.full(JOINTS, 1.0)) for k in range(5) for scale in (1e-3, 3.0, np.nan)
     ],
     "servo_joints": [joints_of(k) for k in range(4)],
 }
