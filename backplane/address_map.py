@@ -18,7 +18,7 @@ LINE = 64
 HEAD_SIZE = PAGE
 BLOCK_SIZE = 256
 TRACE_RECORD_SIZE = 88
-ALARM_RECORD_SIZE = 64
+ALARM_RECORD_SIZE = 192
 ALARM_DEPTH = 256
 """Records in an alarm ring: it is read many times a second, and an alarm is raised once per
 episode."""

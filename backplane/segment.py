@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rack.backplane.message import Message
 
 MAGIC = int.from_bytes(b"NASREM-1", "little")
-VERSION = 17
+VERSION = 18
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 """Words with the addresses of the texts; the word after each has its size."""
 PREFIX = "nasrem-rack."

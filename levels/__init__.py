@@ -5,11 +5,12 @@ level must do.
   and `TimedOutput`, with `Reading`, `Verdict`, `Program`, `LevelContext`, `Pace`.
 - Declare messages: `Message`, `Command`, `Status`, `field`, `State`; the default levels' messages
   are in `rack.levels.messages`, and their error codes in `Error`.
-- Declare parameters: `Table`, `Positive`, `Finite`, `read_params`, `LIVE`, `set_live`; arm and
+- Declare parameters: `Table`, `Positive`, `Finite`, `Live`, `read_params`, `set_live`; arm and
   cell: `RobotConfig`, `SceneConfig`.
 - Obey an operator: `Orders`, `Operation`, `Goal`, `Commands`, `OperatorCommand`, `AnsweringStatus`,
   `RelayedCommand`.
 - Protect the arm: `Demand` from the rack, `Finding` with an `Alarm` to it, `Fault` injected.
+- Report events of its own: `FindingKind`, and `raise_finding` of an executor.
 - Fail: `LevelError`, `RobotError`, `ProgramError`, `Refused`.
 
 Import the rest by module, since MuJoCo takes half a second: `rack.levels.algebra` (arithmetic with
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
         Executor,
         Fault,
         Finding,
+        FindingKind,
         Input,
         Inputs,
         LevelContext,
@@ -56,8 +58,8 @@ if TYPE_CHECKING:
         RelayedCommand,
     )
     from rack.levels.tables import (
-        LIVE,
         Finite,
+        Live,
         Positive,
         RobotConfig,
         SceneConfig,
@@ -67,7 +69,6 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "LIVE",
     "Alarm",
     "AnsweringStatus",
     "Command",
@@ -77,12 +78,14 @@ __all__ = [
     "Executor",
     "Fault",
     "Finding",
+    "FindingKind",
     "Finite",
     "Goal",
     "Input",
     "Inputs",
     "LevelContext",
     "LevelError",
+    "Live",
     "Message",
     "Operation",
     "OperatorCommand",
@@ -118,6 +121,7 @@ _PLACES = {
         "Executor",
         "Fault",
         "Finding",
+        "FindingKind",
         "Input",
         "Inputs",
         "LevelContext",
@@ -141,8 +145,8 @@ _PLACES = {
         "RelayedCommand",
     ),
     "rack.levels.tables": (
-        "LIVE",
         "Finite",
+        "Live",
         "Positive",
         "RobotConfig",
         "SceneConfig",

@@ -45,9 +45,12 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     """Mark a function for compilation. Arguments are numbers, arrays and records; it may call
     others marked so."""
 
-    def __init__(self, function: Callable[_P, _R], types: str = "") -> None:
+    def __init__(
+        self, function: Callable[_P, _R], types: str = "", records: np.dtype[Any] | None = None
+    ) -> None:
         self._function = function
         self._types = types
+        self._records = records
         self._machine: Callable[_P, _R] | None = None
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -65,10 +68,13 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     def preload(self) -> None:
         """Load the machine code for the types with which the function is marked, if any."""
         if self._types:
+            from numba import from_dtype
             from numba.core.sigutils import normalize_signature
 
             machine: Any = self.load()
             types, _ = normalize_signature(f"({self._types},)")  # type: ignore[no-untyped-call]
+            if self._records is not None:
+                types = (from_dtype(self._records)[::1], *types)
             machine.compile(types)
 
     def source(self) -> Iterator[bytes]:
@@ -86,14 +92,18 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
                 yield from _value(known[name])
 
 
-def compiled_for(types: str) -> Callable[[Callable[_A, _T]], compiled[_A, _T]]:
+def compiled_for(
+    types: str, records: np.dtype[Any] | None = None
+) -> Callable[[Callable[_A, _T]], compiled[_A, _T]]:
     """Mark a function for compilation, before a run, for arguments of these types.
 
     Args:
         types: Types as numba writes them: "f8, i8, f8[:, ::1]" are a float, an integer and an
             array in C order.
+        records: Type of the structured array, in one dimension, that is the first argument; None:
+            there is none, and `types` are those of all arguments.
     """
-    return lambda function: compiled(function, types)
+    return lambda function: compiled(function, types, records)
 
 
 def preload(*modules: ModuleType) -> None:

@@ -54,28 +54,26 @@ lists them in `commands`, and follows with `rack.levels.operator.Orders`. Its st
 orders.rests_on(...)`). A level that takes none copies `operator` from the command above to its own
 command and status: without it the system's response to an operator cannot be measured.
 
-Parameters: declare `params = MyParams`, a `Table`, and read it with `read_params`: `rack check`
-then reports every mistake before the launch. The text below a field says what it means, with its
-unit: `rack schema` shows it. Executor and planner of a board share one table. A field with
-`json_schema_extra=LIVE`, which the executor alone reads, may be set while the level runs if it
-takes `Operation.SET`: on that command call `set_live`. A level that reads a program from `[task]`
+Events: what a level finds by itself is declared, `contact = FindingKind(unit="N m", doc="the arm
+touches something")`, and reported by `self.raise_finding("contact", 3.2, text="left finger")`, in
+every cycle in which it holds if you like: the run records one event for each episode.
+
+Parameters: declare `params = MyParams`, a `Table`, and find it in `self.settings`: `rack check`
+reports every mistake before the launch. The text below a field says what it means, with its
+unit: `rack schema` shows it. Executor and planner of a board share one table. A field declared
+`gain: Live[Positive] = 2.0`, which the executor alone reads, may be set while the level runs (`rack
+set`): `self.settings` has the new value in the next cycle, and a status that derives from
+`AnsweringStatus` confirms it. A level that reads its operator's commands itself takes
+`Operation.SET` among them, and calls `set_live`. A level that reads a program from `[task]`
 declares `program = MyProgram`, a `Program`, likewise.
 
-A servo level of your own
-- reports `holding = 1`, `target` (where the arm is held), `target_velocity = 0` and `stopped = 0`
-  until the first set point (while `due` of the command is 0), and again when set points stop: the
-  primitive level waits for this, and motion begins at that `target`. Four primitive cycles after
-  set points began, `holding` must be 0; else it starts over.
-- reports `stopped = 1`, and HOLDING with a `reason`, while it does not follow set points: the
-  primitive level waits.
-- writes a status in every primitive cycle, with `position` near `target`: the primitive level holds
-  motion when statuses are missing, or when a joint is farther off than its `following`.
-- obeys `demand`, and shows it in `status.demand`: emergency stop and lost boards act on the arm
-  only through it.
-- need not report what befalls the arm: refused torques, broken limits, contacts and brakes are
-  findings of the arm itself, and counted in its state.
-- advances the arm's time, saves its state, and publishes its scene, without which the world model
-  is stale and motion holds: see `rack.levels.arm.arm`.
+A servo law of your own derives from `rack.levels.servo.ServoLaw` and writes `torques`. A level that
+drives an arm otherwise derives from `ArmDriver`, and what it reports moves the level above:
+- `holding`, `target` (where the arm is held) and `target_velocity` 0 until the first set point, and
+  again when set points stop: the primitive level begins its motion at that `target`.
+- `stopped`, and HOLDING with a `reason`, while it does not follow set points: the primitive level
+  waits. It also holds motion when statuses are missing, or when a joint is farther from its
+  `target` than its `following`.
 
 A level without Python of its own for its decisions is a state table in a file: see
 `rack.levels.systems.state_table.level`.
@@ -90,6 +88,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -104,8 +103,15 @@ from rack.levels.compiled import preload
 from rack.levels.errors import LevelError, ProgramError
 from rack.levels.faults import Fault
 from rack.levels.messages import ArmState
-from rack.levels.operator import Commands, Operation
+from rack.levels.operator import (
+    AnsweringStatus,
+    Commands,
+    Operation,
+    OperatorCommand,
+    Orders,
+)
 from rack.levels.ports import (
+    FindingKind,
     Input,
     InputPort,
     Inputs,
@@ -116,13 +122,23 @@ from rack.levels.ports import (
     TimedOutput,
     collect_ports,
 )
-from rack.levels.tables import GoalConfig, RobotConfig, SceneConfig, Table, frozen
+from rack.levels.tables import (
+    GoalConfig,
+    RobotConfig,
+    SceneConfig,
+    Table,
+    frozen,
+    live_keys,
+    read_params,
+    set_live,
+)
 
 __all__ = [
     "Demand",
     "Executor",
     "Fault",
     "Finding",
+    "FindingKind",
     "Input",
     "Inputs",
     "LevelContext",
@@ -196,6 +212,7 @@ class Finding(NamedTuple):
     subject: int = -1  # joint, geom, ...: by alarm; -1: none in particular
     value: float = 0.0  # measured, in the unit of the alarm
     since: int | None = None  # tick at which it happened, if that is not the cycle that found it
+    text: str = ""  # of one that the level has declared
 
 
 @dataclass(frozen=True)
@@ -245,6 +262,10 @@ class LevelSection:
     """Modules of which every process of the level needs the functions marked `compiled_for`: see
     `rack.levels.compiled`."""
 
+    settings: Any
+    """The parameters: a record of the class `params`, as which a subclass may annotate it,
+    `settings: MyParams`. Replaced by a new one when a live parameter is set."""
+
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
@@ -254,6 +275,8 @@ class LevelSection:
         self.context = context
         self.ports: dict[str, Any] = {}
         """What the board puts into the ports that a config makes, by name."""
+        if self.params is not None:
+            self.settings = read_params(self.params, context.params)
 
     def input_table(self, port: str) -> dict[str, Any]:
         """Return the dict into which the board puts what it has read from a port, by name.
@@ -303,6 +326,11 @@ class LevelSection:
         """Release what the level holds; called once, after the last cycle, or plan."""
 
 
+OPERATOR = Input(OperatorCommand, "own.operator")
+"""The port by which the board of a level without one of that name sets its live parameters."""
+OPERATOR.name = "operator"
+
+
 class Executor(LevelSection, ABC):
     """The foreground of a level: runs every cycle, at high priority, in bounded time.
 
@@ -316,6 +344,8 @@ class Executor(LevelSection, ABC):
     commands: ClassVar[Commands] = {}
     """An operator's commands to the level, with the forms of their goals; for a level that reads
     "own.operator"."""
+    finding_kinds: ClassVar[Mapping[str, FindingKind]] = {}
+    """What it may find, by name: collected from the class and its bases."""
     made_last: ClassVar[Executor | None] = None
     """In this process. A board makes one executor, which then makes what it drives."""
 
@@ -333,7 +363,68 @@ class Executor(LevelSection, ABC):
         self.acted: dict[int, bool] = {}
         # Whatever it drives adds its own findings, and completes each cycle, given its `ARM_STATE`.
         self.complete_cycle: list[Callable[[ArmState | None], None]] = []
+        self._live_orders = Orders(self.commands)
         Executor.made_last = self
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.finding_kinds = collect_ports(cls, "finding_kinds", (FindingKind,))
+        for name, kind in cls.finding_kinds.items():
+            if kind.mistake:
+                raise LevelError(f"class {cls.__name__}: finding '{name}' {kind.mistake}")
+        if "operator" not in cls.inputs and live_keys(cls.params):
+            if hasattr(cls, "operator"):
+                why = "attribute 'operator' has the name of the port that sets live parameters"
+                raise LevelError(f"class {cls.__name__}: {why}; rename the attribute")
+            cls.inputs = {**cls.inputs, OPERATOR.name: OPERATOR}
+            cls.commands = {Operation.SET: ()}
+
+    def raise_finding(
+        self, name: str, value: float = 0.0, *, unit: str = "", text: str = ""
+    ) -> None:
+        """Report something that the level has found, as an event of the run.
+
+        A finding that is raised again within 20 cycles continues its episode, and is no other
+        event.
+
+        Args:
+            name: One of the class's `FindingKind`s.
+            value: What was measured, in the unit declared.
+            unit: That unit, if it shall be checked.
+            text: What is special about this one, in a few words; beyond 144 bytes it is cut.
+
+        Raises:
+            LevelError: The class declares no such finding, or another unit for it.
+        """
+        kind = self.finding_kinds.get(name)
+        what = f"class {type(self).__name__}: finding '{name}' is"
+        if kind is None:
+            near = get_close_matches(name, self.finding_kinds, 1)
+            known = ", ".join(self.finding_kinds) or "none"
+            hint = f"did you mean '{near[0]}'?" if near else f"declared: {known}"
+            raise LevelError(f"{what} not declared; {hint}")
+        if unit and unit != kind.unit:
+            raise LevelError(f"{what} in {kind.unit}, not in {unit}")
+        number = list(self.finding_kinds).index(name)
+        self.findings.append(Finding(Alarm.OWN, number, float(value), text=text))
+
+    @property
+    def is_set_by_board(self) -> bool:
+        """Whether it has live parameters, and leaves the operator's commands to its board."""
+        return self.inputs.get(OPERATOR.name) is OPERATOR
+
+    def take_settings(self, tick: int) -> None:
+        """Set live parameters as their operator commands, and answer in a status that can. Called
+        by the board before `process`."""
+        self._live_orders.take(OPERATOR.__get__(self, type(self)), self._set)
+        status = vars(self).get("status")
+        if isinstance(status, AnsweringStatus):
+            self._live_orders.report(status)
+
+    def _set(self, command: OperatorCommand) -> None:
+        self.settings, why = set_live(self.settings, command.name)
+        if why:
+            self._live_orders.refuse(why)
 
     @classmethod
     def names(cls, params: Mapping[str, Any]) -> Sequence[str]:

@@ -22,6 +22,7 @@ from typing import Any, Generic, NamedTuple, Self, TypeVar, overload
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
+from rack.backplane.watch.alarms import Alarm
 from rack.levels.errors import LevelError
 
 M = TypeVar("M", bound=Message)
@@ -209,15 +210,50 @@ class MadePorts(NamedTuple):
     is_whole: bool = True
 
 
-def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[str, Any]:
-    """Return the ports of a class: those of its bases, then its own.
+class FindingKind:
+    """What a level may find and report, declared as an attribute of its class: an event of a run.
 
-    A class drops the port of a base by setting it to None.
+    ```python
+    contact = FindingKind(unit="N m", doc="the arm touches something")
+    ```
+
+    Args:
+        unit: Unit of the value measured; "1" for a plain number.
+        doc: Meaning, in a few words.
+    """
+
+    name = ""
+
+    def __init__(self, *, unit: str, doc: str) -> None:
+        self.unit = unit
+        self.doc = doc
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @property
+    def mistake(self) -> str:
+        """What is wrong with the declaration; empty: nothing."""
+        if not self.unit or not self.doc:
+            return 'needs a unit ("1": a plain number) and a meaning, doc="..."'
+        if self.name.upper() in RESERVED:
+            return "has the name of another kind of event; rename it"
+        return ""
+
+
+RESERVED = frozenset((*Alarm.__members__, "BEGINS", "ENDS", "DIED", "RESTART"))
+"""Names that no finding may have: those of alarms, and of what befalls boards and faults."""
+
+
+def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[str, Any]:
+    """Return the ports, or findings, of a class: those of its bases, then its own.
+
+    A class drops one of a base by setting it to None.
 
     Args:
         level: The class.
-        attribute: The attribute in which the bases have their ports, by name.
-        kinds: Classes of ports to collect.
+        attribute: The attribute in which the bases have theirs, by name.
+        kinds: Classes to collect.
 
     Raises:
         LevelError: The class has a port and another attribute of the same name, or lists its ports
@@ -226,6 +262,7 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
     if attribute in vars(level):
         why = f"'{attribute}' is not a dict any more: each port is an attribute of the class"
         raise LevelError(f"class {level.__name__}: {why}, as in status = Output(MyStatus)")
+    noun = "finding" if FindingKind in kinds else "port"
     known: dict[str, Any] = {}
     for base in reversed(level.__mro__[1:]):
         known |= {port.name: port for port in vars(base).get(attribute, {}).values()}
@@ -233,14 +270,14 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
     for name, value in vars(level).items():
         if isinstance(value, kinds):
             if name not in known and any(hasattr(base, name) for base in level.__bases__):
-                why = f"port '{name}' has the name of another attribute"
-                raise LevelError(f"class {level.__name__}: {why}; rename the port")
+                why = f"{noun} '{name}' has the name of another attribute"
+                raise LevelError(f"class {level.__name__}: {why}; rename the {noun}")
             # A port declared again takes its place among the class's own.
             found.pop(name, None)
             found[name] = value
         elif name in known and value is None:
             del found[name]
         elif name in known:
-            why = f"attribute '{name}' has the name of a port"
+            why = f"attribute '{name}' has the name of a {noun}"
             raise LevelError(f"class {level.__name__}: {why}; rename the attribute")
     return found

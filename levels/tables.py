@@ -32,6 +32,8 @@ from rack.backplane.bounded_toml import load_toml
 from rack.levels.errors import LevelError
 from rack.levels.references import find_class
 
+T = TypeVar("T")
+
 # No quantity of an arm in SI units, and no time of a run, exceeds these: sums and squares of them
 # stay finite. pydantic keeps one bound of each kind, so a narrower field uses `le` and `ge`.
 MOST = 1e9
@@ -51,7 +53,8 @@ Tick = Annotated[int, Field(ge=0, le=LAST_TICK)]
 
 
 LIVE: JsonDict = {"live": True}
-"""Declares a field of params live: an operator may set it while the level runs; see `set_live`."""
+Live = Annotated[T, Field(json_schema_extra=LIVE)]
+"""A field of params that an operator may set while the level runs: `gain: Live[Positive] = 2.0`."""
 
 
 class Table(BaseModel):
@@ -108,7 +111,6 @@ def frozen(value: Any) -> Any:
 
 
 Params = TypeVar("Params", bound=Table)
-T = TypeVar("T")
 
 
 def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:

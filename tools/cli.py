@@ -65,6 +65,7 @@ COMMANDS = {
         "reproduce": "Reproduce the paper, claim by claim, as one page.",
     },
     "Bring up": {
+        "new": "Write a level, a servo law or a planner to start from.",
         "robot": "Bring up any arm, from a model file.",
     },
     "Reach others": {

@@ -24,8 +24,7 @@ RECORD = np.dtype(
         ("subject", "i8"),  # see Alarm; -1: none
         ("value", "f8"),  # the measured value, see Alarm
         ("since", "i8"),  # tick since which the condition holds; `tick` if not known
-        ("spare0", "i8"),
-        ("spare1", "i8"),
+        ("text", "S144"),  # UTF-8: what a level says of its own finding
     ]
 )
 
@@ -115,6 +114,8 @@ class Alarm(IntEnum):
     PEER_BACK = 61  # [number; ticks it was away]  the same launch as before
     PEER_RESTARTED = 62  # [number; ticks it was away]  another launch
     REMOTE_STOP = 63  # [number; -]  another machine has set the emergency stop
+    # Raised by a level of a user's own: what it has declared.
+    OWN = 70  # [number among the level's `finding_kinds`; as declared]
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
@@ -143,11 +144,20 @@ class AlarmWriter:
         subject: int = -1,
         value: float = 0.0,
         since: int | None = None,
+        text: str = "",
     ) -> None:
         """Append an alarm, and wake the Rack unless it is one of `MISSES`."""
         count = self._head[0] + 1
         found = tick if since is None else since
-        self._slots[count % ALARM_DEPTH] = (tick, monotonic_ns(), code, subject, value, found, 0, 0)
+        self._slots[count % ALARM_DEPTH] = (
+            tick,
+            monotonic_ns(),
+            code,
+            subject,
+            value,
+            found,
+            text.encode("utf-8", "replace"),
+        )
         self._head[0] = count
         if self._attention is not None and code not in MISSES:
             # This never waits: an eventfd can count more alarms than any run raises.

@@ -51,6 +51,15 @@ class PublishedParam:
 
 
 @dataclass(frozen=True)
+class PublishedFinding:
+    """An event of its own that a level may report: see `rack.levels.ports.FindingKind`."""
+
+    name: str
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
 class PublishedLevel:
     """A level, as its operator and the injector of faults know it.
 
@@ -62,6 +71,7 @@ class PublishedLevel:
         keys: Keys of all its parameters.
         live: Its live parameters by key.
         struck_by: Kinds of faults that can strike the hardware that it drives.
+        findings: Events of its own that it may report, in the order of their numbers.
     """
 
     commands: Mapping[Operation, tuple[Goal, ...]] = field(default_factory=dict)
@@ -70,6 +80,7 @@ class PublishedLevel:
     keys: tuple[str, ...] = ()
     live: Mapping[str, PublishedParam] = field(default_factory=dict)
     struck_by: tuple[str, ...] = ()
+    findings: tuple[PublishedFinding, ...] = ()
 
     @property
     def table(self) -> type[Table]:
@@ -161,6 +172,9 @@ def _level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLev
         keys=() if kind.params is None else tuple(kind.params.model_fields),
         live=live,
         struck_by=tuple(k.name for k in KINDS if isinstance(k.step, kind.faults)),
+        findings=tuple(
+            PublishedFinding(one.name, one.unit, one.doc) for one in kind.finding_kinds.values()
+        ),
     )
 
 

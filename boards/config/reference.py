@@ -19,9 +19,10 @@ from pydantic_core.core_schema import ModelSchema
 from rack.boards.config.files import EXTENDS
 from rack.boards.config.rules.mailboxes import exchange, ports
 from rack.boards.config.schema import LAN, RackConfig
-from rack.boards.config.wiring import Wiring
+from rack.boards.config.wiring import Wiring, executors
 from rack.boards.errors import ConfigError, shown
 from rack.boards.faults.kind import KINDS
+from rack.levels.ports import FindingKind
 from rack.levels.tables import keys_of
 
 UNIT = re.compile(
@@ -88,6 +89,11 @@ def key_tables(config: RackConfig) -> list[KeyTable]:
         # Of the network adapter's board the table is `[adapter.lan]`.
         if config.adapter.lan is None or board != f"board.{LAN}":
             found += _tables(params, f"{board}.params")
+    found += [
+        _findings(board, kind.finding_kinds)
+        for board, kind in executors(config).items()
+        if kind.finding_kinds
+    ]
     return found
 
 
@@ -223,6 +229,17 @@ def _summary(docstring: str) -> str:
     text = " ".join(docstring.partition("\n\n")[0].split())
     text = re.sub(r"^`\[.*?\]`: ", "", text).partition(". ")[0].rstrip(".")
     return text[:1].lower() + text[1:]
+
+
+def _findings(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
+    """Return the events that a level reports itself as a table, though none is a key."""
+    keys = tuple(
+        Key(kind.name, "number", kind.unit.removeprefix("1"), "", "", kind.doc)
+        for kind in kinds.values()
+    )
+    return KeyTable(
+        f"board.{board}.findings", f"(events of board.{board})", "what the level may report", keys
+    )
 
 
 def _fault_kinds() -> Iterator[KeyTable]:

@@ -13,6 +13,7 @@ import numpy as np
 from rack.backplane.address_map import CLOCK
 from rack.backplane.checked import as_named, as_whole, pick
 from rack.backplane.fault_table import FaultTable
+from rack.backplane.message import printable
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
@@ -31,7 +32,17 @@ from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.tables import read_setting
 
 About = Literal[
-    "task", "mailbox", "joint", "geom", "name", "brakes", "fault", "command", "demand", "nothing"
+    "task",
+    "mailbox",
+    "joint",
+    "geom",
+    "name",
+    "brakes",
+    "fault",
+    "command",
+    "demand",
+    "finding",
+    "nothing",
 ]
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
 """Why brakes engaged, where no error says it: by the subject of their alarm, from 0 down."""
@@ -131,6 +142,7 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
         Alarm.OPERATOR_GONE: "{what}: its operator is gone: hold (command {value:.0f})",
     },
     "demand": {Alarm.DEMAND: "{what}"},
+    "finding": {Alarm.OWN: "{what}"},
     "geom": {Alarm.COLLISION: "unintended contact: '{subject}' touches '{writer}'"},
     "name": {
         Alarm.MODIFICATION: "control modification '{subject}' failed and was taken out",
@@ -243,6 +255,14 @@ class AlarmEvents:
             kind = "reaction" if demand else "recovery"
             why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
             words["what"] = DEMANDS[demand].format(why=why)
+        elif about == "finding":
+            declared = self._levels[owner].findings if owner in self._levels else ()
+            finding = pick(declared, number, "finding")
+            code = finding.name
+            subject = board = owner
+            measured = f"{value:.6g} {finding.unit}".removesuffix(" 1")
+            said = bytes(row["text"]).decode("utf-8", "replace") or finding.meaning
+            words["what"] = printable(f"{code}: {measured}, {said}")
         else:
             subject = self._subject(about, number, owner)
             board = subject if alarm == Alarm.REJOINED else owner

@@ -13,6 +13,7 @@ from time import monotonic_ns
 from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag
+from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.backplane.words import Block, Demand, System
 from rack.boards.exchange import EXCHANGE, ExchangeRecord
 from rack.boards.run.task import ClockGuard, Task, in_turn, slowed
@@ -54,6 +55,7 @@ class VirtualControlLoop(Task):
         )
         self._guard = ClockGuard(segment, self.alarms, self.block) if wiring.guards_clock else None
         self._has_cycled = False
+        self._raised: dict[int, int] = {}  # ticks of the level's own findings, by number
         self._due = segment.layout.due(self.spec)
         times = wiring.transfer
         self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
@@ -62,7 +64,8 @@ class VirtualControlLoop(Task):
             message = self.outputs.writers[EXCHANGE].message
             record = ExchangeRecord(self.inputs.taken, message).fill
         reads = in_turn(self.inputs.read_command_and_status, record)
-        self.read_command_and_status = in_turn(self.serve, slowed(reads, times.read_ns))
+        settings = executor.take_settings if executor.is_set_by_board else None
+        self.read_command_and_status = in_turn(self.serve, slowed(reads, times.read_ns), settings)
         self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
 
     def cycle(self, tick: int) -> None:
@@ -104,12 +107,24 @@ class VirtualControlLoop(Task):
         for complete_cycle in executor.complete_cycle:
             complete_cycle(self._arm_state)
         if executor.findings or executor.acted or self.faults.loads:
-            for finding in executor.findings:
+            self._report(tick)
+
+    def _report(self, tick: int) -> None:
+        executor = self.executor
+        for finding in executor.findings:
+            # A level may raise its own findings in every cycle: an alarm is one per episode.
+            if finding.alarm is not Alarm.OWN or self._begins_episode(finding.subject, tick):
                 self.alarms.ring(tick, *finding)
-            executor.findings.clear()
-            self.faults.count(executor.acted, tick)
-            executor.acted.clear()
-            self.faults.burn(tick)
+        executor.findings.clear()
+        self.faults.count(executor.acted, tick)
+        executor.acted.clear()
+        self.faults.burn(tick)
+
+    def _begins_episode(self, number: int, tick: int) -> bool:
+        """Note one of the level's own findings; return whether it begins an episode."""
+        last = self._raised.get(number)
+        self._raised[number] = tick
+        return last is None or tick - last > CLEAN_READS * self.spec.every
 
 
 class PlannerLoop(Task):

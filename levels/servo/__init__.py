@@ -1,7 +1,24 @@
-"""The servo level: torques at the clock's rate from set points of the level above."""
+"""The servo level: torques at the clock's rate from set points of the level above.
 
+A law of your own derives from `ServoLaw`.
+"""
+
+from rack.levels.servo.control import LawParams
+from rack.levels.servo.curves import Motion, SensedMotion
 from rack.levels.servo.executor import ServoExecutor
+from rack.levels.servo.law import ServoLaw
 from rack.levels.servo.modification import Hook, LawContext, LawSample, Modification
 from rack.levels.servo.planner import ServoPlanner
 
-__all__ = ["Hook", "LawContext", "LawSample", "Modification", "ServoExecutor", "ServoPlanner"]
+__all__ = [
+    "Hook",
+    "LawContext",
+    "LawParams",
+    "LawSample",
+    "Modification",
+    "Motion",
+    "SensedMotion",
+    "ServoExecutor",
+    "ServoLaw",
+    "ServoPlanner",
+]

@@ -6,6 +6,7 @@ import math
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
@@ -33,8 +34,24 @@ URGENT_SPEED_PART = 0.99
 be certain."""
 TURNING = 2.0
 """Speed, in `FRICTION_SPEED`, up to which dry friction may be anything up to its full value."""
-
-
+MOTORS = np.dtype(
+    [
+        ("velocity", "f8"),  # rad/s: at the beginning of the cycle
+        ("earlier_velocity", "f8"),  # rad/s: at that of the cycle before
+        ("bias", "f8"),  # N m: of gravity and velocities, at the beginning
+        ("torque", "f8"),  # N m: given in the cycle
+        ("dry", "f8"),  # N m: dry friction
+        ("friction_s", "f8"),  # s: time constant of the simulated one
+        ("exact_noise", "f8"),  # N m: left unexplained with exact encoders
+        ("uncertain", "f8"),  # rad/s2: acceleration that other encoders may simulate
+        ("off", "f8"),  # rad: error of a position
+        ("left", "f8"),  # N m: left unexplained in the cycle
+        ("noise", "f8"),  # N m: what of it may be noise
+        ("least_friction", "f8"),  # N m
+        ("most_friction", "f8"),  # N m
+    ]
+)
+"""What is known of a joint's motor."""
 EXPLAINED = 0
 LEFT_OVER = 1
 ASTRAY = 2
@@ -61,19 +78,19 @@ class ActuatorMonitor:
         joints = len(cell.dof)
         self._limits = cell.bounds.torque
         self._fastest = URGENT_SPEED_PART * cell.bounds.velocity
-        self._table = np.zeros((13 + joints, joints))  # in the rows of `left_over`
-        # `torque`, (joints,), N m: given in the cycle that begins; the level fills it in.
-        self.torque, self._dry, early, least, uncertain, self._off = self._table[2:8]
-        self._left, self._noise, *self._friction, self._velocity = self._table[8:13]
-        self._dry[:] = model.dof_frictionloss[dof]
+        self._motors = motors = np.zeros(joints, MOTORS)
+        self.torque: Array = motors["torque"]
+        """Torques given in the cycle that begins, (joints,), N m; the level fills them in."""
+        motors["dry"] = model.dof_frictionloss[dof]
         # Simulated friction slows a joint as a damper of that time constant does: if the joint
         # brakes harder, the friction changes sign before the velocity does.
-        early[:] = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
-        least[:] = NOISE_PART * self._limits
+        motors["friction_s"] = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
+        motors["exact_noise"] = NOISE_PART * self._limits
         # The change in velocity that the encoders' errors may simulate.
-        uncertain[:] = 2.0 * cell.encoders.speed_off / period_s
-        self._off[:] = cell.encoders.off
-        self._judge = partial(left_over.load(), self._table, 0.5 / period_s, following)
+        motors["uncertain"] = 2.0 * cell.encoders.speed_off / period_s
+        motors["off"] = cell.encoders.off
+        inertia = np.zeros((joints, joints))  # kg m2: at the beginning of the cycle
+        self._judge = partial(left_over.load(), motors, inertia, 0.5 / period_s, following)
         self._reported = is_reported
         self._begun = False
         self._pushed = False  # weak motors do not explain the difference
@@ -111,31 +128,32 @@ class ActuatorMonitor:
             return None
         if verdict == ASTRAY:
             astray = wanted[0] - state[0]
-            joint = int((np.abs(astray) - self._off).argmax())
+            joint = int((np.abs(astray) - self._motors["off"]).argmax())
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
-        return self._lacking(self._left, state[1], holds)
+        return self._lacking(state[1], holds)
 
-    def _lacking(self, left: Array, velocity: Array, holds: bool) -> Finding | None:
+    def _lacking(self, velocity: Array, holds: bool) -> Finding | None:
         """Follow cycles in which motors that lack torque explain the difference, until it is
         certain."""
+        motors = self._motors
+        left = motors["left"]
+        noise = motors["noise"]
         commanded = np.abs(self.torque)
         lacks = left * np.sign(self.torque)
-        explained = (lacks >= -self._noise) & (lacks <= commanded + self._noise)
+        explained = (lacks >= -noise) & (lacks <= commanded + noise)
         if not self._pushed and not explained.all():
             self._pushed = True
             self._cycles = 0
         share = np.where(explained, lacks / self._limits, 0.0)
         # While a joint turns, its dry friction is known, and any push shows.
-        rests = (
-            np.count_nonzero(self._friction[1] - self._friction[0] <= self._noise)
-            < MIN_TURNING_JOINTS
-        )
+        is_known = motors["most_friction"] - motors["least_friction"] <= noise
+        rests = np.count_nonzero(is_known) < MIN_TURNING_JOINTS
         part = LACKING_PART
         if self._pushed:
             part = MAX_CONTACT_PART
         elif rests and holds:
             part = MAX_RESTING_CONTACT_PART
-        least = np.maximum(part, self._noise / self._limits)
+        least = np.maximum(part, noise / self._limits)
         joint = (
             self._joint
             if self._cycles and share[self._joint] > least[self._joint]
@@ -153,8 +171,8 @@ class ActuatorMonitor:
             self._alone = True
         self._cycles += 1
         self._most = max(self._most, abs(commanded[joint] - lacks[joint]))
-        self._alone &= not rests and np.count_nonzero(np.abs(left) > self._noise) == 1
-        ahead = np.abs(velocity) + 2.0 * np.abs(velocity - self._velocity)
+        self._alone &= not rests and np.count_nonzero(np.abs(left) > noise) == 1
+        ahead = np.abs(velocity) + 2.0 * np.abs(velocity - motors["earlier_velocity"])
         if (ahead > self._fastest).any() or self._sure(joint, commanded[joint], lacks[joint]):
             self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
@@ -172,14 +190,16 @@ class ActuatorMonitor:
             return True
         more = commanded - self._commanded
         rise = commanded - lacks - self._given
-        certain = 2.0 * self._noise[joint]
-        hidden = 2.0 * self._dry[joint] if self._alone and lacks >= DEAD_PART * commanded else 0.0
+        motor = self._motors[joint]
+        certain = 2.0 * motor["noise"]
+        hidden = 2.0 * motor["dry"] if self._alone and lacks >= DEAD_PART * commanded else 0.0
         return bool(self._most <= certain + hidden or (more > certain and rise < RISE_PART * more))
 
 
-@compiled_for("f8[:,::1], f8, f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]")
+@compiled_for("f8[:,::1], f8, f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]", MOTORS)
 def left_over(
-    table: Array,  # (13 + joints, joints): rows as below
+    motors: NDArray[np.void],  # (joints,): MOTORS
+    inertia_before: Array,  # (joints, joints), kg m2: at the beginning of the cycle
     half_rate: float,  # 1/s: of the cycles
     following: float,  # rad
     wanted: Array,  # (3, joints), rad: positions in the first row
@@ -189,41 +209,37 @@ def left_over(
 ) -> int:
     """Compare the torques that a motion took with those commanded; keep the present state for the
     next cycle."""
-    # At the beginning of the cycle: rad/s, N m, N m. Dry friction, N m, and time constant of the
-    # simulated one, s. Noise of exact encoders, N m; acceleration that others may simulate, rad/s2;
-    # error of the positions, rad.
-    velocity_before, bias_before, torque, dry, early, noise, uncertain, off = table[:8]
-    inertia_before = table[13:]  # kg m2
-    position = state[0]
-    velocity = state[1]
+    position, velocity = state
     verdict = EXPLAINED
-    for j in range(len(velocity)):
-        left = torque[j] - 0.5 * (bias_before[j] + bias[j])
-        unsure = noise[j]
-        for k in range(len(velocity)):
+    for j in range(len(motors)):
+        motor = motors[j]
+        left = motor["torque"] - 0.5 * (motor["bias"] + bias[j])
+        noise = motor["exact_noise"]
+        for k in range(len(motors)):
             left -= (inertia_before[j, k] + inertia[j, k]) * (
-                half_rate * (velocity[k] - velocity_before[k])
+                half_rate * (velocity[k] - motors[k]["velocity"])
             )
-            unsure += abs(inertia[j, k]) * uncertain[k]
-        ahead = velocity[j] + early[j] * (half_rate * (velocity[j] - velocity_before[j]))
-        slowest = min(ahead, velocity_before[j])
-        fastest = max(ahead, velocity_before[j])
-        least = dry[j] * math.tanh(slowest / FRICTION_SPEED - TURNING)
-        most = dry[j] * math.tanh(fastest / FRICTION_SPEED + TURNING)
+            noise += abs(inertia[j, k]) * motors[k]["uncertain"]
+        before = motor["velocity"]
+        ahead = velocity[j] + motor["friction_s"] * (half_rate * (velocity[j] - before))
+        slowest = min(ahead, before)
+        fastest = max(ahead, before)
+        least = motor["dry"] * math.tanh(slowest / FRICTION_SPEED - TURNING)
+        most = motor["dry"] * math.tanh(fastest / FRICTION_SPEED + TURNING)
         left -= min(max(left, least), most)
-        # Set, N m: what is left over, what of it may be noise, least and most friction.
-        table[8, j] = left
-        table[9, j] = unsure
-        table[10, j] = least
-        table[11, j] = most
-        if abs(left) > unsure:
+        motor["left"] = left
+        motor["noise"] = noise
+        motor["least_friction"] = least
+        motor["most_friction"] = most
+        if abs(left) > noise:
             verdict = max(verdict, LEFT_OVER)
-        if abs(wanted[0, j] - position[j]) - off[j] > following:
+        if abs(wanted[0, j] - position[j]) - motor["off"] > following:
             verdict = ASTRAY
-    for j in range(len(velocity)):
-        table[12, j] = velocity_before[j]
-        velocity_before[j] = velocity[j]
-        bias_before[j] = bias[j]
-        for k in range(len(velocity)):
+    for j in range(len(motors)):
+        motor = motors[j]
+        motor["earlier_velocity"] = motor["velocity"]
+        motor["velocity"] = velocity[j]
+        motor["bias"] = bias[j]
+        for k in range(len(motors)):
             inertia_before[j, k] = inertia[j, k]
     return verdict

@@ -13,12 +13,12 @@ from pydantic import Field, field_validator
 from rack.levels.algebra import Array
 from rack.levels.arm import JointTarget, find_arm
 from rack.levels.compiled import compiled_for
-from rack.levels.messages import ArmSetPoint, ServoPlan
+from rack.levels.messages import ArmSetPoint
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics, Payload, Terms
-from rack.levels.servo.curves import Motion
+from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
+from rack.levels.servo.curves import Motion, SensedMotion
 from rack.levels.servo.modification import ModifiableParams
-from rack.levels.tables import LIVE, GripperConfig, Positive, Table
+from rack.levels.tables import GripperConfig, Live, Positive, Table
 
 Reacting = Literal["hold", "stop", "brake"]
 
@@ -26,9 +26,9 @@ Reacting = Literal["hold", "stop", "brake"]
 class LoopGains(Table):
     """Gains of the joint loop."""
 
-    bandwidth: Positive = Field(60.0, le=400.0, json_schema_extra=LIVE)
+    bandwidth: Live[Positive] = Field(60.0, le=400.0)
     """natural frequency of the error in every joint, rad/s"""
-    damping: Positive = Field(1.0, le=3.0, json_schema_extra=LIVE)
+    damping: Live[Positive] = Field(1.0, le=3.0)
     """damping ratio of the error"""
 
     def fill(self, table: Array) -> None:
@@ -62,7 +62,11 @@ class ArmParams(Table):
         return reference
 
 
-class ServoParams(ModifiableParams, ArmParams, LoopGains):
+class LawParams(ModifiableParams, ArmParams):
+    """`[board.servo.params]` of any servo law; a law of your own adds its own keys."""
+
+
+class ServoParams(LawParams, LoopGains):
     """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults of
     sensors and motors."""
 
@@ -71,64 +75,45 @@ class ComputedTorque:
     """torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction;
     M is the planner's.
 
-    Every joint's error is that of a damped oscillator in every state of the arm. Torques stay
-    within their limits.
+    Every joint's error is that of a damped oscillator in every state of the arm.
+
+    Attributes:
+        inertia: (joints, joints), kg m2, as planned; None: the present one is used.
     """
 
-    def __init__(self, cell: Cell, params: ServoParams, dynamics: Dynamics) -> None:
-        """Use `dynamics` of the cell: the arm's, which saves its limit gate another evaluation."""
-        self._dynamics = dynamics
-        table = np.zeros((5, len(cell.dof)))  # in the rows of `set_torque`
+    def __init__(self, friction: Array, gains: LoopGains) -> None:
+        """Compensate `friction`, (joints,), N m: dry."""
+        table = np.zeros((4, len(friction)))  # in the rows of `set_torque`
         self._constants = table
-        self.tune(params)
-        table[2] = dynamics.dry
-        table[3] = cell.bounds.torque
-        self._torque: Array = table[4]
+        self.tune(gains)
+        table[2] = friction
+        self._torque: Array = table[3]
         self._set = partial(set_torque.load(), table)
-        self.holds = False  # the gripper holds a part, says the plan
-        self.cut = 0  # cycles in which a torque limit cut a torque
-        self._payload: Payload | None = None
-        self._inertia: Array | None = None  # (joints, joints), kg m2: planned
+        self.inertia: Array | None = None
 
     def tune(self, gains: LoopGains) -> None:
         """Use these gains from now on."""
         gains.fill(self._constants)
 
-    def take(self, plan: ServoPlan) -> None:
-        """Take a new plan."""
-        self.holds = plan.held >= 0
-        self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
-        self._inertia = plan.inertia.copy()
-
-    def terms(self, position: Array, velocity: Array) -> Terms:
-        """Return the equation of motion at rad, rad/s, with the held object. Valid until the next
-        call."""
-        return self._dynamics.terms(position, velocity, self._payload)
-
-    def torque(self, wanted: Motion, state: Array, terms: Terms) -> Array:
-        """Return the torques, (joints,), N m, for the wanted motion at `state`, rad, rad/s. Valid
-        until the next call.
-
-        The rows of `state` are positions and velocities, (2, joints).
-        """
-        inertia = terms.inertia if self._inertia is None else self._inertia
-        if self._set(wanted.table, state, inertia, terms.bias):
-            self.cut += 1
+    def torque(self, wanted: Motion, sensed: SensedMotion, terms: Terms) -> Array:
+        """Return the torques, (joints,), N m, for the wanted motion; `terms` are those at the
+        sensed state. Valid until the next call."""
+        inertia = terms.inertia if self.inertia is None else self.inertia
+        self._set(wanted.table, sensed.table, inertia, terms.bias)
         return self._torque
 
 
 @compiled_for("f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]")
 def set_torque(
-    table: Array,  # (5, joints): rows as below
+    table: Array,  # (4, joints): rows as below
     wanted: Array,  # (3, joints): rad, rad/s, rad/s2
     state: Array,  # (2, joints): rad, rad/s
     inertia: Array,  # (joints, joints), kg m2
     bias: Array,  # (joints,), N m
-) -> bool:
-    """Set the torques of `ComputedTorque`; return whether a limit cut one."""
-    # 1/s2, 1/s; friction, limits and, set here, torques, N m.
-    stiffness, damping, dry, limits, torque = table
-    cut = False
+) -> None:
+    """Set the torques of `ComputedTorque`."""
+    # 1/s2, 1/s; friction and, set here, torques, N m.
+    stiffness, damping, dry, torque = table
     for j in range(len(torque)):
         torque[j] = bias[j] + dry[j] * math.tanh(wanted[1, j] / FRICTION_SPEED)
     for k in range(len(torque)):
@@ -136,10 +121,16 @@ def set_torque(
         acceleration = damped + stiffness[k] * (wanted[0, k] - state[0, k])
         for j in range(len(torque)):
             torque[j] += inertia[j, k] * acceleration
+
+
+@compiled_for("f8[::1], f8[::1]")
+def limit_torques(torque: Array, limits: Array) -> bool:
+    """Cut torques, (joints,), N m, at their limits; return whether one was cut. NaN stays."""
+    cut = False
     for j in range(len(torque)):
-        needed = torque[j]
-        torque[j] = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
-        cut = cut or needed != torque[j]
+        if abs(torque[j]) > limits[j]:
+            torque[j] = math.copysign(limits[j], torque[j])
+            cut = True
     return cut
 
 

@@ -28,6 +28,16 @@ class Motion:
         self.position, self.velocity, self.acceleration = table
 
 
+class SensedMotion:
+    """Joint positions, rad, and velocities, rad/s, (joints,) each: the rows of `table`."""
+
+    __slots__ = ("position", "table", "velocity")
+
+    def __init__(self, table: Array) -> None:
+        self.table = table  # (2, joints)
+        self.position, self.velocity = table
+
+
 class Curve:
     """A motion in time, for all joints, that goes over to rest at `ends_s`."""
 

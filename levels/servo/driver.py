@@ -28,7 +28,7 @@ from rack.levels.level import (
 from rack.levels.messages import ArmState, DrivenArm, Error, Scene
 from rack.levels.operator import Operation, OperatorCommand, Orders
 from rack.levels.robot.cell import cell_of, sensed_by
-from rack.levels.robot.dynamics import Terms
+from rack.levels.robot.dynamics import Payload, Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
 from rack.levels.servo.control import ArmParams, SetPointLaw
@@ -65,8 +65,9 @@ class ArmDriver(Executor):
 
     faults = ARM_STEPS
     params: ClassVar[type[ArmParams]] = ArmParams
+    settings: ArmParams
     gives_set_points: ClassVar[bool] = False
-    """Whether it can drive an arm by set points, too: its `torques` are then those predicted."""
+    """Whether it can drive an arm by set points, too: its torques are then those predicted."""
     ahead: SetPointLaw | None = None
     """The set points of a cycle, for drives that take them; None: they take torques."""
     orders: Orders
@@ -75,9 +76,12 @@ class ArmDriver(Executor):
     status: DrivenArm
     state: ArmState
     scene: Scene
+    terms: Terms
+    """The equation of motion in this cycle."""
 
-    def __init__(self, context: LevelContext, params: ArmParams) -> None:
+    def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
+        params = self.settings
         every = context.every
         robot = context.robot
         kind = find_arm(params.arm)
@@ -160,13 +164,19 @@ class ArmDriver(Executor):
         After braking (`abandoned`) it begins where the arm is; with a reaction it comes to rest.
         """
 
-    @abstractmethod
-    def terms(self) -> Terms:
-        """Return the equation of motion at the sensed state."""
+    def find_terms(self) -> Terms:
+        """Return the equation of motion at the sensed state, with what the gripper holds."""
+        return self.arm.dynamics.terms(self.sensors.position, self.sensors.velocity, self.payload)
 
     @abstractmethod
-    def torques(self, wanted: Motion, sensed: Sensed, terms: Terms) -> tuple[Array, float]:
-        """Return torques, (joints,), N m, and grip force, N, for the wanted motion."""
+    def efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
+        """Return torques, (joints,), N m, and grip force, N, for the wanted motion, at the `terms`
+        of the cycle."""
+
+    @property
+    @abstractmethod
+    def payload(self) -> Payload | None:
+        """What the gripper holds; None: nothing, or not known."""
 
     @property
     @abstractmethod
@@ -298,8 +308,8 @@ class ArmDriver(Executor):
         wanted = self.next_motion(reaction, missed, tick)
         if wanted is None:
             return self.brake()
-        terms = self.terms()
-        failed = self.motors.look(wanted.table, self.sensors.state, terms, self.holds)
+        self.terms = self.find_terms()
+        failed = self.motors.look(wanted.table, self.sensors.state, self.terms, self.holds)
         if failed is not None:
             if not self.stopping.trying:
                 self.findings.append(failed)
@@ -307,7 +317,7 @@ class ArmDriver(Executor):
                 return self.brake()
         if reaction is Reaction.STOP and (self.abandoned or not wanted.velocity.any()):
             return self.brake()
-        torque, grip_force = self.torques(wanted, sensed, terms)
+        torque, grip_force = self.efforts(wanted, sensed)
         if self.ahead is None:
             refused = self._link.drive(torque, grip_force)
         else:

@@ -7,6 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, Ints, Mask
@@ -46,6 +47,28 @@ SILENT_CYCLES = 2
 """Cycles without a new sample after which the sensors are silent; with none but old ones, after
 which they are late."""
 NO_SAMPLES = "sensors give no new samples"
+MONITORED = np.dtype(
+    [
+        ("position", "f8"),  # rad: the sample
+        ("velocity", "f8"),  # rad/s
+        ("last_position", "f8"),  # rad: the sample before it
+        ("last_velocity", "f8"),  # rad/s
+        ("tolerance", "f8"),  # rad: largest error of a good sample
+        ("velocity_tolerance", "f8"),  # rad/s
+        ("unshown", "f8"),  # rad: largest motion that a good sensor may not show
+        ("braking", "f8"),  # rad/s2: of the brakes
+        ("fastest", "f8"),  # rad/s: no sample is faster
+        ("still_cycles", "f8"),  # without a change while the set point moves
+        ("still_way", "f8"),  # rad: motion of the set point in that time
+        ("claimed", "f8"),  # rad: integrated velocity while the sample does not change
+        ("way", "f8"),  # rad: motion since the last sample, by velocities
+        ("allowed", "f8"),  # rad: largest error of a good sample after that motion
+        ("fits", "?"),  # the sample agrees with that motion
+        ("unchanged", "?"),  # it was taken, and is as the one before
+    ],
+    align=True,
+)
+"""What is known of a joint's sensor, besides the estimate."""
 DOUBTFUL = 0
 GOOD = 1
 TAKEN = 2
@@ -87,23 +110,18 @@ class SensorMonitor:
         self._tick_s = tick_s
         self._every = every
         joints = len(home)
-        self._table = np.zeros((19, joints))  # in the rows of `check`
-        self._q, self._qd, *self._raw = self._table[:4]  # the sample, and the one before it
         # (joints,), rad: as sensed; estimated for joints whose sensor is suspect. (joints,), rad/s,
         # likewise; unknown ones are estimated as braked. (joints,), rad: largest error of
         # `position`.
-        self.position, self.velocity, self.doubt = self.estimate = self._table[4:7]
-        self.state = self._table[4:6]  # (2, joints): `position` and `velocity`
-        self._room, self._speed_room, self._unshown = self._table[7:10]
-        self._still, self._still_way, self._claimed = self._table[10:13]
-        self._way, self._allowed, self._braking, self._fastest = self._table[13:17]
-        self._fits, self._unchanged = self._table[17:]
-        self._braking[:] = cell.limits.acceleration
-        self._fastest[:] = BEYOND_SPEED * bounds.velocity
-        self._room[:] = FIT_RAD + 2.0 * encoders.off
-        self._speed_room[:] = encoders.speed_off
-        self._unshown[:] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
-        self.position[:] = self._raw[0][:] = home
+        self.position, self.velocity, self.doubt = self.estimate = np.zeros((3, joints))
+        self.state = self.estimate[:2]  # (2, joints): `position` and `velocity`
+        self._joints = np.zeros(joints, MONITORED)
+        self._joints["braking"] = cell.limits.acceleration
+        self._joints["fastest"] = BEYOND_SPEED * bounds.velocity
+        self._joints["tolerance"] = FIT_RAD + 2.0 * encoders.off
+        self._joints["velocity_tolerance"] = encoders.speed_off
+        self._joints["unshown"] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
+        self.position[:] = self._joints["last_position"] = home
         self.fresh = True  # there is a sample of this cycle
         self.faulty = False  # a sensor is, or was until fewer than `good_cycles` ago, at fault
         self.drivable = True  # velocities are known, so the arm could still be driven
@@ -117,7 +135,7 @@ class SensorMonitor:
         self._suspect = np.zeros(joints, dtype=bool)
         self._everyone = np.ones(joints, dtype=bool)
         self._sent = self._everyone  # its set point moves, or may have moved
-        self._check = partial(check.load(), self._table, not encoders.exact)
+        self._check = partial(check.load(), self._joints, self.estimate, not encoders.exact)
         self._tick: int | None = None
         self._sampled = -sys.maxsize  # tick of the newest sample
         self._latency = encoders.latency_ticks
@@ -142,8 +160,9 @@ class SensorMonitor:
         q, qd, _, _, sampled = sensed
         if sampled != tick or not (np.isfinite(q).all() and np.isfinite(qd).all()):
             return False
-        for row, before in enumerate((q - self._every * self._tick_s * qd, qd)):
-            self._table[2 + row] = self._table[4 + row] = before
+        joints = self._joints
+        joints["last_position"] = self.position[:] = q - self._every * self._tick_s * qd
+        joints["last_velocity"] = self.velocity[:] = qd
         self.doubt[:] = 0.0
         self._tick = tick - self._every
         self._trust()
@@ -173,49 +192,59 @@ class SensorMonitor:
         verdict = self._check(q, qd, motion, passed_s, braked_s, blow, driven, self.faulty)
         if verdict == TAKEN:
             return
+        joints = self._joints
         if verdict == GOOD:
-            self._take(self._allowed)
+            self._take(joints["allowed"])
             return
         self._sent = self._everyone if wanted is None else wanted[1] != 0.0
-        fits = self._fits != 0.0
+        fits = joints["fits"]
         if self.faulty:
-            fits |= np.abs(self._q - self.position - self._way) <= self._allowed + self.doubt
-        fastest = blow * self._fastest if struck else self._fastest
-        self._doubtful(fits & (np.abs(self._qd) <= fastest), passed_s)
+            off = joints["position"] - self.position - joints["way"]
+            fits = fits | (np.abs(off) <= joints["allowed"] + self.doubt)
+        fastest = blow * joints["fastest"] if struck else joints["fastest"]
+        self._doubtful(fits & (np.abs(joints["velocity"]) <= fastest), passed_s)
 
     def _take(self, room: Array) -> None:
         """Trust the sample; report a joint that this moves by more than `room`, rad."""
-        q = self._q
-        way = self._way
-        self._unchanged[:] = q == self._raw[0]
+        joints = self._joints
+        q = joints["position"]
+        joints["unchanged"] = q == joints["last_position"]
         if self.doubt.any():
-            off = q - self.position - way
+            off = q - self.position - joints["way"]
             for joint in np.flatnonzero(np.abs(off) > room):
                 self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(off[joint])))
             # A sensor that does not change proves nothing: it may be stuck.
-            self.doubt[self._unchanged == 0.0] = 0.0
-        self._table[4:6] = self._table[2:4] = self._table[:2]
+            self.doubt[~joints["unchanged"]] = 0.0
+        self.position[:] = q
+        self.velocity[:] = joints["velocity"]
+        self._keep_sample()
+
+    def _keep_sample(self) -> None:
+        """Keep the sample as the last one."""
+        for field in ("position", "velocity"):
+            self._joints[f"last_{field}"] = self._joints[field]
 
     def _doubtful(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, take its good joints, and estimate the others."""
-        q = self._q
-        qd = self._qd
-        last_q, last_qd = self._raw
-        way = self._way
-        room = self._allowed
+        joints = self._joints
+        q = joints["position"]
+        qd = joints["velocity"]
+        last_q = joints["last_position"]
+        last_qd = joints["last_velocity"]
+        way = joints["way"]
+        room = joints["allowed"]
+        cycles = joints["still_cycles"]
         finite = np.isfinite(q) & np.isfinite(qd)
         inside = (q >= self._low) & (q <= self._high)
         unchanged = (q == last_q) & (qd == last_qd)
-        frozen = self._claimed > self._room
-        still = np.asarray(
-            (self._still >= STILL_CYCLES) & (np.abs(self._still_way) >= self._unshown)
-        )
+        frozen = joints["claimed"] > joints["tolerance"]
+        still = (cycles >= STILL_CYCLES) & (np.abs(joints["still_way"]) >= joints["unshown"])
         begins = not self.faulty
         room += passed_s * np.abs(qd - last_qd)
         steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= room
         off = q - self.position - way
         self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
-        self._name(Alarm.SENSOR_STUCK, frozen | still, self._still)
+        self._name(Alarm.SENSOR_STUCK, frozen | still, cycles)
         self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, off)
         good = fits & steady & inside & ~still & ~frozen
         self.drivable = bool((np.isfinite(qd) & ~frozen & ~still).all())
@@ -227,23 +256,23 @@ class SensorMonitor:
             # off by that distance.
             np.maximum(
                 self.doubt,
-                np.where(self._unchanged != 0.0, STUCK_RAD, PLAUSIBLE_RAD),
+                np.where(joints["unchanged"], STUCK_RAD, PLAUSIBLE_RAD),
                 out=self.doubt,
             )
             # One that shows no change now, although its joint was driven, may have been stuck for
             # longer.
-            unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * self._braking + self._unshown
+            unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * joints["braking"] + joints["unshown"]
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
-        self._still[still] = 0
+        cycles[still] = 0
         if not good.all():
             amount = np.where(np.isfinite(off), np.abs(off), np.inf)
             joint = int(np.where(good, -1.0, amount).argmax())
             self.blamed = joint, float(q[joint]), float(off[joint])
         self._suspect |= ~good
         if self._settled(bool(good.all())):
-            self._take(self._room)
+            self._take(joints["tolerance"])
             return
-        self._table[2:4] = self._table[:2]
+        self._keep_sample()
         self._estimate(q, qd, way, np.isfinite(qd) & ~frozen, passed_s)
 
     def _estimate(self, q: Array, qd: Array, way: Array, known: Mask, passed_s: float) -> None:
@@ -283,14 +312,15 @@ class SensorMonitor:
         if not joints.any():
             return
         speed = np.abs(self.velocity)
-        time_s = np.minimum(passed_s, speed / self._braking)
-        way = (speed - 0.5 * self._braking * time_s) * time_s * joints
+        braking = self._joints["braking"]
+        time_s = np.minimum(passed_s, speed / braking)
+        way = (speed - 0.5 * braking * time_s) * time_s * joints
         # Until the brakes engage the last torque still acts.
-        acting = 2.0 * self._braking * passed_s * self._every * self._tick_s
+        acting = 2.0 * braking * passed_s * self._every * self._tick_s
         self.position += np.copysign(way, self.velocity)
-        np.maximum(self.doubt, BRAKE_TAIL_S2 * self._braking, out=self.doubt, where=joints)
+        np.maximum(self.doubt, BRAKE_TAIL_S2 * braking, out=self.doubt, where=joints)
         self.doubt += way + acting * joints * (speed > 0.0)
-        slower = np.copysign(np.maximum(speed - self._braking * time_s, 0.0), self.velocity)
+        slower = np.copysign(np.maximum(speed - braking * time_s, 0.0), self.velocity)
         np.copyto(self.velocity, slower, where=joints)
 
     def _name(self, alarm: Alarm, wrong: Mask, values: Array | Ints) -> None:
@@ -323,9 +353,10 @@ class SensorMonitor:
         self._rung.clear()
 
 
-@compiled_for("f8[:,::1], b1, f8[::1], f8[::1], f8[:,::1], f8, f8, f8, b1, b1")
+@compiled_for("f8[:,::1], b1, f8[::1], f8[::1], f8[:,::1], f8, f8, f8, b1, b1", MONITORED)
 def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
-    table: Array,  # (19, joints): rows as below
+    joints: NDArray[np.void],  # (joints,): MONITORED
+    estimate: Array,  # (3, joints), rad, rad/s, rad: position, velocity, and largest error of both
     coarse: bool,
     sensed: Array,  # (joints,), rad
     sensed_velocity: Array,  # (joints,), rad/s
@@ -338,45 +369,48 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
 ) -> int:
     """Check a sample against the estimate, and take it if nothing is in doubt; return the
     verdict."""
-    # This sample and the one before it, rad and rad/s; the estimate: rad, rad/s, rad.
-    q, qd, last_q, last_qd, position, velocity, doubt = table[:7]
-    # For errors, rad and rad/s; motion that must show, rad. Cycles without a change while the set
-    # point moves, and its motion in that time, rad; integrated velocity while the sample does not
-    # change, rad.
-    room, speed_room, unshown, still, still_way, claimed = table[7:13]
-    # Set here: motion since the last sample, and room for its errors, rad. Braking, rad/s2, and
-    # greatest velocity, rad/s. Set to 0 or 1: agrees with velocities; if taken, is as before.
-    way, allowed, braking, fastest, fits, unchanged = table[13:]
+    position, velocity, doubt = estimate
     good = not faulty
     in_doubt = False
     at_rest = False
-    for j in range(len(q)):
-        q[j] = sensed[j]
-        qd[j] = sensed_velocity[j]
-        at_rest = at_rest or (driven and qd[j] == velocity[j])
-    for j in range(len(q)):
-        change = qd[j] - velocity[j]
-        way[j] = (0.5 * passed_s) * (qd[j] + velocity[j])
-        further = passed_s * (braked_s * braking[j] + blow * fastest[j])
-        allowed[j] = room[j] + passed_s * (abs(change) + speed_room[j]) + further
-        fitting = abs(q[j] - position[j] - way[j]) <= allowed[j]  # never true for NaN
-        fits[j] = 1.0 if fitting else 0.0
-        same = q[j] == last_q[j]
-        unmoved = at_rest and change == 0.0 and same and wanted[1, j] != 0.0
-        still[j] = still[j] + 1.0 if unmoved else 0.0
-        still_way[j] = still_way[j] + passed_s * wanted[1, j] if unmoved else 0.0
-        good = (
-            good and fitting and not (still[j] >= STILL_CYCLES and abs(still_way[j]) >= unshown[j])
-        )
-        least = max(abs(qd[j]) - speed_room[j], 0.0)
-        claimed[j] = claimed[j] + passed_s * least if same and qd[j] == last_qd[j] else 0.0
+    for j in range(len(joints)):
+        at_rest = at_rest or (driven and sensed_velocity[j] == velocity[j])
+    for j in range(len(joints)):
+        joint = joints[j]
+        q = sensed[j]
+        qd = sensed_velocity[j]
+        joint["position"] = q
+        joint["velocity"] = qd
+        change = qd - velocity[j]
+        way = (0.5 * passed_s) * (qd + velocity[j])
+        further = passed_s * (braked_s * joint["braking"] + blow * joint["fastest"])
+        room = passed_s * (abs(change) + joint["velocity_tolerance"])
+        joint["way"] = way
+        joint["allowed"] = joint["tolerance"] + room + further
+        fits = abs(q - position[j] - way) <= joint["allowed"]  # never true for NaN
+        joint["fits"] = fits
+        same = q == joint["last_position"]
+        if at_rest and change == 0.0 and same and wanted[1, j] != 0.0:
+            joint["still_cycles"] += 1.0
+            joint["still_way"] += passed_s * wanted[1, j]
+        else:
+            joint["still_cycles"] = 0.0
+            joint["still_way"] = 0.0
+        is_long = joint["still_cycles"] >= STILL_CYCLES
+        still = is_long and abs(joint["still_way"]) >= joint["unshown"]
+        if same and qd == joint["last_velocity"]:
+            joint["claimed"] += passed_s * max(abs(qd) - joint["velocity_tolerance"], 0.0)
+        else:
+            joint["claimed"] = 0.0
         # An exact sensor that is stuck shows it in the next sample.
-        good = good and not (coarse and claimed[j] > room[j])
+        frozen = coarse and joint["claimed"] > joint["tolerance"]
+        good = good and fits and not (still or frozen)
         in_doubt = in_doubt or doubt[j] != 0.0
     if not good or in_doubt:
         return GOOD if good else DOUBTFUL
-    for j in range(len(q)):
-        unchanged[j] = 1.0 if q[j] == last_q[j] else 0.0
-        last_q[j] = position[j] = q[j]
-        last_qd[j] = velocity[j] = qd[j]
+    for j in range(len(joints)):
+        joint = joints[j]
+        joint["unchanged"] = joint["position"] == joint["last_position"]
+        joint["last_position"] = position[j] = joint["position"]
+        joint["last_velocity"] = velocity[j] = joint["velocity"]
     return TAKEN

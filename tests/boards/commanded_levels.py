@@ -11,7 +11,7 @@ import pydantic
 from rack.backplane.message import Command, Message, State, field
 from rack.levels.level import Executor, Input, Output
 from rack.levels.operator import RESTS_ON, AnsweringStatus, Goal, Operation, OperatorCommand, Orders
-from rack.levels.tables import LIVE, Table, read_params, set_live
+from rack.levels.tables import Live, Table, read_params, set_live
 
 
 class Step(Command, version=1):
@@ -53,7 +53,7 @@ class Upper(Executor):
 class CountParams(Table):
     """Params of the lower level."""
 
-    by: int = pydantic.Field(1, ge=1, le=9, description="counts in a cycle", json_schema_extra=LIVE)
+    by: Live[int] = pydantic.Field(1, ge=1, le=9, description="counts in a cycle")
     label: str = ""
 
 
@@ -113,3 +113,15 @@ class Homing(Lower):
     def is_there(self) -> bool:
         """Whether the command in force is done."""
         return self.orders.standing is not Operation.GOTO or self.given.by == 9
+
+
+class Plain(Executor):
+    """Counts by a live parameter, which its board sets."""
+
+    status = Output(Counted)
+    params = CountParams
+    settings: CountParams
+
+    def process(self, tick: int) -> None:
+        self.status.count += self.settings.by
+        self.status.state = State.EXECUTING

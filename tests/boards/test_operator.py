@@ -95,18 +95,25 @@ SET = commands(
     "level='lower', what='set', name='by=3', tick=101",
     "level='lower', what='set', name='by=2', tick=200",
 )
+BY_ITSELF, BY_ITS_BOARD = "Lower", "Plain"
+set_either_way = pytest.mark.parametrize("level", [BY_ITSELF, BY_ITS_BOARD])
+"""Whether a level takes the operator's commands itself, or leaves live parameters to its board."""
 
 
 @pytest.mark.slow
+@set_either_way
 def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_values(
-    commanded: Callable[..., RackConfig],
+    commanded: Callable[..., RackConfig], level: str
 ) -> None:
-    runs = [run(commanded(setting)) for setting in (SET, SET, "seed=0")]
+    lower = f"board.lower.executor=commanded_levels:{level}"
+    runs = [run(commanded(setting, lower)) for setting in (SET, SET, "seed=0")]
     assert runs[0][0].digest == runs[1][0].digest != runs[2][0].digest
     _, events, boxes = runs[0]
     rows = boxes["lower.status"]
     steps = dict(zip(rows["tick"][1:].tolist(), np.diff(rows["message"]["count"]), strict=True))
     assert [steps[tick] for tick in (101, 102, 200, 201)] == [1, 3, 3, 2]
+    answered = dict(zip(rows["tick"].tolist(), rows["message"]["order"].tolist(), strict=True))
+    assert [answered[tick] for tick in (101, 102, 200, 201)] == [0, 1, 1, 2]
     seen = [event for event in events if event.kind == "command"]
     assert [(e.tick, e.code, e.board, e.text) for e in seen] == [
         (101, "set", "lower", "set by=3, before 1 (command 1)"),
@@ -115,10 +122,12 @@ def test_a_live_parameter_is_set_between_two_cycles_and_its_event_has_both_value
 
 
 @pytest.mark.slow
+@set_either_way
 def test_a_restarted_board_has_its_live_params_as_they_were_set(
-    commanded: Callable[..., RackConfig],
+    commanded: Callable[..., RackConfig], level: str
 ) -> None:
-    outcome, events, boxes = run(faulty(commanded(SET), kill_at("lower", 250)), 2.0)
+    lower = f"board.lower.executor=commanded_levels:{level}"
+    outcome, events, boxes = run(faulty(commanded(SET, lower), kill_at("lower", 250)), 2.0)
     assert outcome.worked
     assert [event.board for event in events if event.code == "rejoined"] == ["lower"]
     assert np.diff(boxes["lower.status"]["message"]["count"])[-50:].tolist() == [2] * 50

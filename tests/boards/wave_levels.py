@@ -14,7 +14,7 @@ from typing import Any
 
 from rack.backplane.message import Message, State, Status, field
 from rack.levels.errors import LevelError
-from rack.levels.level import Executor, Input, LevelContext, Output, Planner
+from rack.levels.level import Executor, FindingKind, Input, LevelContext, Output, Planner
 
 
 class WaveStatus(Status, version=1, message="wave"):
@@ -102,6 +102,17 @@ class Steady(PlannedWave):
     def process(self, tick: int) -> None:
         self.status.state = State.EXECUTING
         self.status.value = 0.5 * tick * self.gain()
+
+
+class Surf(Wave):
+    """Finds a breaking wave in every cycle of the ticks that `breaks` lists."""
+
+    breaker = FindingKind(unit="m", doc="the wave breaks")
+
+    def process(self, tick: int) -> None:
+        super().process(tick)
+        if tick in self.context.params["breaks"]:
+            self.raise_finding("breaker", self.status.value, unit="m", text=f"tick {tick}")
 
 
 class GainPlanner(Planner):

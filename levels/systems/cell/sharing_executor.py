@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 from pydantic import Field, field_validator
 
@@ -53,11 +52,12 @@ class SharingServoExecutor(ServoExecutor):
     last = Input(SharedBodies, "own.shared")
     shared = SHARED
     params = SharingServoParams
+    settings: SharingServoParams
     arm: SharingArm
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        names = cast(SharingServoParams, self.given).shared
+        names = self.settings.shared
         rack = context.rack.encode()
         self._shared = {
             context.scene.objects.index(name): SharedBody(name.encode(), rack) for name in names

@@ -25,7 +25,6 @@ from rack.levels.systems.force.contact import HALVES, WristLevel
 from rack.levels.systems.force.hybrid_law import turned
 from rack.levels.systems.force.messages import AXES, Wrench
 from rack.levels.systems.joint_boards import ArmExecutor
-from rack.levels.tables import read_params
 
 ALARMS = (Alarm.FORCE_LIMIT, Alarm.MOMENT_LIMIT)
 """By half of a wrench."""
@@ -109,13 +108,13 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     felt = Input(Wrench, "own.wrench")
     wrench = Output(Wrench)
     params = ForceArmParams
+    settings: ForceArmParams
 
     def __init__(self, context: LevelContext) -> None:
-        params = read_params(ForceArmParams, context.params)
         super().__init__(context)
         assert self.cell.wrist is not None, "`misfits` refuses an arm without a sensor"
         self._most = self.cell.wrist.most
-        self._on_limit = Reaction[params.on_force_limit.upper()]
+        self._on_limit = Reaction[self.settings.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
         self._exact = self.cell.encoders.exact
         # (joints,), rad/s: velocities at the tick before.
@@ -189,9 +188,9 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         self._before[:] = self._velocity
         self._since = self.arm.tick
 
-    def terms(self) -> Terms:
+    def find_terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with what the gripper holds, and with
         the contact."""
-        terms = super().terms()
+        terms = super().find_terms()
         terms.bias[:] -= self.contact.torque
         return terms

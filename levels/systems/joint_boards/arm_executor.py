@@ -4,7 +4,6 @@ brakes it."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,14 +14,12 @@ from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output, Read
 from rack.levels.messages import ArmState
 from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.dynamics import Payload, Terms
-from rack.levels.servo.control import ArmParams
+from rack.levels.robot.dynamics import Payload
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver, Course, numbers
 from rack.levels.servo.reference import ASTRAY_RAD
 from rack.levels.servo.stopping import Reaction
 from rack.levels.systems.joint_boards.messages import ArmStatus, JointTorque
-from rack.levels.tables import read_params
 
 HELD = "held by the operator; `resume` releases it"
 
@@ -80,10 +77,9 @@ class ArmExecutor(ArmDriver):
     state = Output(ArmState)
     scene = SCENES
     commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
-    params: ClassVar[type[ArmParams]] = ArmParams
 
     def __init__(self, context: LevelContext) -> None:
-        super().__init__(context, read_params(self.params, context.params))
+        super().__init__(context)
         limits = self.cell.limits
         self.joints = JointTorques(context, self.cell)
         self.orders = Orders(self.commands)
@@ -193,20 +189,19 @@ class ArmExecutor(ArmDriver):
         self._rest_by = None
         super().brake()
 
-    def terms(self) -> Terms:
-        """Return the equation of motion at the sensed state, with what the gripper holds."""
-        return self.arm.dynamics.terms(
-            self.sensors.position, self.sensors.velocity, self.joints.payload
-        )
-
-    def torques(self, wanted: Motion, sensed: Sensed, terms: Terms) -> tuple[Array, float]:
+    def efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
         """Return the torques of the boards above, N m, and their grip force, N."""
         return self.joints.torque, self.joints.grip_force
 
     @property
+    def payload(self) -> Payload:
+        """What the gripper holds, by the boards above."""
+        return self.joints.payload
+
+    @property
     def holds(self) -> bool:
         """Whether the gripper holds a part, by the boards above."""
-        return self.joints.payload.mass > 0.0
+        return self.payload.mass > 0.0
 
     @property
     def has_work(self) -> bool:

@@ -13,6 +13,7 @@ from rack.boards.config import CONFIGS, FAULTS, load, names
 from rack.boards.config.files import assembled, with_faults
 from rack.boards.config.reference import Key, find_tables, key_tables
 from rack.boards.errors import ConfigError
+from tests.boards.conftest import MakeConfig
 
 DIMENSIONLESS = {
     *(
@@ -122,6 +123,14 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
     path.write_text('extends = ["small.toml"]\n[board.upper]\nexecutor = "two_levels:Nobody"\n')
     with pytest.raises(ConfigError, match="has no class 'Nobody'"):
         reference(path)
+
+
+def test_the_events_of_a_users_own_level_are_in_the_reference(config: MakeConfig) -> None:
+    assert not [table for table in key_tables(config()) if table.name.endswith(".findings")]
+    surf = config("board.wave.executor=wave_levels:Surf")
+    (table,) = find_tables("board.wave.findings", surf)
+    assert table.heading == "(events of board.wave)"
+    assert table.keys == (Key("breaker", "number", "m", "", "", "the wave breaks"),)
 
 
 def test_an_unknown_table_is_refused_with_the_known_tables() -> None:

@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 
 from rack.backplane.address_map import CLOCK
+from rack.backplane.errors import DamageError
 from rack.backplane.fault_table import FaultTable
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.watch.alarms import BY_DEMAND, MISSES, NO_TORQUE, Alarm, AlarmWriter, alarm_ring
@@ -15,7 +16,7 @@ from rack.backplane.words import Demand
 from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
 from rack.boards.config.faults import injections
-from rack.boards.config.published import PublishedLevel
+from rack.boards.config.published import PublishedFinding, PublishedLevel
 from rack.boards.crate.alarm_events import AlarmEvents
 from rack.boards.events import Event
 from rack.levels.messages import Error
@@ -24,6 +25,10 @@ from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
 JOINTS = ("shoulder", "elbow")
+FINDINGS = (
+    PublishedFinding("own", "1", "a number of its own"),
+    PublishedFinding("contact", "N m", "the arm touches something"),
+)
 FAULTS = (
     {"kind": "mute", "board": "wave", "mailbox": "wave.status", "for": "100ms"},
     {"kind": "sensor-bias", "board": "driven", "joint": 1, "size": 0.1},
@@ -66,7 +71,8 @@ def alarm_events(
     geom: Callable[[int], str] = str,
     names: tuple[str, ...] = ("first", "second"),
 ) -> AlarmEvents:
-    return AlarmEvents(segment, JOINTS, geom, {"wave": PublishedLevel(names=names)})
+    wave = PublishedLevel(names=names, findings=FINDINGS)
+    return AlarmEvents(segment, JOINTS, geom, {"wave": wave})
 
 
 def heard(
@@ -76,11 +82,42 @@ def heard(
     subject: int = -1,
     value: float = 0.0,
     since: int | None = None,
+    text: str = "",
 ) -> Event:
     """Ring an alarm at tick 400 and return the event that it makes."""
-    AlarmWriter(segment, owner).ring(400, alarm, subject, value, since)
+    AlarmWriter(segment, owner).ring(400, alarm, subject, value, since, text)
     row = alarm_ring(segment, owner).drain().rows[-1]
     return alarm_events(segment).of(row, owner)
+
+
+@pytest.mark.parametrize(
+    ("number", "said", "text"),
+    [
+        (0, "", "own: 3.25, a number of its own"),
+        (1, "", "contact: 3.25 N m, the arm touches something"),
+        (1, "gripper\x1b[2J", r"contact: 3.25 N m, gripper\x1b[2J"),
+        (1, "ü" * 100, f"contact: 3.25 N m, {'ü' * 72}"),
+    ],
+)
+def test_a_finding_of_a_levels_own_has_its_name_value_and_unit(
+    segment: Segment, number: int, said: str, text: str
+) -> None:
+    event = heard(segment, "wave", Alarm.OWN, number, 3.25, text=said)
+    assert (event.kind, event.code, event.board, event.value, event.text) == (
+        "detection",
+        FINDINGS[number].name,
+        "wave",
+        3.25,
+        text,
+    )
+
+
+@pytest.mark.parametrize(("owner", "number"), [("wave", 2), ("watch", 0)])
+def test_a_finding_that_no_level_has_declared_is_damage(
+    segment: Segment, owner: str, number: int
+) -> None:
+    with pytest.raises(DamageError, match=f"{number} is not the number of a finding"):
+        heard(segment, owner, Alarm.OWN, number)
 
 
 # Operator commands come from the operator table: see test_operator.py and test_desk.py.

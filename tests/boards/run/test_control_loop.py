@@ -12,6 +12,7 @@ from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import Flag, trace_ring
+from rack.backplane.watch.alarms import Alarm, alarm_ring
 from rack.backplane.words import Block, Slot, System
 from rack.boards.classes import find_class
 from rack.boards.config import Resolved, resolve
@@ -207,3 +208,18 @@ def test_the_load_of_a_fault_is_computed_in_its_cycle(bench: MakeBench) -> None:
     wave.cycle(0)
     assert entry.count == 1
     assert entry.struck_tick == 0
+
+
+def test_a_finding_of_a_levels_own_is_one_alarm_an_episode(bench: MakeBench) -> None:
+    breaks = [*range(30), 49, 70, 100]
+    rack = bench("board.wave.executor=wave_levels:Surf", f"board.wave.params.breaks={breaks}")
+    wave = rack.task("wave")
+    for tick in range(110):
+        rack.to(tick)
+        wave.cycle(tick)
+    rows = alarm_ring(rack.segment, "wave").drain().rows
+    assert set(rows["code"]) == {Alarm.OWN}
+    # It begins anew when it was not found for more than 20 cycles.
+    assert [(int(row["tick"]), bytes(row["text"]).decode()) for row in rows] == [
+        (tick, f"tick {tick}") for tick in (0, 70, 100)
+    ]

@@ -13,7 +13,7 @@ from rack.boards.faults import KINDS
 from rack.levels.algebra import Array
 from rack.levels.level import Fault, Finding
 from rack.levels.messages import JointCommand
-from rack.levels.servo import ServoExecutor, ServoPlanner
+from rack.levels.servo import ServoExecutor, ServoLaw, ServoPlanner
 from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.lockstep import CLOCK_NS, BoardSpec, Lockstep
 
@@ -49,7 +49,7 @@ class ServoRig:
     """Runs executor and planner of the servo level tick by tick; the set points come from a
     function of time."""
 
-    executor: type[ServoExecutor] = ServoExecutor
+    executor: type[ServoLaw] = ServoExecutor
     outside: Mapping[str, type[Message]] = {"primitive.command": JointCommand}
     """Mailboxes that the test writes."""
 

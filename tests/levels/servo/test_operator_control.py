@@ -133,7 +133,7 @@ def test_gains_act_from_the_cycle_after_their_tick_and_survive_a_restart() -> No
     assert (after[0] != after[1]).any(axis=1).all()
     tuned.restart()
     tuned.torques(1, QUICK.at)
-    assert tuned.servo.given.bandwidth == 300.0
+    assert tuned.servo.settings.bandwidth == 300.0
 
 
 @pytest.mark.slow

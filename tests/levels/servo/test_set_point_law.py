@@ -59,7 +59,7 @@ def test_it_follows_a_course(tmp_path: Path, interface: Interface, arm: str) -> 
     assert not servo.alarms()
     assert (servo.status.clipped, servo.status.violations) == (0, 0)
     # It says what torque was predicted for the motion: at rest that of gravity.
-    holding = servo.servo.terms().bias
+    holding = servo.servo.terms.bias
     assert servo.status.torque == pytest.approx(holding, abs=0.3)
 
 
@@ -130,7 +130,7 @@ def test_a_drive_that_does_not_follow_is_a_motor_fault(
     servo.run(100, COURSE.at)
     found = servo.found[0].finding
     assert (found.alarm, found.subject) == (Alarm.ACTUATOR, 1)
-    assert abs(found.value) == pytest.approx(servo.servo.given.following, rel=0.3)
+    assert abs(found.value) == pytest.approx(servo.servo.settings.following, rel=0.3)
     assert servo.status.error == Error.NONE
     assert "motor of 'elbow'" in servo.status.reason
 

@@ -1,0 +1,36 @@
+"""A servo law of your own: one method. All else of a servo level is inherited.
+
+`rack.levels.servo.ServoLaw` says what that is.
+"""
+
+from __future__ import annotations
+
+from rack.levels import Live, Positive
+from rack.levels.algebra import Array
+from rack.levels.servo import LawParams, Motion, SensedMotion, ServoLaw
+
+
+class MyServoParams(LawParams):
+    """What `[board.servo.params]` may hold, besides what any servo law has."""
+
+    stiffness: Live[Positive] = 2500.0
+    """acceleration for an error of one rad, 1/s2"""
+    damping: Live[Positive] = 100.0
+    """acceleration against an error of one rad/s, 1/s"""
+
+
+class MyServo(ServoLaw):
+    """Drives every joint by itself: PD control, and compensation of gravity."""
+
+    params = MyServoParams
+    settings: MyServoParams
+
+    def torques(self, set_point: Motion, sensed: SensedMotion) -> Array:
+        """Return the torques, (joints,), N m."""
+        gains = self.settings
+        error = set_point.position - sensed.position
+        slip = set_point.velocity - sensed.velocity
+        inertia, bias = self.terms
+        wanted = gains.stiffness * error + gains.damping * slip  # rad/s2
+        torque: Array = inertia.diagonal() * wanted + bias
+        return torque

@@ -1,0 +1,126 @@
+"""`rack new`: what it writes runs, and passes its test, as it is."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from rack.tools.commands.new import TEMPLATES
+from tests.tools.command_line import rack
+
+BOUND_S = 100
+KINDS = ("level", "servo", "planner")
+
+
+NUMBERS = count()
+
+
+@pytest.fixture
+def name() -> str:
+    """A name that no other module of this process has, nor a rack of another one."""
+    return f"soft_touch_{os.getpid()}_{next(NUMBERS)}"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
+    kind: str, name: str, tmp_path: Path
+) -> None:
+    assert rack("new", kind, f"my_{kind}", folder=tmp_path).returncode == 0
+    done = rack("new", kind, name, "--json", folder=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    files = [tmp_path / file for file in json.loads(done.stdout)["files"]]
+    assert sorted(files) == sorted((tmp_path / name).iterdir())
+    assert {file.name for file in files} == {f"{name}.py", f"{name}.toml", f"test_{name}.py"}
+    assert not [file for file in files if re.search(f"my_{kind}|My[A-Z]", file.read_text())]
+    camel = name.title().replace("_", "")
+    assert f"class {camel}(" in (tmp_path / name / f"{name}.py").read_text()
+    done = rack("check", f"{name}/{name}.toml", folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_it_writes_runs_and_passes_its_test(kind: str, name: str, tmp_path: Path) -> None:
+    done = rack("new", kind, name, folder=tmp_path)
+    assert f"next: rack run {name}/{name}.toml --lockstep --seconds 2; pytest {name}" in done.stdout
+    run = [*("run", f"{name}/{name}.toml", "--lockstep", "--seconds", "2", "--no-record")]
+    done = rack(*run, folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    test = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", name]
+    tested = subprocess.run(
+        test, cwd=tmp_path, capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
+    assert "1 passed" in tested.stdout, tested.stdout + tested.stderr
+
+
+@pytest.mark.slow
+def test_a_new_level_reports_its_own_event_once_its_live_limit_is_set(
+    name: str, tmp_path: Path
+) -> None:
+    rack("new", "level", name, folder=tmp_path)
+    setting = f"command=[{{level='{name}', what='set', name='limit=0.01', tick=400}}]"
+    run = [name, "--lockstep", "--seconds", "6", "--set", setting, "--out", "recorded"]
+    done = rack("run", *run, folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "a joint is faster than the limit" in done.stdout
+    report = json.loads((tmp_path / "recorded" / "report.json").read_text())
+    (found,) = (one for one in report["unexplained"] if one["code"] == "fast")
+    assert found["board"] == name
+    assert found["text"].startswith("fast: 0.0")
+    assert "rad/s, a joint is faster than the limit" in found["text"]
+    schema = rack("schema", f"board.{name}.findings", "--config", name, folder=tmp_path)
+    assert "a joint is faster than the limit" in schema.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("", "permitted: a-z, 0-9 and '_'"),
+        ("3d", "permitted: a-z, 0-9 and '_'"),
+        ("class", "permitted: a-z, 0-9 and '_'"),
+        ("a-b", "permitted: a-z, 0-9 and '_'"),
+        ("../up", "permitted: a-z, 0-9 and '_'"),
+        ("Upper", "permitted: a-z, 0-9 and '_'"),
+        ("a" * 41, "permitted: a-z, 0-9 and '_'"),
+        ("json", "an installed module has that name"),
+        ("nasrem", "a bundled config, or a board of nasrem, has that name"),
+        ("servo", "a bundled config, or a board of nasrem, has that name"),
+        ("executor", "its class Executor would have the name of one that it uses"),
+        ("answering", "its class AnsweringStatus would have the name of one that it uses"),
+    ],
+)
+def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, why: str, tmp_path: Path) -> None:
+    done = rack("new", "level", name, folder=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f'NAME = "{name}": {why}')
+    assert done.stderr.count("\n") == 1
+    assert not [*tmp_path.iterdir()]
+
+
+def test_what_is_there_stays_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "mine.py").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "nowhere").symlink_to("missing")
+    for taken in ("mine", "file", "nowhere"):
+        done = rack("new", "level", "mine", "--out", taken, folder=tmp_path)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert f"'{taken}' is there already" in done.stderr
+    assert [*(tmp_path / "mine").iterdir()] == [tmp_path / "mine" / "mine.py"]
+    assert (tmp_path / "mine" / "mine.py").read_text() == "mine"
+
+
+def test_each_template_is_three_files() -> None:
+    for kind in KINDS:
+        assert sorted(path.name for path in (TEMPLATES / kind).iterdir() if path.is_file()) == [
+            f"my_{kind}.py",
+            f"my_{kind}.toml",
+            f"test_my_{kind}.py",
+        ]

@@ -1,0 +1,95 @@
+"""`rack new`: a level, a servo law or a planner of one's own to start from."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from rack.backplane.rack_name import is_free_name
+from rack.boards.config import CONFIGS, load, names
+from rack.tools.console.answer import Failure, print_answer
+from rack.tools.console.parameters import Json
+
+TEMPLATES = CONFIGS / "new"
+
+
+def new(
+    kind: Annotated[
+        Literal["level", "servo", "planner"],
+        typer.Argument(metavar="KIND", help="level, servo or planner"),
+    ],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="name of the Python module, as in my_level")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="new folder; default: NAME")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a folder with a class, a config that adds it to nasrem, and a test.
+
+    A level reads and writes messages, and has a live parameter and an event of its own. A servo
+    law is one method: torques from set points and sensed motion. A planner works in the background
+    of a level that reads its plans. Each runs, and passes its test, as it is.
+
+    Exit status: 0 written; 2 NAME cannot be a module, or the folder is there already; then nothing
+    is written.
+
+    \b
+    Examples:
+      rack new level my_level && rack run my_level --lockstep --seconds 2
+      rack new servo my_law && pytest my_law
+      rack new planner my_planner --json
+    """
+    if why := _flaw(kind, name):
+        raise Failure(f'NAME = "{name}": {why}', 2)
+    folder = out or Path(name)
+    written = {
+        folder / path.name.replace(f"my_{kind}", name): _filled(path.read_text(), kind, name)
+        for path in sorted((TEMPLATES / kind).glob("*my_*"))
+    }
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        why = f"'{folder}' is there already; name a folder that is not, by --out"
+        raise Failure(why, 2) from None
+    for path, text in written.items():
+        path.write_text(text, encoding="utf-8")
+    config = folder / f"{name}.toml"
+    document = {"kind": kind, "name": name, "folder": str(folder), "files": list(map(str, written))}
+    lines = (
+        *(f"wrote {path}" for path in written),
+        f"next: rack run {config} --lockstep --seconds 2; pytest {folder}",
+    )
+    print_answer(document, lines, as_json)
+
+
+def _flaw(kind: str, name: str) -> str:
+    """Return why a name cannot be that of the module, its rack and, of a level, its board."""
+    if not is_free_name(name, ()) or not name.isidentifier() or keyword.iskeyword(name):
+        return "permitted: a-z, 0-9 and '_', at most 40, a letter first; no keyword of Python"
+    if name in names() or name in load("nasrem").board:
+        return "a bundled config, or a board of nasrem, has that name"
+    if find_spec(name) is not None:
+        return "an installed module has that name"
+    source = (TEMPLATES / kind / f"my_{kind}.py").read_text()
+    used = re.findall(rf"\b(?!{_class_name(f'my_{kind}')})\w+", source)
+    made = re.findall(r"^class (\w+)", _filled(source, kind, name), re.MULTILINE)
+    for clash in sorted({*made} & {*used}):
+        return f"its class {clash} would have the name of one that it uses"
+    return ""
+
+
+def _class_name(name: str) -> str:
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+def _filled(text: str, kind: str, name: str) -> str:
+    """Return a file of a template with the user's names in place of its own."""
+    theirs = f"my_{kind}"
+    return text.replace(theirs, name).replace(_class_name(theirs), _class_name(name))
