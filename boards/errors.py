@@ -23,6 +23,15 @@ UNKEPT = "no snapshots: "
 """Begins the note of a run that takes none, with the reason after it."""
 
 
+class Failure(Exception):
+    """A command, or a call of a program, that did not work. The message is for the user, `status`
+    the exit status of the command."""
+
+    def __init__(self, reason: str, status: int = 1) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
 class BoardError(Exception):
     """Root of every error this package raises; its text is one line for the user."""
 
@@ -54,13 +63,13 @@ Mistakes = Iterator[Mistake]
 """What a rule yields."""
 
 
-class ConfigError(BoardError):
+class ConfigError(BoardError, Failure):
     """A config that cannot run. `mistakes` holds every mistake found; the text has one line per
     mistake."""
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list({str(mistake): mistake for mistake in mistakes}.values())
-        super().__init__("\n".join(str(mistake) for mistake in self.mistakes))
+        Failure.__init__(self, "\n".join(str(mistake) for mistake in self.mistakes), 2)
 
 
 def shown(value: Any) -> str:

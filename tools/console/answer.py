@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rack.backplane.json_text import encode_json
+from rack.boards.errors import Failure as Failure
 from rack.boards.errors import one_line
 
 Document = dict[str, Any]
@@ -17,22 +18,13 @@ MAX_LINE = 1300
 """Characters of one line of an error message, at most."""
 
 
-class Failure(Exception):
-    """A command that did not work. The message is one line for the user, `status` the exit
-    status."""
-
-    def __init__(self, reason: str, status: int = 1) -> None:
-        super().__init__(reason)
-        self.status = status
-
-
 def exit_status(error: Exception) -> int | None:
     """Return the exit status of an error that the project raises on purpose; None for any other."""
     from rack.backplane.errors import BackplaneError
-    from rack.boards.errors import BoardError, ConfigError, SnapshotError
+    from rack.boards.errors import BoardError, SnapshotError
     from rack.levels.errors import LevelError
 
-    if isinstance(error, ConfigError | SnapshotError):
+    if isinstance(error, SnapshotError):
         return 2
     return 1 if isinstance(error, BackplaneError | BoardError | LevelError) else None
 
@@ -42,6 +34,8 @@ def as_failure() -> Iterator[None]:
     """Raise as `Failure` what a command would end with, with the same text and status."""
     try:
         yield
+    except Failure:
+        raise
     except Exception as error:
         status = exit_status(error)
         if status is None:

@@ -89,8 +89,8 @@ class RunResult:
     faults: tuple[Strike, ...]
     clock_offset_ns: int
     refused: dict[str, int]
-    others: tuple[OtherEnd, ...]
-    failed: str
+    others: tuple[OtherEnd, ...] = ()
+    failed: str = ""
 
     @property
     def worked(self) -> bool:
@@ -153,15 +153,7 @@ def run_rack(
             )
             rack.segment.words[System.HOLD_AT] = int(step)
             if folder is not None and recorder is not None:
-                try:
-                    folder.mkdir(parents=True, exist_ok=True)
-                    (folder / "config.toml").write_text(config.text())
-                    write_code(config, folder)
-                    if begins.origin is not None:
-                        begins.origin.write(folder)
-                    log.open(folder / "events.jsonl")
-                except OSError as error:
-                    raise Failure(f"{folder}: {error.strerror}") from None
+                begin_folder(folder, config, log, begins.origin)
                 port = import_module(VIEWER).free_port() if view else None
                 if not recorder.attach(config.name, folder, port, rack.segment.words):
                     log.add(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
@@ -180,37 +172,66 @@ def run_rack(
         recording = "none"
         rows_lost = dict[str, int]()
         if folder is not None and recorder is not None:
-            recording, rows_lost = _compared(
+            recording, rows_lost = compare_recording(
                 folder, segment, recorder.finish(in_a_hurry=INTERRUPT.number != 0), outcome.ticks
             )
         _log_news(news, segment, log)
         failed = others.finish()
-        result = RunResult(
-            rack=config.name,
-            outcome=outcome,
-            wall_s=wall_s,
-            clock_skipped=segment.words[System.CLOCK_SKIPPED],
-            tasks={
-                task.name: {
-                    **{
-                        name.lower(): segment.block(task.name)[getattr(Block, name)]
-                        for name in COUNTED
-                    },
-                    **segment.count_cycles(task, outcome.ticks)._asdict(),
-                }
-                for task in segment.layout.tasks
-            },
-            recording=recording,
-            rows_lost=rows_lost,
-            faults=strikes(segment, config.joints),
-            clock_offset_ns=time.time_ns() - time.monotonic_ns(),
-            refused={queue.mailbox: queue.refused for queue in queue_fills(Newest(segment))},
+        result = replace(
+            result_of(segment, config, outcome, wall_s, recording, rows_lost),
             others=others.ends(),
             failed=failed,
         )
         log.end(asdict(result))
         cut_off = replace(result, recording="events.jsonl ends before the run")
         return cut_off if log.has_failed else result
+
+
+def begin_folder(
+    folder: Path, config: RackConfig, log: EventLog, origin: Origin | None = None
+) -> None:
+    """Write what is known when a run begins into its folder: config, code, the events so far.
+    Raises `Failure`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "config.toml").write_text(config.text())
+        write_code(config, folder)
+        if origin is not None:
+            origin.write(folder)
+        log.open(folder / "events.jsonl")
+    except OSError as error:
+        raise Failure(f"{folder}: {error.strerror}") from None
+
+
+def result_of(
+    segment: Segment,
+    config: RackConfig,
+    outcome: Outcome,
+    wall_s: float,
+    recording: str,
+    rows_lost: dict[str, int],
+) -> RunResult:
+    """Return the result of a run that is over, by the words of its segment."""
+    return RunResult(
+        rack=config.name,
+        outcome=outcome,
+        wall_s=wall_s,
+        clock_skipped=segment.words[System.CLOCK_SKIPPED],
+        tasks={
+            task.name: {
+                **{
+                    name.lower(): segment.block(task.name)[getattr(Block, name)] for name in COUNTED
+                },
+                **segment.count_cycles(task, outcome.ticks)._asdict(),
+            }
+            for task in segment.layout.tasks
+        },
+        recording=recording,
+        rows_lost=rows_lost,
+        faults=strikes(segment, config.joints),
+        clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+        refused={queue.mailbox: queue.refused for queue in queue_fills(Newest(segment))},
+    )
 
 
 def _viewer(port: int) -> News:
@@ -254,7 +275,9 @@ def _watch(
     return rack.outcome
 
 
-def _compared(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str, dict[str, int]]:
+def compare_recording(
+    folder: Path, segment: Segment, why: str, ticks: int
+) -> tuple[str, dict[str, int]]:
     """Compare the files with what the rings say was written; `why` is how the recorder ended.
 
     Return "complete" or what is missing, and the rows missing by task and by mailbox.
