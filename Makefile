@@ -68,6 +68,6 @@ $(STAMP): requirements.lock pyproject.toml
 	@# `rack` as a package: type checkers and editors read no import hook, and a folder called rack in front of it, as a
 	@# clone is in the folder that holds it, is none. They follow the links; Python finds the files themselves.
 	@mkdir -p $(VENV)/src/rack && for floor in $(FLOORS); do ln -sfn ../../../$$floor $(VENV)/src/rack/$$floor; done
-	@ln -sfn ../../../tools/front/__init__.py $(VENV)/src/rack/__init__.py
+	@for file in __init__.py py.typed; do ln -sfn ../../../tools/front/$$file $(VENV)/src/rack/$$file; done
 	@for packages in $(VENV)/lib/python3*/site-packages; do echo ../../../src > $$packages/rack.pth; done
 	@touch $(STAMP)
