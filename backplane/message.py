@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import IntEnum
 from functools import cache
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_type_hints
 
 import numpy as np
@@ -143,10 +142,12 @@ class Message(metaclass=_Slotted):
 
     Array fields are numpy views of `record`: fill them in place (`m.position[:] = q`) or assign
     (`m.position = q`). Scalars read and assign as plain values, texts as `str`, see `text_of`.
-    `record` is the structured array, shape (), `raw` its bytes.
+    A number that an enumeration does not name reads as a plain `int`: no reader fails because
+    another board, or another version of a rack, sent it. `record` is the structured array, shape
+    (), `raw` its bytes.
     """
 
-    __slots__ = ("raw", "record")
+    __slots__ = ("_views", "raw", "record")
     raw: memoryview
     record: np.ndarray
     message_type: ClassVar[MessageType] = MessageType("", 0, ())
@@ -187,8 +188,10 @@ class Message(metaclass=_Slotted):
         raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
         _SET(self, "raw", raw)
         _SET(self, "record", np.frombuffer(raw, dtype=dtype, count=1).reshape(()))
-        for name in dtype.names or ():
-            _SET(self, f"_{name}", self.record[name])
+        views = {name: self.record[name] for name in dtype.names or ()}
+        _SET(self, "_views", views)
+        for name in type(self).__slots__:
+            _SET(self, name, views[name])
 
     @classmethod
     def zeros(cls, sizes: Mapping[str, int]) -> Self:
@@ -207,9 +210,12 @@ class Message(metaclass=_Slotted):
     if not TYPE_CHECKING:
         # A type checker knows the fields of a message class.
         def __setattr__(self, name: str, value: Any) -> None:
+            # Here, in place of a setter per field: that would be a second call.
+            if isinstance(value, str):
+                value = value.encode("ascii", "replace")
             try:
-                _SET(self, name, value)
-            except AttributeError:
+                self._views[name][...] = value
+            except KeyError:
                 raise AttributeError(self._unknown(name)) from None
 
         def __getattr__(self, name: str) -> Any:
@@ -284,39 +290,28 @@ def _greatest(kind: np.dtype) -> float:
 
 @cache
 def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
-    """Return the subclass of a message class with one property per field of this dtype."""
-    names = dtype.names or ()
+    """Return the subclass of a message class for this dtype: a property per scalar, a slot per
+    array and group."""
     declared = {field.name: field for field in cls.message_type.fields}
-    body = {name: _property(f"_{name}", dtype[name], declared.get(name)) for name in names}
+    columns = {name: dtype[name] for name in dtype.names or ()}
+    scalars = {n: column for n, column in columns.items() if not (column.shape or column.names)}
+    body = {name: _scalar(name, column, declared.get(name)) for name, column in scalars.items()}
     kind = cls.message_type
     options = {"version": kind.version, "message": kind.name}
-    slots = tuple(f"_{name}" for name in names)
+    slots = tuple(name for name in columns if name not in scalars)
     made: Any = _Slotted(cls.__name__, (cls,), {"__slots__": slots, **body}, **options)
     return made  # type: ignore[no-any-return]
 
 
-def _property(slot: str, dtype: np.dtype, declared: Field | None) -> property:
-    view = attrgetter(slot)
-
-    def store(self: Message, value: Any) -> None:
-        view(self)[...] = value
-
-    if dtype.shape or dtype.names:
-        return property(view, store)
+def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
     if dtype.kind == "S":
-        size = dtype.itemsize
-
-        def store_text(self: Message, value: str | bytes) -> None:
-            data = value.encode("ascii", "replace") if isinstance(value, str) else value
-            view(self)[...] = data[:size]
-
-        return property(lambda self: text_of(view(self).item()), store_text)
+        return property(lambda self: text_of(self._views[name].item()))
     if declared is not None and declared.python is bool:
-        return property(lambda self: view(self).item() != 0, store)
+        return property(lambda self: self._views[name].item() != 0)
     if declared is not None and not isinstance(declared.unit, str):
         member = {int(each): each for each in declared.unit}.get
-        return property(lambda self: member(value := view(self).item(), value), store)
-    return property(lambda self: view(self).item(), store)
+        return property(lambda self: member(value := self._views[name].item(), value))
+    return property(lambda self: self._views[name].item())
 
 
 def _is_enum(hint: Any, kind: type) -> bool:
