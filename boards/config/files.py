@@ -11,7 +11,7 @@ from typing import Any
 
 from rack.backplane.bounded_toml import MAX_DEPTH
 from rack.backplane.regular_file import read_regular_file
-from rack.boards.config.toml import Setting, Tables, merge, override, parse, table_of
+from rack.boards.config.toml import Tables, merge, override, parse, table_of
 from rack.boards.errors import ConfigError, Mistake
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -29,7 +29,7 @@ EXTENDS = "configs that this file extends, by name or path, in order; its own ke
 
 
 def assembled(
-    name_or_path: str | Path, overrides: Sequence[Setting], faults: str | Path | None
+    name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
 ) -> Tables:
     """Return the tables of a config by name or path, with `key.sub=value` overrides and the faults
     of a script.

@@ -37,7 +37,7 @@ from rack.boards.config.rules.faults import fault_mistakes
 from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAN, LAST_SLOT, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
-from rack.boards.config.toml import Setting, Tables, parse, table_of
+from rack.boards.config.toml import Tables, parse, table_of
 from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -79,10 +79,10 @@ T = TypeVar("T", bound=Table)
 
 
 def load(
-    name_or_path: str | Path, overrides: Sequence[Setting] = (), faults: str | Path | None = None
+    name_or_path: str | Path, overrides: Sequence[str] = (), faults: str | Path | None = None
 ) -> RackConfig:
-    """Return a config by name or path, with overrides such as "clock.speed=2" or
-    ("clock.speed", 2), and add its levels to the import path.
+    """Return a config by name or path, with `key.sub=value` overrides, and add its levels to the
+    import path.
 
     Faults of the script `faults`, by name or path, are appended to its own. Paths in an override
     are relative to the current folder. Raises `ConfigError` with every mistake if a file, a setting

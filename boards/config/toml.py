@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import date
-from datetime import time as clock_time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 
 from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_LONG, load_toml
@@ -23,8 +22,6 @@ FREE_FORM = ("params", "task")
 """Tables of the levels, where an empty list is an ordinary value."""
 
 Tables = dict[str, Any]
-Setting = str | tuple[str, Any]
-"""A setting as text, "key.sub=value", or as key and value of Python."""
 
 
 def parse(text: str, place: str = "config") -> Tables:
@@ -36,18 +33,13 @@ def parse(text: str, place: str = "config") -> Tables:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
     except ValueError as error:
         raise ConfigError([Mistake(place, None, str(error))]) from None
-    return _bounded(tables, place)
-
-
-def _bounded(tables: Tables, place: str) -> Tables:
     if mistakes := list(_out_of_bounds(tables, place)):
         raise ConfigError(mistakes)
     return tables
 
 
 def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
-    """Yield mistakes that are valid TOML, or Python: deep nesting, long integers, NUL in text,
-    dates, other objects."""
+    """Yield mistakes that are valid TOML: deep nesting, long integers, NUL in text, dates."""
     waiting: list[tuple[str, int, Any]] = [
         (f"{place}: {key}", 1, value) for key, value in tables.items()
     ]
@@ -63,13 +55,10 @@ def _out_of_bounds(tables: Tables, place: str) -> Iterator[Mistake]:
             yield Mistake(where, value, TOO_LONG)
         elif isinstance(value, str) and "\0" in value:
             yield Mistake(where, value, "text must not contain NUL")
-        elif isinstance(value, date | clock_time):
+        elif not isinstance(value, str | int | float):
             yield Mistake(
                 where, str(value), "dates and times are not permitted; use a number or quoted text"
             )
-        elif not isinstance(value, str | int | float):
-            what = type(value).__name__
-            yield Mistake(where, str(value), f"{what}; permitted: text, numbers, lists and tables")
 
 
 def to_toml(tables: Mapping[str, Any]) -> str:
@@ -98,12 +87,12 @@ def merge(base: Tables, top: Tables) -> Tables:
 
 
 def override(
-    tables: Tables, settings: Sequence[Setting], mistakes: list[Mistake] | None = None
+    tables: Tables, settings: Sequence[str], mistakes: list[Mistake] | None = None
 ) -> Tables:
-    """Return the tables with each setting applied, in order.
+    """Return the tables with each setting `key.sub=value` applied, in order.
 
-    In "key.sub=value" the value is TOML; any other text is taken as a string. A number in a key is
-    an index into a list, as in `task.action.0.by=30`.
+    Values are TOML; any other text is taken as a string. A number in a key is an index into a list,
+    as in `task.action.0.by=30`.
 
     Args:
         tables: Tables of a config, which are not changed.
@@ -120,41 +109,48 @@ def override(
             keys, value = _parts(setting)
             tables = _put(tables, keys, value)
         except LookupError as error:
-            mistakes.append(_mistake(setting, str(error.args[0])))
+            mistakes.append(Mistake("--set", setting, str(error.args[0])))
         except ConfigError as error:
-            mistakes += [_mistake(setting, mistake.why) for mistake in error.mistakes]
+            mistakes += [Mistake("--set", setting, mistake.why) for mistake in error.mistakes]
     if mistakes and raises:
         raise ConfigError(mistakes)
     return tables
 
 
-def settings_of(tables: Mapping[str, Any], outer: str = "") -> Iterator[Setting]:
-    """Yield the settings in tables of Python values, whose keys may be dotted."""
+def settings_of(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
+    """Yield the settings in tables of Python values, whose keys may be dotted, as `override` takes
+    them. Raises `ConfigError` for a value that is none of TOML."""
     for key, value in tables.items():
         if isinstance(value, Mapping) and value:
             yield from settings_of(value, f"{outer}{key}.")
         else:
-            yield f"{outer}{key}", value
+            try:
+                yield f"{outer}{key}={_inline(value)}"
+            except TypeError as error:
+                raise ConfigError([Mistake("settings", f"{outer}{key}", str(error))]) from None
 
 
-def _mistake(setting: Setting, why: str) -> Mistake:
-    if isinstance(setting, str):
-        return Mistake("--set", setting, why)
-    key, value = setting
-    return Mistake("settings", f"{key}={value}", why)
+def _inline(value: Any) -> str:
+    """Return a Python value as TOML on one line; an array of numpy as a list, a path as text."""
+    if isinstance(value, Mapping):
+        items = (f"{_inline(str(key))} = {_inline(item)}" for key, item in value.items())
+        return f"{{{', '.join(items)}}}"
+    if isinstance(value, np.ndarray | list | tuple):
+        return f"[{', '.join(map(_inline, value))}]"
+    plain = str(value) if isinstance(value, Path) else value
+    plain = plain.item() if isinstance(plain, np.generic) else plain
+    return tomli_w.dumps({"value": plain}).partition("=")[2].strip()
 
 
-def _parts(setting: Setting) -> tuple[list[str], Any]:
+def _parts(setting: str) -> tuple[list[str], Any]:
     """Return the keys and the value of a setting. Raises `LookupError` and `ConfigError`."""
-    text = setting if isinstance(setting, str) else f"{setting[0]}="
-    found = SETTING.fullmatch(text)
-    if found is None or "\0" in text or (found[2] and not isinstance(setting, str)):
+    found = SETTING.fullmatch(setting)
+    if found is None or "\0" in setting:
         raise LookupError("must be key=value, as in clock.speed=2")
     parts = re.findall(PART, found[1])
     if len(parts) > MAX_DEPTH:
         raise LookupError(TOO_DEEP)
-    value = _value(found[2]) if isinstance(setting, str) else _from_python(setting[1])
-    return [_key(part) for part in parts], value
+    return [_key(part) for part in parts], _value(found[2])
 
 
 def _key(part: str) -> str:
@@ -174,22 +170,6 @@ def _value(text: str) -> Any:
     except ValueError:
         pass  # valid TOML, but out of bounds: `parse` gives the reason
     return parse(f"value = {text}")["value"]
-
-
-def _from_python(value: Any) -> Any:
-    return _bounded({"value": _as_toml(value)}, "config")["value"]
-
-
-def _as_toml(value: Any) -> Any:
-    """Return a value with tables, lists, texts and numbers in place of what is like them."""
-    if isinstance(value, Mapping):
-        return {str(key): _as_toml(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_as_toml(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    # Arrays and numbers of numpy.
-    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _put(node: Any, keys: list[str], value: Any) -> Any:

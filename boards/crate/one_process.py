@@ -27,7 +27,6 @@ from rack.backplane.mailbox.slots import message_dtype
 from rack.backplane.message import AnyMessage, Message
 from rack.boards.classes import find_class
 from rack.boards.config import RackConfig, load, resolve
-from rack.boards.config.toml import Setting
 from rack.boards.errors import LaunchError
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner, Reading, Verdict
@@ -61,7 +60,7 @@ class OneProcess:
         self._cycles = [(*task.spec.grid, task.cycle) for task in self._tasks]
 
     @classmethod
-    def from_file(cls, config: str | Path, overrides: Sequence[Setting] = ()) -> Self:
+    def from_file(cls, config: str | Path, overrides: Sequence[str] = ()) -> Self:
         """Return the rack of a config, by name or path, with overrides as in `load`."""
         return cls(load(config, overrides))
 

@@ -28,7 +28,6 @@ from rack.boards.config.commands import asked, request
 from rack.boards.config.outside import outside
 from rack.boards.config.resolved import classes, load, resolve
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.toml import Setting
 from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.crate.clean import remove_dead, remove_own
 from rack.boards.crate.heartbeat import Heartbeat
@@ -138,7 +137,7 @@ class Rack:
         return self._journal.events
 
     @classmethod
-    def from_file(cls, name_or_path: str | Path, overrides: Sequence[Setting] = ()) -> Self:
+    def from_file(cls, name_or_path: str | Path, overrides: Sequence[str] = ()) -> Self:
         """Return the rack of a config, by name or path. Raises `ConfigError` with every mistake."""
         return cls(load(str(name_or_path), overrides))
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from rack.boards import Rack as CrateRack
 from rack.boards.config.resolved import load
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.toml import Setting, settings_of
+from rack.boards.config.toml import settings_of
 from rack.boards.events import Event
 from rack.tools.live.display import Display
 from rack.tools.live.folder import EventLog, folder_of
@@ -35,7 +36,7 @@ class Rack(CrateRack):
         config: str | Path | RackConfig,
         *,
         lockstep: bool = False,
-        settings: Mapping[str, Any] | Sequence[str] = (),
+        settings: Mapping[str, Any] = MappingProxyType({}),
         faults: str | Path | None = None,
         out: str | Path | None = None,
         on_event: Callable[[Event], None] | None = None,
@@ -47,7 +48,7 @@ class Rack(CrateRack):
             lockstep: Start a tick only when every due task has finished: exact and repeatable.
             settings: Values in place of the config's, by dotted keys or nested:
                 {"clock.speed": 2} or {"clock": {"speed": 2}}. A key that contains a dot is quoted,
-                as in TOML. Or texts, as of --set: ["clock.speed=2"].
+                as in TOML.
             faults: A fault script by name or path.
             out: Folder into which the run is recorded, as `rack run` does; it is created, and must
                 be empty. None: the run is not recorded.
@@ -57,11 +58,7 @@ class Rack(CrateRack):
             ConfigError: The config, a setting or a fault has mistakes: all of them.
             Failure: `out` holds files already.
         """
-        wanted: list[Setting] = [*settings]
-        if isinstance(settings, Mapping):
-            wanted = [*settings_of(settings)]
-        if lockstep:
-            wanted.append(("clock.mode", "lockstep"))
+        wanted = [*settings_of(settings), *["clock.mode=lockstep"] * lockstep]
         if not isinstance(config, RackConfig):
             config = load(config, wanted, faults)
         elif wanted or faults is not None:
