@@ -31,7 +31,6 @@ from rack.backplane.message_type import Field, MessageType
 REASON_BYTES = 120
 COMMAND_ID = "id"
 """First field of every command: its serial."""
-_SET = object.__setattr__
 B = TypeVar("B", bound="Message")
 _KINDS: Mapping[type, tuple[str, str]] = {
     bool: ("u1", "u"),
@@ -124,20 +123,11 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
         fields: What `field` returns, by name.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
-    made: Any = _Slotted(name, (base,), body, version=version, message=name)
+    made: Any = type(name, (base,), body, version=version, message=name)
     return made  # type: ignore[no-any-return]
 
 
-class _Slotted(type):
-    """Gives classes no attributes besides their slots: a misspelt field is an error."""
-
-    def __new__(
-        cls, name: str, bases: tuple[type, ...], body: dict[str, Any], **options: Any
-    ) -> _Slotted:
-        return super().__new__(cls, name, bases, {"__slots__": (), **body}, **options)
-
-
-class Message(metaclass=_Slotted):
+class Message:
     """A local copy of one message: a mailbox reads into it or writes from it.
 
     Array fields are numpy views of `record`: fill them in place (`m.position[:] = q`) or assign
@@ -147,7 +137,6 @@ class Message(metaclass=_Slotted):
     (), `raw` its bytes.
     """
 
-    __slots__ = ("_views", "raw", "record")
     raw: memoryview
     record: np.ndarray
     message_type: ClassVar[MessageType] = MessageType("", 0, ())
@@ -168,7 +157,8 @@ class Message(metaclass=_Slotted):
         hints = get_type_hints(cls) if own else {}
         for name, declaration in own.items():
             try:
-                if name.startswith("_") or hasattr(Message, name) or name not in hints:
+                is_taken = hasattr(Message, name) or name in Message.__annotations__
+                if name.startswith("_") or is_taken or name not in hints:
                     raise ValueError(
                         "permitted: annotated, no leading '_', no attribute of Message"
                     )
@@ -181,17 +171,14 @@ class Message(metaclass=_Slotted):
         cls.message_type = MessageType(known_as, version, tuple(fields.values()))
 
     def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Self:  # noqa: D102  # as the class
-        made: Self = object.__new__(_resolved(cls, dtype))
+        made: Self = object.__new__(_resolved(cls, dtype))  # type: ignore[arg-type]
         return made
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
         raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
-        _SET(self, "raw", raw)
-        _SET(self, "record", np.frombuffer(raw, dtype=dtype, count=1).reshape(()))
-        views = {name: self.record[name] for name in dtype.names or ()}
-        _SET(self, "_views", views)
-        for name in type(self).__slots__:
-            _SET(self, name, views[name])
+        record = np.frombuffer(raw, dtype=dtype, count=1).reshape(())
+        views = {name: record[name] for name in dtype.names or ()}
+        self.__dict__.update(views, raw=raw, record=record, _views=views)
 
     @classmethod
     def zeros(cls, sizes: Mapping[str, int]) -> Self:
@@ -210,13 +197,13 @@ class Message(metaclass=_Slotted):
     if not TYPE_CHECKING:
         # A type checker knows the fields of a message class.
         def __setattr__(self, name: str, value: Any) -> None:
-            # Here, in place of a setter per field: that would be a second call.
-            if isinstance(value, str):
-                value = value.encode("ascii", "replace")
+            # One call for all fields: the setter of a property would be a second one.
             try:
                 self._views[name][...] = value
             except KeyError:
                 raise AttributeError(self._unknown(name)) from None
+            except UnicodeEncodeError:
+                self._views[name][...] = value.encode("ascii", "replace")
 
         def __getattr__(self, name: str) -> Any:
             raise AttributeError(self._unknown(name))
@@ -290,16 +277,17 @@ def _greatest(kind: np.dtype) -> float:
 
 @cache
 def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
-    """Return the subclass of a message class for this dtype: a property per scalar, a slot per
-    array and group."""
+    """Return the subclass of a message class with a property per scalar of this dtype."""
     declared = {field.name: field for field in cls.message_type.fields}
     columns = {name: dtype[name] for name in dtype.names or ()}
-    scalars = {n: column for n, column in columns.items() if not (column.shape or column.names)}
-    body = {name: _scalar(name, column, declared.get(name)) for name, column in scalars.items()}
+    body = {
+        name: _scalar(name, column, declared.get(name))
+        for name, column in columns.items()
+        if not (column.shape or column.names)
+    }
     kind = cls.message_type
     options = {"version": kind.version, "message": kind.name}
-    slots = tuple(name for name in columns if name not in scalars)
-    made: Any = _Slotted(cls.__name__, (cls,), {"__slots__": slots, **body}, **options)
+    made: Any = type(cls.__name__, (cls,), body, **options)
     return made  # type: ignore[no-any-return]
 
 
