@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from difflib import get_close_matches
 from enum import IntEnum
 from functools import cache
@@ -41,6 +41,9 @@ _KINDS: Mapping[type, tuple[str, str]] = {
     np.ndarray: ("f8", "iufS"),
 }
 """By type of a field: its numpy type unless the field states another, and the kinds permitted."""
+_UNITS = {bool: "1", str: "ASCII"}
+_UNSTATED = "unstated"
+"""The unit, of any other type, of a field that states none."""
 
 
 class State(IntEnum):
@@ -53,44 +56,11 @@ class State(IntEnum):
     HOLDING = 4  # has work but must wait; `reason` says for what, and what ends the wait
 
 
-@dataclass(frozen=True)
-class Declaration:
-    """What `field` says of a field of a message class; its name and type stand beside it."""
-
-    kind: str | type[Message]
-    unit: str | type[IntEnum] | None
-    doc: str
-    shape: tuple[int | str, ...]
-    length: tuple[float, float] | None
-    default: Any
-
-    def named(self, name: str, hint: Any) -> Field:
-        """Return the field of this name and annotated type. Raises `ValueError` with a reason."""
-        if isinstance(self.kind, type):
-            group = self.kind.message_type
-            return Field(name, group, "", self.doc, self.shape)
-        python = next((kind for kind in _KINDS if hint is kind or _is_enum(hint, kind)), np.ndarray)
-        usual, permitted = _KINDS[python]
-        kind = self.kind or usual
-        if np.dtype(kind).kind not in permitted:
-            raise ValueError(f"numpy type '{kind}' does not hold {_name(hint)}")
-        if (python is np.ndarray) != bool(self.shape):
-            raise ValueError(f"shape {self.shape} does not suit {_name(hint)}")
-        unit = hint if python is IntEnum else self.unit
-        if unit is None:
-            unit = {bool: "1", str: "ASCII"}.get(python)
-        if unit is None:
-            raise ValueError('has no unit; of a pure number it is "1"')
-        if self.default is not None and not _holds(kind, self.default):
-            raise ValueError(f"default {self.default!r} does not fit numpy type '{kind}'")
-        return Field(name, kind, unit, self.doc, self.shape, self.length, python, self.default)
-
-
 def field(
     kind: str | type[Message] = "",
     *,
     doc: str,
-    unit: str | type[IntEnum] | None = None,
+    unit: str | type[IntEnum] = _UNSTATED,
     shape: int | str | tuple[int | str, ...] = (),
     length: tuple[float, float] | None = None,
     default: Any = None,
@@ -110,7 +80,30 @@ def field(
         default: Value in the first message that a level writes; otherwise all bytes are 0.
     """
     sizes = shape if isinstance(shape, tuple) else (shape,)
-    return Declaration(kind, unit, doc, sizes, length, default)
+    stored = kind if isinstance(kind, str) else kind.message_type
+    return Field("", stored, unit, doc, sizes, length, default=default)
+
+
+def _named(declared: Field, name: str, hint: Any) -> Field:
+    """Return a declared field with the name and the annotation that stand beside it. Raises
+    `ValueError` with a reason."""
+    if isinstance(declared.kind, MessageType):
+        return replace(declared, name=name, unit="")
+    is_name = isinstance(hint, type) and issubclass(hint, IntEnum)
+    python = IntEnum if is_name else hint if hint in _KINDS else np.ndarray
+    usual, permitted = _KINDS[python]
+    kind = declared.kind or usual
+    if np.dtype(kind).kind not in permitted:
+        raise ValueError(f"numpy type '{kind}' does not hold {_name(hint)}")
+    if (python is np.ndarray) != bool(declared.shape):
+        raise ValueError(f"shape {declared.shape} does not suit {_name(hint)}")
+    unit = hint if python is IntEnum else _UNITS.get(python, declared.unit)
+    if unit == _UNSTATED:
+        raise ValueError('has no unit; of a pure number it is "1"')
+    default = declared.default
+    if default is not None and not _holds(kind, default):
+        raise ValueError(f"default {default!r} does not fit numpy type '{kind}'")
+    return replace(declared, name=name, kind=kind, unit=unit, python=python)
 
 
 def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
@@ -153,16 +146,16 @@ class Message:
             MailboxError: No message may have such a field.
         """
         fields = {f.name: f for base in cls.__bases__ for f in base.message_type.fields}  # type: ignore[attr-defined]
-        own = {name: d for name, d in vars(cls).items() if isinstance(d, Declaration)}
+        own = {name: d for name, d in vars(cls).items() if isinstance(d, Field)}
         hints = get_type_hints(cls) if own else {}
-        for name, declaration in own.items():
+        for name, declared in own.items():
             try:
                 is_taken = hasattr(Message, name) or name in Message.__annotations__
                 if name.startswith("_") or is_taken or name not in hints:
                     raise ValueError(
                         "permitted: annotated, no leading '_', no attribute of Message"
                     )
-                fields[name] = declaration.named(name, hints[name])
+                fields[name] = _named(declared, name, hints[name])
             except (TypeError, ValueError) as error:
                 raise MailboxError(
                     f"message class {cls.__name__}: field '{name}': {error}"
@@ -300,10 +293,6 @@ def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
         member = {int(each): each for each in declared.unit}.get
         return property(lambda self: member(value := self._views[name].item(), value))
     return property(lambda self: self._views[name].item())
-
-
-def _is_enum(hint: Any, kind: type) -> bool:
-    return kind is IntEnum and isinstance(hint, type) and issubclass(hint, IntEnum)
 
 
 def _name(hint: Any) -> str:
