@@ -102,8 +102,10 @@ class Rack(CrateRack):
 
     def close(self) -> None:
         """End everything: no process and no segment of this rack is left; finish the recording."""
-        super().close()
         record = self._record
+        if record is not None and self.outcome is not None:
+            record.await_begun()
+        super().close()
         self._record = None
         if record is not None:
             record.finish(self)
@@ -135,6 +137,10 @@ class RunRecord:
             self._add(text)
         for event in () if self._standstill is None else self._standstill.look():
             self.log.add(event)
+
+    def await_begun(self) -> None:
+        """Wait until the recorder has begun: later it would find no rack to attach to."""
+        self._recorder.await_begun()
 
     def finish(self, rack: Rack) -> None:
         """Finish the files of a rack that is closed; of a run that is over, write its outcome."""

@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ import numpy as np
 import pytest
 
 import rack
+from rack.backplane.segment import Segment
 from rack.boards.config import load
 from rack.boards.config.toml import override, settings_of
 from rack.boards.events import Event
+from rack.tools.recording import recorder_process
 from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED
@@ -133,6 +136,27 @@ def test_a_recorded_rack_leaves_the_run_of_the_command(
         assert again.wait(BOUND_S) == outcome
     with pytest.raises(rack.Failure, match="exists already and is not an empty folder"):
         rack.Rack(path, settings=settings, out=out)
+
+
+@pytest.mark.slow
+def test_a_rack_stays_until_its_recorder_has_begun(
+    path: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[float] = []
+    wait: Callable[[RecorderProcess, float], bool] = RecorderProcess.await_begun
+
+    def note(recorder: RecorderProcess, bound_s: float = math.inf) -> bool:
+        # Raises when the rack is gone.
+        with closing(Segment.attach(rack_name)):
+            waits.append(bound_s)
+            return wait(recorder, bound_s)
+
+    monkeypatch.setattr(RecorderProcess, "await_begun", note)
+    settings = {**LOCKSTEP, "name": rack_name}
+    with rack.Rack(path, settings=settings, out=tmp_path / "run") as own:
+        own.run(0.1)
+    assert waits == [recorder_process.ATTACH_S, math.inf]
+    assert Recording(tmp_path / "run").ended["recording"] == "complete"
 
 
 @pytest.mark.slow
