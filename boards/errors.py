@@ -32,7 +32,7 @@ class Failure(Exception):
         self.status = status
 
 
-class BoardError(Exception):
+class BoardError(Failure):
     """Root of every error this package raises; its text is one line for the user."""
 
 
@@ -42,6 +42,9 @@ class LaunchError(BoardError):
 
 class SnapshotError(BoardError):
     """A process that cannot be copied, or a snapshot from which a rack cannot go on."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason, 2)
 
 
 @dataclass(frozen=True)
@@ -63,13 +66,13 @@ Mistakes = Iterator[Mistake]
 """What a rule yields."""
 
 
-class ConfigError(BoardError, Failure):
+class ConfigError(BoardError):
     """A config that cannot run. `mistakes` holds every mistake found; the text has one line per
     mistake."""
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list({str(mistake): mistake for mistake in mistakes}.values())
-        Failure.__init__(self, "\n".join(str(mistake) for mistake in self.mistakes), 2)
+        super().__init__("\n".join(str(mistake) for mistake in self.mistakes), 2)
 
 
 def shown(value: Any) -> str:

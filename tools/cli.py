@@ -246,7 +246,7 @@ def _open_closed_streams() -> None:
 
 def run_commands() -> None:
     """Run the command line in this process, without handling signals."""
-    from rack.tools.console.answer import Failure, exit_status, fail
+    from rack.tools.console.answer import RAISED, Failure, fail
 
     arguments = sys.argv[1:]
     if sys.flags.optimize > 1 and "--help" in arguments:
@@ -267,10 +267,9 @@ def run_commands() -> None:
         if hasattr(error, "show"):
             error.show(usage := StringIO())
             fail(usage.getvalue().rstrip(), 2)
-        known = exit_status(error)
-        if known is None:
+        if not isinstance(error, RAISED):
             raise
-        fail(str(error), known)
+        fail(str(error), 1)
 
 
 def _fail_on_system_error(error: OSError) -> NoReturn:

@@ -8,25 +8,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
+from rack.backplane.errors import BackplaneError
 from rack.backplane.json_text import encode_json
 from rack.boards.errors import Failure as Failure
 from rack.boards.errors import one_line
+from rack.levels.errors import LevelError
 
 Document = dict[str, Any]
 """Plain data, as `--json` prints it and a run's folder holds it."""
 MAX_LINE = 1300
 """Characters of one line of an error message, at most."""
-
-
-def exit_status(error: Exception) -> int | None:
-    """Return the exit status of an error that the project raises on purpose; None for any other."""
-    from rack.backplane.errors import BackplaneError
-    from rack.boards.errors import BoardError, SnapshotError
-    from rack.levels.errors import LevelError
-
-    if isinstance(error, SnapshotError):
-        return 2
-    return 1 if isinstance(error, BackplaneError | BoardError | LevelError) else None
+RAISED = (BackplaneError, LevelError)
+"""What the project raises on purpose besides `Failure`: a command ends with status 1."""
 
 
 @contextmanager
@@ -34,13 +27,8 @@ def as_failure() -> Iterator[None]:
     """Raise as `Failure` what a command would end with, with the same text and status."""
     try:
         yield
-    except Failure:
-        raise
-    except Exception as error:
-        status = exit_status(error)
-        if status is None:
-            raise
-        raise Failure(str(error), status) from None
+    except RAISED as error:
+        raise Failure(str(error)) from None
 
 
 def write_file(path: Path, text: str) -> None:
