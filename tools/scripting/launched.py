@@ -13,13 +13,13 @@ from typing import Any
 from rack.boards import Rack as CrateRack
 from rack.boards.config.resolved import load
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.toml import settings_of
 from rack.boards.events import Event
 from rack.tools.live.display import Display
 from rack.tools.live.folder import EventLog, folder_of
 from rack.tools.live.holds import Standstill
 from rack.tools.live.launch import NO_RECORDER, begin_folder, compare_recording, result_of
 from rack.tools.recording.recorder_process import RecorderProcess
+from rack.tools.scripting.settings import settings_of
 
 
 class Rack(CrateRack):

@@ -18,11 +18,12 @@ import pytest
 import rack
 from rack.backplane.segment import Segment
 from rack.boards.config import load
-from rack.boards.config.toml import override, settings_of
+from rack.boards.config.toml import override
 from rack.boards.events import Event
 from rack.tools.recording import recorder_process
 from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.recording.recording import Recording
+from rack.tools.scripting.settings import settings_of
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S
 
@@ -74,7 +75,7 @@ VALUES = [
 
 @pytest.mark.parametrize("value", VALUES, ids=repr)
 def test_a_value_of_python_is_read_as_it_is(value: object) -> None:
-    assert override({}, [*settings_of({"table": {"key": value}})]) == {"table": {"key": value}}
+    assert override({}, [*settings_of({"table": {"key": value}})], []) == {"table": {"key": value}}
 
 
 def test_arrays_are_lists() -> None:
