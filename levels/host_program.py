@@ -6,8 +6,8 @@ time never waits for it. It reaches the levels only through a bus adapter
 (`rack.boards.host.bus_adapter`), which exchanges at its own rate. The author writes `run`:
 
     class Stroll(HostProgram):
-        motion = HostInput(MotionStatus, "below.motion")
-        requests = HostOutput(MotionRequest)
+        motion = ProgramInput(MotionStatus, "below.motion")
+        requests = ProgramOutput(MotionRequest)
 
         def run(self, bus: Bus) -> None:
             request = self.requests.message
@@ -107,7 +107,7 @@ class HostSender(Protocol[M_co]):
         """Number of messages sent so far, by former processes of this board too."""
 
 
-class HostInput(InputPort[M]):
+class ProgramInput(InputPort[M]):
     """A port that a host program reads: an attribute that is a `HostReceiver`.
 
     Args:
@@ -126,7 +126,7 @@ class HostInput(InputPort[M]):
         raise self.not_connected()
 
 
-class HostOutput(Output[M]):
+class ProgramOutput(Output[M]):
     """A port that a host program writes, the mailbox `<board>.<port>`, for a bus adapter to read:
     an attribute that is a `HostSender`."""
 
@@ -147,9 +147,9 @@ class HostOutput(Output[M]):
 class HostProgram:
     """A program of a host board. `context.every` is 1: it has no rate."""
 
-    inputs: ClassVar[Mapping[str, HostInput[Any]]] = {}
+    inputs: ClassVar[Mapping[str, ProgramInput[Any]]] = {}
     """The ports that it reads, by name: collected from the class and its bases."""
-    outputs: ClassVar[Mapping[str, HostOutput[Any]]] = {}
+    outputs: ClassVar[Mapping[str, ProgramOutput[Any]]] = {}
     """The ports that it writes, likewise."""
     params: ClassVar[type[Table] | None] = None
     """Keys of `[host.<name>.params]`, checked before the launch; None: unchecked, the program reads
@@ -162,9 +162,11 @@ class HostProgram:
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
         cls.outputs = collect_ports(cls, "outputs", (Output,))
         for port in (*cls.inputs.values(), *cls.outputs.values()):
-            if not isinstance(port, HostInput | HostOutput):
+            if not isinstance(port, ProgramInput | ProgramOutput):
                 why = f"port '{port.name}' is a level's {type(port).__name__}"
-                raise LevelError(f"class {cls.__name__}: {why}; permitted: HostInput, HostOutput")
+                raise LevelError(
+                    f"class {cls.__name__}: {why}; permitted: ProgramInput, ProgramOutput"
+                )
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

@@ -15,7 +15,7 @@ BOUND_S = 110
 OWN = '''
 import rack
 from rack.backplane.message import Status, field
-from rack.levels.host_program import Bus, HostInput, HostOutput, HostProgram
+from rack.levels.host_program import Bus, ProgramInput, ProgramOutput, HostProgram
 from rack.levels.level import Executor, Input, Inputs, Output, QueuedOutput
 from rack.levels.messages import ServoStatus
 
@@ -46,8 +46,8 @@ class PowerMeter(Executor):
 
 
 class Program(HostProgram):
-    servo = HostInput(ServoStatus, "below.servo")
-    numbers = HostOutput(PowerStatus)
+    servo = ProgramInput(ServoStatus, "below.servo")
+    numbers = ProgramOutput(PowerStatus)
 
     def run(self, bus: Bus) -> None:
         reveal_type(self.servo.read().message)  # ServoStatus

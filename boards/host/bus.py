@@ -22,7 +22,7 @@ WORD = 8
 LONGEST_S = 1e9
 
 
-class Receiver:
+class BusReceiver:
     """An input of a program, see `HostReceiver`. Its first read returns the newest message
     alone."""
 
@@ -36,7 +36,7 @@ class Receiver:
         return self._reader.with_earlier(reading, before) if before else reading
 
 
-class Sender:
+class BusSender:
     """An output of a program, see `HostSender`."""
 
     def __init__(self, bus: HostBus, writer: HostWriter, kind: type[Message]) -> None:
@@ -98,9 +98,9 @@ class HostBus:
         ports = vars(program)
         for port, mailbox in self._wiring.inputs.items():
             self._segment.message_classes[mailbox] = program.inputs[port].message
-            ports[port] = Receiver(DoubleBufferReader(self._segment, mailbox))
+            ports[port] = BusReceiver(DoubleBufferReader(self._segment, mailbox))
         for port, writer in self._writers.items():
-            ports[port] = Sender(self, writer, program.outputs[port].message)
+            ports[port] = BusSender(self, writer, program.outputs[port].message)
 
     @property
     def tick(self) -> int:

@@ -7,7 +7,7 @@ request.
 
 from collections.abc import Sequence
 
-from rack.levels.host_program import Bus, HostInput, HostOutput, HostProgram
+from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.systems.joint_boards.messages import ArmStatus
 from rack.levels.systems.trajectory.commands import Motions
 from rack.levels.systems.trajectory.messages import MotionRequest, MotionStatus, RequestEnd
@@ -32,9 +32,9 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
 class Assembly(HostProgram):
     """Puts a block on the table, and the other one on it; how high that is, only touch tells."""
 
-    motion = HostInput(MotionStatus, "below.motion")
-    sensors = HostInput(ArmStatus, "below.sensors")
-    requests = HostOutput(MotionRequest)
+    motion = ProgramInput(MotionStatus, "below.motion")
+    sensors = ProgramInput(ArmStatus, "below.sensors")
+    requests = ProgramOutput(MotionRequest)
 
     def run(self, bus: Bus) -> None:
         """Carry both blocks."""

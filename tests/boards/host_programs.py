@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment
 from rack.boards.host import bus_adapter
 from rack.boards.host.bus_adapter import BusAdapter
 from rack.boards.wiring import Entries
-from rack.levels.host_program import Bus, HostInput, HostOutput, HostProgram
+from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.level import Executor, Input, Output
 
 
@@ -54,8 +54,8 @@ class Adder(Executor):
 class Host(HostProgram):
     """A program with both ports."""
 
-    sum = HostInput(Sum, "below.sum")
-    numbers = HostOutput(Number)
+    sum = ProgramInput(Sum, "below.sum")
+    numbers = ProgramOutput(Number)
 
     def send_number(self, value: float, colour: Colour = Colour.NONE) -> bool:
         """Send a number; False if too many wait."""
@@ -125,7 +125,7 @@ class Waiting(Host):
 class Slow(Host):
     """Sends 40 numbers that hold what it sees, and computes up to `lag` seconds for each."""
 
-    again = HostInput(Sum, "second.sum")
+    again = ProgramInput(Sum, "second.sum")
 
     def run(self, bus: Bus) -> None:
         """Compute, send, wait; end once all were added."""
@@ -190,4 +190,4 @@ class Repeater(Executor):
 class Listener(HostProgram):
     """A program that reads what is for levels."""
 
-    numbers = HostInput(Number, "below.numbers")
+    numbers = ProgramInput(Number, "below.numbers")

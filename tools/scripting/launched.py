@@ -22,7 +22,7 @@ from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.scripting.settings import settings_of
 
 
-class Rack(CrateRack):
+class LaunchedRack(CrateRack):
     """A rack of boards, launched by a program. Use it as a context: it ends with the block.
 
     ```python
@@ -111,6 +111,10 @@ class Rack(CrateRack):
             record.finish(self)
 
 
+Rack = LaunchedRack
+"""Its name in the package `rack`."""
+
+
 class RunRecord:
     """The recording of a run: its events, and the recorder's process, which imports its libraries
     while the boards start."""
@@ -122,7 +126,7 @@ class RunRecord:
         self._began_s = 0.0
         self.log = EventLog(Display())
 
-    def begin(self, rack: Rack) -> None:
+    def begin(self, rack: LaunchedRack) -> None:
         """Record a rack that has been launched. Raises `Failure`."""
         begin_folder(self._folder, rack.config, self.log)
         words = rack.segment.words
@@ -142,7 +146,7 @@ class RunRecord:
         """Wait until the recorder has begun: later it would find no rack to attach to."""
         self._recorder.await_begun()
 
-    def finish(self, rack: Rack) -> None:
+    def finish(self, rack: LaunchedRack) -> None:
         """Finish the files of a rack that is closed; of a run that is over, write its outcome."""
         wall_s = time.monotonic() - self._began_s
         with closing(self.log):

@@ -24,7 +24,7 @@ from pydantic import ValidationError
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
-from rack.levels.host_program import Bus, HostInput, HostOutput, HostReceiver, HostSender
+from rack.levels.host_program import Bus, HostReceiver, HostSender, ProgramInput, ProgramOutput
 from rack.levels.level import LevelContext, Misfits, Program
 from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
 from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
@@ -225,8 +225,8 @@ class ForceMotions(Motions):
 class ForceClient(CommandEnvironment):
     """Runs a script that commands forces and motions by name; a prompt offers the same names."""
 
-    motion = HostInput(ServerStatus, "below.motion")
-    requests = HostOutput(ServerRequest)
+    motion = ProgramInput(ServerStatus, "below.motion")
+    requests = ProgramOutput(ServerRequest)
     program = ForceProgram
 
     def motions(self, bus: Bus) -> Motions:

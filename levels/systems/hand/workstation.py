@@ -26,7 +26,7 @@ from pydantic import Field
 from rack.backplane.words import Block
 from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
-from rack.levels.host_program import Bus, HostInput, HostOutput, HostProgram
+from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.level import LevelContext
 from rack.levels.messages import WorldState
 from rack.levels.robot.cell import Cell, cell_of
@@ -217,9 +217,9 @@ class WorkstationParams(Table):
 class Workstation(HostProgram):
     """Plans a grasp of one object, and plans again if the object moves before it is held."""
 
-    world = HostInput(WorldState, "below.world")
-    grasp = HostInput(GraspStatus, "below.grasp")
-    plan = HostOutput(GraspPlan)
+    world = ProgramInput(WorldState, "below.world")
+    grasp = ProgramInput(GraspStatus, "below.grasp")
+    plan = ProgramOutput(GraspPlan)
     params = WorkstationParams
 
     def __init__(self, context: LevelContext) -> None:

@@ -23,11 +23,11 @@ from typing import Any
 from rack.levels.errors import LevelError
 from rack.levels.host_program import (
     Bus,
-    HostInput,
-    HostOutput,
     HostProgram,
     HostReceiver,
     HostSender,
+    ProgramInput,
+    ProgramOutput,
 )
 from rack.levels.level import LevelContext
 from rack.levels.systems.trajectory.messages import (
@@ -213,8 +213,8 @@ class ScriptParams(Table):
 class CommandEnvironment(HostProgram):
     """Runs a script that commands motions by name; a prompt offers the same names."""
 
-    motion = HostInput(MotionStatus, "below.motion")
-    requests = HostOutput(MotionRequest)
+    motion = ProgramInput(MotionStatus, "below.motion")
+    requests = ProgramOutput(MotionRequest)
     params = ScriptParams
 
     def __init__(self, context: LevelContext) -> None:
