@@ -17,11 +17,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from difflib import get_close_matches
 from enum import IntEnum
 from functools import cache
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_type_hints
 
 import numpy as np
@@ -32,7 +31,6 @@ from rack.backplane.message_type import Field, MessageType
 REASON_BYTES = 120
 COMMAND_ID = "id"
 """First field of every command: its serial."""
-_SET = object.__setattr__
 B = TypeVar("B", bound="Message")
 _KINDS: Mapping[type, tuple[str, str]] = {
     bool: ("u1", "u"),
@@ -43,6 +41,9 @@ _KINDS: Mapping[type, tuple[str, str]] = {
     np.ndarray: ("f8", "iufS"),
 }
 """By type of a field: its numpy type unless the field states another, and the kinds permitted."""
+_UNITS = {bool: "1", str: "ASCII"}
+_UNSTATED = "unstated"
+"""The unit, of any other type, of a field that states none."""
 
 
 class State(IntEnum):
@@ -55,44 +56,11 @@ class State(IntEnum):
     HOLDING = 4  # has work but must wait; `reason` says for what, and what ends the wait
 
 
-@dataclass(frozen=True)
-class Declaration:
-    """What `field` says of a field of a message class; its name and type stand beside it."""
-
-    kind: str | type[Message]
-    unit: str | type[IntEnum] | None
-    doc: str
-    shape: tuple[int | str, ...]
-    length: tuple[float, float] | None
-    default: Any
-
-    def named(self, name: str, hint: Any) -> Field:
-        """Return the field of this name and annotated type. Raises `ValueError` with a reason."""
-        if isinstance(self.kind, type):
-            group = self.kind.message_type
-            return Field(name, group, "", self.doc, self.shape)
-        python = next((kind for kind in _KINDS if hint is kind or _is_enum(hint, kind)), np.ndarray)
-        usual, permitted = _KINDS[python]
-        kind = self.kind or usual
-        if np.dtype(kind).kind not in permitted:
-            raise ValueError(f"numpy type '{kind}' does not hold {_name(hint)}")
-        if (python is np.ndarray) != bool(self.shape):
-            raise ValueError(f"shape {self.shape} does not suit {_name(hint)}")
-        unit = hint if python is IntEnum else self.unit
-        if unit is None:
-            unit = {bool: "1", str: "ASCII"}.get(python)
-        if unit is None:
-            raise ValueError('has no unit; of a pure number it is "1"')
-        if self.default is not None and not _holds(kind, self.default):
-            raise ValueError(f"default {self.default!r} does not fit numpy type '{kind}'")
-        return Field(name, kind, unit, self.doc, self.shape, self.length, python, self.default)
-
-
 def field(
     kind: str | type[Message] = "",
     *,
     doc: str,
-    unit: str | type[IntEnum] | None = None,
+    unit: str | type[IntEnum] = _UNSTATED,
     shape: int | str | tuple[int | str, ...] = (),
     length: tuple[float, float] | None = None,
     default: Any = None,
@@ -112,7 +80,30 @@ def field(
         default: Value in the first message that a level writes; otherwise all bytes are 0.
     """
     sizes = shape if isinstance(shape, tuple) else (shape,)
-    return Declaration(kind, unit, doc, sizes, length, default)
+    stored = kind if isinstance(kind, str) else kind.message_type
+    return Field("", stored, unit, doc, sizes, length, default=default)
+
+
+def _named(declared: Field, name: str, hint: Any) -> Field:
+    """Return a declared field with the name and the annotation that stand beside it. Raises
+    `ValueError` with a reason."""
+    if isinstance(declared.kind, MessageType):
+        return replace(declared, name=name, unit="")
+    is_name = isinstance(hint, type) and issubclass(hint, IntEnum)
+    python = IntEnum if is_name else hint if hint in _KINDS else np.ndarray
+    usual, permitted = _KINDS[python]
+    kind = declared.kind or usual
+    if np.dtype(kind).kind not in permitted:
+        raise ValueError(f"numpy type '{kind}' does not hold {_name(hint)}")
+    if (python is np.ndarray) != bool(declared.shape):
+        raise ValueError(f"shape {declared.shape} does not suit {_name(hint)}")
+    unit = hint if python is IntEnum else _UNITS.get(python, declared.unit)
+    if unit == _UNSTATED:
+        raise ValueError('has no unit; of a pure number it is "1"')
+    default = declared.default
+    if default is not None and not _holds(kind, default):
+        raise ValueError(f"default {default!r} does not fit numpy type '{kind}'")
+    return replace(declared, name=name, kind=kind, unit=unit, python=python)
 
 
 def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
@@ -125,28 +116,20 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
         fields: What `field` returns, by name.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
-    made: Any = _Slotted(name, (base,), body, version=version, message=name)
+    made: Any = type(name, (base,), body, version=version, message=name)
     return made  # type: ignore[no-any-return]
 
 
-class _Slotted(type):
-    """Gives classes no attributes besides their slots: a misspelt field is an error."""
-
-    def __new__(
-        cls, name: str, bases: tuple[type, ...], body: dict[str, Any], **options: Any
-    ) -> _Slotted:
-        return super().__new__(cls, name, bases, {"__slots__": (), **body}, **options)
-
-
-class Message(metaclass=_Slotted):
+class Message:
     """A local copy of one message: a mailbox reads into it or writes from it.
 
     Array fields are numpy views of `record`: fill them in place (`m.position[:] = q`) or assign
     (`m.position = q`). Scalars read and assign as plain values, texts as `str`, see `text_of`.
-    `record` is the structured array, shape (), `raw` its bytes.
+    A number that an enumeration does not name reads as a plain `int`: no reader fails because
+    another board, or another version of a rack, sent it. `record` is the structured array, shape
+    (), `raw` its bytes.
     """
 
-    __slots__ = ("raw", "record")
     raw: memoryview
     record: np.ndarray
     message_type: ClassVar[MessageType] = MessageType("", 0, ())
@@ -163,15 +146,16 @@ class Message(metaclass=_Slotted):
             MailboxError: No message may have such a field.
         """
         fields = {f.name: f for base in cls.__bases__ for f in base.message_type.fields}  # type: ignore[attr-defined]
-        own = {name: d for name, d in vars(cls).items() if isinstance(d, Declaration)}
+        own = {name: d for name, d in vars(cls).items() if isinstance(d, Field)}
         hints = get_type_hints(cls) if own else {}
-        for name, declaration in own.items():
+        for name, declared in own.items():
             try:
-                if name.startswith("_") or hasattr(Message, name) or name not in hints:
+                is_taken = hasattr(Message, name) or name in Message.__annotations__
+                if name.startswith("_") or is_taken or name not in hints:
                     raise ValueError(
                         "permitted: annotated, no leading '_', no attribute of Message"
                     )
-                fields[name] = declaration.named(name, hints[name])
+                fields[name] = _named(declared, name, hints[name])
             except (TypeError, ValueError) as error:
                 raise MailboxError(
                     f"message class {cls.__name__}: field '{name}': {error}"
@@ -180,15 +164,14 @@ class Message(metaclass=_Slotted):
         cls.message_type = MessageType(known_as, version, tuple(fields.values()))
 
     def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Self:  # noqa: D102  # as the class
-        made: Self = object.__new__(_resolved(cls, dtype))
+        made: Self = object.__new__(_resolved(cls, dtype))  # type: ignore[arg-type]
         return made
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
         raw = memoryview(bytearray(dtype.itemsize)) if buffer is None else buffer
-        _SET(self, "raw", raw)
-        _SET(self, "record", np.frombuffer(raw, dtype=dtype, count=1).reshape(()))
-        for name in dtype.names or ():
-            _SET(self, f"_{name}", self.record[name])
+        record = np.frombuffer(raw, dtype=dtype, count=1).reshape(())
+        views = {name: record[name] for name in dtype.names or ()}
+        self.__dict__.update(views, raw=raw, record=record, _views=views)
 
     @classmethod
     def zeros(cls, sizes: Mapping[str, int]) -> Self:
@@ -207,10 +190,13 @@ class Message(metaclass=_Slotted):
     if not TYPE_CHECKING:
         # A type checker knows the fields of a message class.
         def __setattr__(self, name: str, value: Any) -> None:
+            # One call for all fields: the setter of a property would be a second one.
             try:
-                _SET(self, name, value)
-            except AttributeError:
+                self._views[name][...] = value
+            except KeyError:
                 raise AttributeError(self._unknown(name)) from None
+            except UnicodeEncodeError:
+                self._views[name][...] = value.encode("ascii", "replace")
 
         def __getattr__(self, name: str) -> Any:
             raise AttributeError(self._unknown(name))
@@ -289,43 +275,29 @@ def _greatest(kind: np.dtype) -> float:
 
 @cache
 def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
-    """Return the subclass of a message class with one property per field of this dtype."""
-    names = dtype.names or ()
+    """Return the subclass of a message class with a property per scalar of this dtype."""
     declared = {field.name: field for field in cls.message_type.fields}
-    body = {name: _property(f"_{name}", dtype[name], declared.get(name)) for name in names}
+    columns = {name: dtype[name] for name in dtype.names or ()}
+    body = {
+        name: _scalar(name, column, declared.get(name))
+        for name, column in columns.items()
+        if not (column.shape or column.names)
+    }
     kind = cls.message_type
     options = {"version": kind.version, "message": kind.name}
-    slots = tuple(f"_{name}" for name in names)
-    made: Any = _Slotted(cls.__name__, (cls,), {"__slots__": slots, **body}, **options)
+    made: Any = type(cls.__name__, (cls,), body, **options)
     return made  # type: ignore[no-any-return]
 
 
-def _property(slot: str, dtype: np.dtype, declared: Field | None) -> property:
-    view = attrgetter(slot)
-
-    def store(self: Message, value: Any) -> None:
-        view(self)[...] = value
-
-    if dtype.shape or dtype.names:
-        return property(view, store)
+def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
     if dtype.kind == "S":
-        size = dtype.itemsize
-
-        def store_text(self: Message, value: str | bytes) -> None:
-            data = value.encode("ascii", "replace") if isinstance(value, str) else value
-            view(self)[...] = data[:size]
-
-        return property(lambda self: text_of(view(self).item()), store_text)
+        return property(lambda self: text_of(self._views[name].item()))
     if declared is not None and declared.python is bool:
-        return property(lambda self: view(self).item() != 0, store)
+        return property(lambda self: self._views[name].item() != 0)
     if declared is not None and not isinstance(declared.unit, str):
         member = {int(each): each for each in declared.unit}.get
-        return property(lambda self: member(value := view(self).item(), value), store)
-    return property(lambda self: view(self).item(), store)
-
-
-def _is_enum(hint: Any, kind: type) -> bool:
-    return kind is IntEnum and isinstance(hint, type) and issubclass(hint, IntEnum)
+        return property(lambda self: member(value := self._views[name].item(), value))
+    return property(lambda self: self._views[name].item())
 
 
 def _name(hint: Any) -> str:

@@ -23,7 +23,16 @@ UNKEPT = "no snapshots: "
 """Begins the note of a run that takes none, with the reason after it."""
 
 
-class BoardError(Exception):
+class Failure(Exception):
+    """A command, or a call of a program, that did not work. The message is for the user, `status`
+    the exit status of the command."""
+
+    def __init__(self, reason: str, status: int = 1) -> None:
+        super().__init__(reason)
+        self.status = status
+
+
+class BoardError(Failure):
     """Root of every error this package raises; its text is one line for the user."""
 
 
@@ -33,6 +42,9 @@ class LaunchError(BoardError):
 
 class SnapshotError(BoardError):
     """A process that cannot be copied, or a snapshot from which a rack cannot go on."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason, 2)
 
 
 @dataclass(frozen=True)
@@ -60,7 +72,7 @@ class ConfigError(BoardError):
 
     def __init__(self, mistakes: Iterable[Mistake]) -> None:
         self.mistakes = list({str(mistake): mistake for mistake in mistakes}.values())
-        super().__init__("\n".join(str(mistake) for mistake in self.mistakes))
+        super().__init__("\n".join(str(mistake) for mistake in self.mistakes), 2)
 
 
 def shown(value: Any) -> str:

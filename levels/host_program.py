@@ -6,12 +6,15 @@ time never waits for it. It reaches the levels only through a bus adapter
 (`rack.boards.host.bus_adapter`), which exchanges at its own rate. The author writes `run`:
 
     class Stroll(HostProgram):
-        motion = Input(MotionStatus, "below.motion")
-        requests = Output(MotionRequest)
+        motion = ProgramInput(MotionStatus, "below.motion")
+        requests = ProgramOutput(MotionRequest)
 
         def run(self, bus: Bus) -> None:
-            bus.send("requests", kind=MotionKind.JOINTS, joints=(0.0, -0.5, ...))
-            while bus.read("motion").message.done < bus.sent("requests"):
+            request = self.requests.message
+            request.kind = MotionKind.JOINTS
+            request.joints[:] = (0.0, -0.5, ...)
+            self.requests.send()
+            while self.motion.read().message.done < self.requests.sent:
                 bus.wait(1.0)
 
 The program is over when `run` returns. An exception ends the process, which is restarted by the
@@ -27,12 +30,16 @@ elsewhere for 30 s ends the run. For prompts lockstep does not wait.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, Self, TypeVar, overload
 
 from rack.backplane.mailbox.mailbox import Reading
+from rack.backplane.message import Message
+from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext, Program
-from rack.levels.ports import InputPort, Output, collect_ports
+from rack.levels.ports import InputPort, M, Output, collect_ports
 from rack.levels.tables import Table
+
+M_co = TypeVar("M_co", bound=Message, covariant=True)
 
 
 class Bus(Protocol):
@@ -55,20 +62,6 @@ class Bus(Protocol):
         """Wait until a message arrives; False when none has after the timeout, by `time_s`, or when
         the run ends."""
 
-    def read(self, port: str) -> Reading[Any]:
-        """Return the newest message; `earlier` holds the unread ones before it, as far as the
-        mailbox keeps them."""
-
-    def send(self, port: str, **fields: Any) -> bool:
-        """Send a message with these fields, all others 0; False when too many wait at the adapter.
-
-        A command without an `id` gets the number of the message, which rises by one with every
-        message sent. Raises `AttributeError` for an unknown field.
-        """
-
-    def sent(self, port: str) -> int:
-        """Return the number of messages sent so far, by former processes of this board too."""
-
     @property
     def tasks(self) -> list[str]:
         """Names of the crate's tasks."""
@@ -89,13 +82,75 @@ class Bus(Protocol):
         """Declare the program's work done, as its return does."""
 
 
+class HostReceiver(Protocol[M_co]):
+    """An input of a host program at work."""
+
+    def read(self) -> Reading[M_co]:
+        """Return the newest message; `earlier` holds the unread ones before it, as far as the
+        mailbox keeps them."""
+
+
+class HostSender(Protocol[M_co]):
+    """An output of a host program at work."""
+
+    @property
+    def message(self) -> M_co:
+        """The next message: all its fields are 0, but for the `id` of a command, which is the
+        number of the message."""
+
+    def send(self) -> bool:
+        """Send a copy of the message, and begin the next one; return False, and leave it as it is,
+        when too many wait at the adapter."""
+
+    @property
+    def sent(self) -> int:
+        """Number of messages sent so far, by former processes of this board too."""
+
+
+class ProgramInput(InputPort[M]):
+    """A port that a host program reads: an attribute that is a `HostReceiver`.
+
+    Args:
+        message: The class of its messages.
+        source: A mailbox of a bus adapter, as in "below.motion". A config may wire it elsewhere.
+    """
+
+    @overload
+    def __get__(self, program: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, program: Any, owner: type) -> HostReceiver[M]: ...
+    def __get__(self, program: Any, owner: type) -> Self | HostReceiver[M]:
+        """Return the declaration; a program that no board has connected can read nothing."""
+        if program is None:
+            return self
+        raise self.not_connected()
+
+
+class ProgramOutput(Output[M]):
+    """A port that a host program writes, the mailbox `<board>.<port>`, for a bus adapter to read:
+    an attribute that is a `HostSender`."""
+
+    def __init__(self, message: type[M]) -> None:
+        super().__init__(message)
+
+    @overload  # type: ignore[override]
+    def __get__(self, program: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, program: Any, owner: type) -> HostSender[M]: ...
+    def __get__(self, program: Any, owner: type) -> Self | HostSender[M]:
+        """Return the declaration; a program that no board has connected can send nothing."""
+        if program is None:
+            return self
+        raise self.not_connected()
+
+
 class HostProgram:
     """A program of a host board. `context.every` is 1: it has no rate."""
 
-    inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
-    """Ports that it reads: mailboxes of a bus adapter, one per port, as in "below.motion"."""
-    outputs: ClassVar[Mapping[str, Output[Any]]] = {}
-    """Ports that it writes, each the mailbox `<board>.<port>`, for a bus adapter to read."""
+    inputs: ClassVar[Mapping[str, ProgramInput[Any]]] = {}
+    """The ports that it reads, by name: collected from the class and its bases."""
+    outputs: ClassVar[Mapping[str, ProgramOutput[Any]]] = {}
+    """The ports that it writes, likewise."""
     params: ClassVar[type[Table] | None] = None
     """Keys of `[host.<name>.params]`, checked before the launch; None: unchecked, the program reads
     them by itself."""
@@ -106,6 +161,12 @@ class HostProgram:
         super().__init_subclass__()
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
         cls.outputs = collect_ports(cls, "outputs", (Output,))
+        for port in (*cls.inputs.values(), *cls.outputs.values()):
+            if not isinstance(port, ProgramInput | ProgramOutput):
+                why = f"port '{port.name}' is a level's {type(port).__name__}"
+                raise LevelError(
+                    f"class {cls.__name__}: {why}; permitted: ProgramInput, ProgramOutput"
+                )
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context

@@ -37,6 +37,10 @@ class Port(Generic[M]):
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
+    def not_connected(self) -> LevelError:
+        """Return the error of an object that uses the port before a board has connected it."""
+        return LevelError(f"port '{self.name}': no board has connected it to a mailbox")
+
 
 class InputPort(Port[M]):
     """A port that a level reads.
@@ -178,7 +182,7 @@ class SentOutput(Output[M]):
         """Return the declaration; a level that no board has connected can send nothing."""
         if level is None:
             return self
-        raise LevelError(f"port '{self.name}': no board has connected it to a mailbox")
+        raise self.not_connected()
 
 
 class QueuedOutput(SentOutput[M]):

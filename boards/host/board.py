@@ -46,7 +46,9 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
         bus.await_turn()
         # Imported here, not in the crate: a program may import anything, and the crate must stay
         # single-threaded.
-        find_class(wiring.target, HostProgram)(wiring.context).run(bus)
+        program = find_class(wiring.target, HostProgram)(wiring.context)
+        bus.connect(program)
+        program.run(bus)
     except SystemExit as end:
         if end.code and not bus.is_over:
             return _failed(wiring.board, end)

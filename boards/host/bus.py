@@ -4,23 +4,64 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.host_ring import HostWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
-from rack.backplane.message import COMMAND_ID
+from rack.backplane.message import COMMAND_ID, AnyMessage, Message
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.wiring import HostWiring
+from rack.levels.host_program import HostProgram
 
 WORD = 8
 LONGEST_S = 1e9
-_Port = TypeVar("_Port")
+
+
+class BusReceiver:
+    """An input of a program, see `HostReceiver`. Its first read returns the newest message
+    alone."""
+
+    def __init__(self, reader: DoubleBufferReader) -> None:
+        self._reader = reader
+
+    def read(self) -> Reading[AnyMessage]:
+        """Return the newest message, with the unread ones before it."""
+        before = self._reader.serial
+        reading = self._reader.peek()
+        return self._reader.with_earlier(reading, before) if before else reading
+
+
+class BusSender:
+    """An output of a program, see `HostSender`."""
+
+    def __init__(self, bus: HostBus, writer: HostWriter, kind: type[Message]) -> None:
+        self._bus = bus
+        self._writer = writer
+        # In the writer's own memory.
+        self.message: Any = kind(writer.message.record.dtype, writer.message.raw)
+        self._begin()
+
+    def _begin(self) -> None:
+        self.message.clear()
+        if COMMAND_ID in (self.message.record.dtype.names or ()):
+            self.message.id = self.sent + 1
+
+    def send(self) -> bool:
+        """Send a copy of the message, and begin the next; False when too many wait."""
+        is_sent = self._writer.send(self._bus.tick)
+        if is_sent:
+            self._begin()
+        return is_sent
+
+    @property
+    def sent(self) -> int:
+        """Number of messages sent so far."""
+        return self._writer.serial
 
 
 class HostBus:
@@ -39,9 +80,6 @@ class HostBus:
         self._is_paced = self._words[System.LOCKSTEP] and layout.pacers(layout.task(wiring.board))
         self.block = segment.block(wiring.board)
         self._claim = _claim(segment, wiring.board)
-        self._readers = {
-            port: DoubleBufferReader(segment, mailbox) for port, mailbox in wiring.inputs.items()
-        }
         self._writers: dict[str, HostWriter] = {}
         try:
             for port, mailbox in wiring.outputs.items():
@@ -54,6 +92,15 @@ class HostBus:
         self.block[Block.PID] = os.getpid() if segment.launcher else 0
         self.block[Block.WAITS_UNTIL] = 0
         self.block[Block.STATE] = TaskState.RUNNING
+
+    def connect(self, program: HostProgram) -> None:
+        """Put what reads and sends into the ports of the board's program."""
+        ports = vars(program)
+        for port, mailbox in self._wiring.inputs.items():
+            self._segment.message_classes[mailbox] = program.inputs[port].message
+            ports[port] = BusReceiver(DoubleBufferReader(self._segment, mailbox))
+        for port, writer in self._writers.items():
+            ports[port] = BusSender(self, writer, program.outputs[port].message)
 
     @property
     def tick(self) -> int:
@@ -106,36 +153,6 @@ class HostBus:
         block[Block.DONE] = block[Block.RELEASED]
         done_semaphore(self._segment, self._wiring.board).release()
 
-    def read(self, port: str) -> Reading[Any]:
-        """Return the newest message; `earlier` holds the unread ones before it, as far as the
-        mailbox keeps them; the first read returns the newest alone."""
-        reader = _of(self._readers, port)
-        before = reader.serial
-        reading = reader.peek()
-        return reader.with_earlier(reading, before) if before else reading
-
-    def send(self, port: str, **fields: Any) -> bool:
-        """Send a message with these fields, all others 0; False when too many wait at the adapter.
-
-        A command without an `id` gets the number of the message, which rises by one with every
-        message sent. Raises `AttributeError` for an unknown field.
-        """
-        writer = _of(self._writers, port)
-        message = writer.message
-        message.clear()
-        if COMMAND_ID in (message.record.dtype.names or ()):
-            message.id = writer.serial + 1
-        for name, value in fields.items():
-            # Read first: a slot for any other name would raise an error that does not list the
-            # fields.
-            getattr(message, name)
-            setattr(message, name, value)
-        return writer.send(self.tick)
-
-    def sent(self, port: str) -> int:
-        """Return the number of messages sent so far, by former processes of this board too."""
-        return _of(self._writers, port).serial
-
     @property
     def tasks(self) -> list[str]:
         """Names of the crate's tasks."""
@@ -183,9 +200,3 @@ def _claim(segment: Segment, board: str) -> ByteLock:
         where = f" (process {pid})" if pid else " in another PID namespace"
         raise MailboxError(f"host board '{board}' is already running{where}")
     return claim
-
-
-def _of(ports: Mapping[str, _Port], port: str) -> _Port:
-    if port not in ports:
-        raise AttributeError(f"no port '{port}'; ports: {', '.join(sorted(ports)) or 'none'}")
-    return ports[port]

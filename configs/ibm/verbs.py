@@ -7,8 +7,7 @@ request of the line.
 
 from collections.abc import Sequence
 
-from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input, Output
+from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.systems.joint_boards.messages import ArmStatus
 from rack.levels.systems.trajectory.commands import Motions
 from rack.levels.systems.trajectory.messages import MotionRequest, MotionStatus, RequestEnd
@@ -33,15 +32,15 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
 class Assembly(HostProgram):
     """Puts a block on the table, and the other on top of it. Heights are found by touch."""
 
-    motion = Input(MotionStatus, "below.motion")
-    sensors = Input(ArmStatus, "below.sensors")
-    requests = Output(MotionRequest)
+    motion = ProgramInput(MotionStatus, "below.motion")
+    sensors = ProgramInput(ArmStatus, "below.sensors")
+    requests = ProgramOutput(MotionRequest)
 
     def run(self, bus: Bus) -> None:
         """Carry both blocks."""
-        motions = Motions(bus, self.context.robot, self.context.scene)
+        motions = Motions(bus, self.motion, self.requests, self.context)
         for block in ("block1", "block2"):
-            self._fetch(motions, bus, block)
+            self._fetch(motions, block)
             touched = self._lower(motions)
             motions.wait(motions.release())
             found = "touched at" if touched else "no touch down to"
@@ -49,12 +48,12 @@ class Assembly(HostProgram):
             motions.wait(motions.line((*PLACE, 0.70)))
         motions.wait(motions.move())
 
-    def _fetch(self, motions: Motions, bus: Bus, block: str) -> None:
+    def _fetch(self, motions: Motions, block: str) -> None:
         motions.release()
         motions.line((0.0, 0.0, 0.15), body=block)
         motions.line((0.0, 0.0, 0.0), body=block)
         motions.wait(motions.grip())
-        opening = bus.read("sensors").message.opening
+        opening = self.sensors.read().message.opening
         if opening < LEAST:
             raise RuntimeError(f"{block}: the gripper closed to {1e3 * opening:.1f} mm, on nothing")
         motions.wait(motions.line((0.0, 0.0, 0.20), body=block))

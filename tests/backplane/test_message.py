@@ -94,6 +94,8 @@ def test_a_field_that_no_message_may_have_is_refused_with_class_and_field(
 def test_a_misspelt_field_is_refused_with_the_nearest_one(track: Track) -> None:
     with pytest.raises(AttributeError, match="'track' has no field 'cuont'; did you mean 'count'"):
         track.cuont = 3  # type: ignore[attr-defined]
+    with pytest.raises(AttributeError, match="'track' has no field 'raw'; fields: count, poses"):
+        track.raw = memoryview(b"")
     with pytest.raises(AttributeError, match="no field 'cuont'; did you mean 'count'"):
         _ = track.cuont  # type: ignore[attr-defined]
     with pytest.raises(AttributeError, match="no field 'xyz'; fields: count, poses, angle, word"):
@@ -119,18 +121,27 @@ def test_a_class_has_the_fields_of_its_bases_first_and_its_name_in_words() -> No
     ]
 
 
-def test_flags_and_names_read_as_what_they_are() -> None:
-    class Lamp(Message, version=1):
-        on: bool = field(doc="")
-        colour: Colour = field(doc="")
+class Lamp(Message, version=1):
+    on: bool = field(doc="")
+    colour: Colour = field(doc="")
 
+
+def test_flags_and_names_read_as_what_they_are() -> None:
     lamp = Lamp.zeros({})
     lamp.on, lamp.colour = True, Colour.BLUE
     assert (lamp.on, lamp.colour) == (True, Colour.BLUE)
     assert isinstance(lamp.colour, Colour)
-    lamp.record["colour"] = 7  # from a rack of another version
-    assert lamp.colour == 7
     assert isinstance(lamp, Lamp)
+
+
+def test_a_number_without_a_name_reads_as_a_plain_number() -> None:
+    lamp = Lamp.zeros({})
+    lamp.record["colour"] = 7
+    assert type(lamp.colour) is int
+    assert lamp.colour == 7
+    assert lamp.colour not in set(Colour)
+    lamp.colour = Colour.BLUE
+    assert lamp.colour is Colour.BLUE
 
 
 def test_scalars_read_as_plain_numbers_that_fit_their_fields(track: Track) -> None:

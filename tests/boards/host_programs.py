@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment
 from rack.boards.host import bus_adapter
 from rack.boards.host.bus_adapter import BusAdapter
 from rack.boards.wiring import Entries
-from rack.levels.host_program import Bus, HostProgram
+from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.level import Executor, Input, Output
 
 
@@ -54,8 +54,14 @@ class Adder(Executor):
 class Host(HostProgram):
     """A program with both ports."""
 
-    sum = Input(Sum, "below.sum")
-    numbers = Output(Number)
+    sum = ProgramInput(Sum, "below.sum")
+    numbers = ProgramOutput(Number)
+
+    def send_number(self, value: float, colour: Colour = Colour.NONE) -> bool:
+        """Send a number; False if too many wait."""
+        self.numbers.message.value = value
+        self.numbers.message.colour = colour
+        return self.numbers.send()
 
 
 class Counting(Host):
@@ -64,9 +70,9 @@ class Counting(Host):
     def run(self, bus: Bus) -> None:
         count = self.context.params.get("count", 5)
         for value in range(1, count + 1):
-            while not bus.send("numbers", value=value, colour=Colour.RED):
+            while not self.send_number(value, Colour.RED):
                 bus.wait(1.0)
-        while bus.read("sum").message.last < count and not bus.is_over:
+        while self.sum.read().message.last < count and not bus.is_over:
             bus.wait(1.0)
 
 
@@ -74,7 +80,7 @@ class Deaf(Host):
     """Blocks for ever in one call, and keeps out SystemExit."""
 
     def run(self, bus: Bus) -> None:
-        bus.send("numbers", value=1.0)
+        self.send_number(1.0)
         if os.fork() == 0:
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
         while True:
@@ -112,23 +118,23 @@ class Waiting(Host):
     """Sends one number, and waits."""
 
     def run(self, bus: Bus) -> None:
-        bus.send("numbers", value=1.0)
+        self.send_number(1.0)
         super().run(bus)
 
 
 class Slow(Host):
     """Sends 40 numbers that hold what it sees, and computes up to `lag` seconds for each."""
 
-    again = Input(Sum, "second.sum")
+    again = ProgramInput(Sum, "second.sum")
 
     def run(self, bus: Bus) -> None:
         """Compute, send, wait; end once all were added."""
-        while bus.sent("numbers") < 40:
+        while self.numbers.sent < 40:
             time.sleep(random.uniform(0.0, self.context.params["lag"]))
-            seen = bus.read("sum").message.sum + bus.read("again").message.last
-            bus.send("numbers", value=seen % 7.0 + bus.time_s + bus.tick)
+            seen = self.sum.read().message.sum + self.again.read().message.last
+            self.send_number(seen % 7.0 + bus.time_s + bus.tick)
             bus.wait(0.03)
-        while bus.read("sum").message.last < bus.sent("numbers") and not bus.is_over:
+        while self.sum.read().message.last < self.numbers.sent and not bus.is_over:
             bus.wait(1.0)
 
 
@@ -168,7 +174,7 @@ class Console(Host):
 
     def names(self, bus: Bus) -> dict[str, object]:
         """Offer a function that sends a number."""
-        return {"number": lambda value: bus.send("numbers", value=value)}
+        return {"number": self.send_number}
 
 
 class Repeater(Executor):
@@ -184,4 +190,4 @@ class Repeater(Executor):
 class Listener(HostProgram):
     """A program that reads what is for levels."""
 
-    numbers = Input(Number, "below.numbers")
+    numbers = ProgramInput(Number, "below.numbers")

@@ -7,8 +7,12 @@ import pytest
 from rack.boards.errors import (
     LONGEST_REASON,
     LONGEST_VALUE,
+    BoardError,
     ConfigError,
+    Failure,
+    LaunchError,
     Mistake,
+    SnapshotError,
     one_line,
     shown,
 )
@@ -50,3 +54,15 @@ def test_an_error_has_each_mistake_once() -> None:
     error = ConfigError([one, Mistake("b", 2, "no"), Mistake("a", 1, "no")])
     assert str(error) == "a = 1: no\nb = 2: no"
     assert len(error.mistakes) == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(ConfigError([]), 2), (SnapshotError("no copy"), 2), (LaunchError("not ready"), 1)],
+    ids=repr,
+)
+def test_every_error_is_a_failure_with_the_exit_status_of_its_command(
+    error: BoardError, status: int
+) -> None:
+    assert isinstance(error, Failure)
+    assert error.status == status

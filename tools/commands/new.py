@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from rack.backplane.rack_name import is_free_name
+from rack.backplane.rack_name import RACK_NAME
 from rack.boards.config import CONFIGS, load, names
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json
@@ -71,7 +71,7 @@ def new(
 
 def _flaw(kind: str, name: str) -> str:
     """Return why a name cannot be that of the module, its rack and, of a level, its board."""
-    if not is_free_name(name, ()) or not name.isidentifier() or keyword.iskeyword(name):
+    if not re.fullmatch(RACK_NAME, name) or not name.isidentifier() or keyword.iskeyword(name):
         return "permitted: a-z, 0-9 and '_', at most 40, a letter first; no keyword of Python"
     if name in names() or name in load("nasrem").board:
         return "a bundled config, or a board of nasrem, has that name"

@@ -36,7 +36,8 @@ def prompt(
     """Open a Python prompt on the host side of a running rack, or run a script there.
 
     It takes the place of the program of a host board with `external = true`, one process at a time.
-    `bus` sends and reads messages, `program` is the board's program, which may offer more names.
+    `program` is the board's program, whose ports read and send messages; it may offer more names.
+    `bus` has the time, and waits for messages.
     Whatever happens here, the real-time side is not delayed. The prompt can be left and opened
     again while the rack runs. Its program is a class that the rack's config names: the rack must be
     one's own.
@@ -58,6 +59,7 @@ def prompt(
     wiring = _wiring(segment, board)
     program = find_class(wiring.target, HostProgram)(wiring.context)
     bus = HostBus(segment, wiring)
+    bus.connect(program)
     names = {"bus": bus, "program": program, **program.names(bus)}
     try:
         with _python_signals():

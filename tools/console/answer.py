@@ -9,21 +9,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rack.backplane.json_text import encode_json
+from rack.boards.errors import Failure as Failure
 from rack.boards.errors import one_line
 
 Document = dict[str, Any]
 """Plain data, as `--json` prints it and a run's folder holds it."""
 MAX_LINE = 1300
 """Characters of one line of an error message, at most."""
-
-
-class Failure(Exception):
-    """A command that did not work. The message is one line for the user, `status` the exit
-    status."""
-
-    def __init__(self, reason: str, status: int = 1) -> None:
-        super().__init__(reason)
-        self.status = status
 
 
 @contextmanager
@@ -33,12 +25,9 @@ def as_failure() -> Iterator[None]:
         yield
     except Exception as error:
         from rack.backplane.errors import BackplaneError
-        from rack.boards.errors import BoardError, ConfigError, SnapshotError
         from rack.levels.errors import LevelError
 
-        if isinstance(error, ConfigError | SnapshotError):
-            raise Failure(str(error), 2) from None
-        if isinstance(error, BackplaneError | BoardError | LevelError):
+        if isinstance(error, BackplaneError | LevelError):
             raise Failure(str(error)) from None
         raise
 

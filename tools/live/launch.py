@@ -91,8 +91,8 @@ class RunResult:
     faults: tuple[Strike, ...]
     clock_offset_ns: int
     refused: dict[str, int]
-    others: tuple[OtherEnd, ...]
-    failed: str
+    others: tuple[OtherEnd, ...] = ()
+    failed: str = ""
 
     @property
     def worked(self) -> bool:
@@ -154,7 +154,7 @@ def run_rack(
             news: list[News] = []
             if recorder is not None:
                 news.append(recorder.news)
-                _begin_folder(recorder.folder, config, begins.origin, log)
+                begin_folder(recorder.folder, config, log, begins.origin)
                 port = import_module(VIEWER).free_port() if view else None
                 if not recorder.attach(config.name, port, segment.words):
                     log.add(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
@@ -178,29 +178,11 @@ def run_rack(
         recording, rows_lost = "none", dict[str, int]()
         if recorder is not None:
             ended = recorder.finish(in_a_hurry=INTERRUPT.number != 0)
-            recording, rows_lost = _compare(recorder.folder, segment, ended, outcome.ticks)
+            recording, rows_lost = compare_recording(recorder.folder, segment, ended, outcome.ticks)
         log_news()
         failed = others.finish()
-        result = RunResult(
-            rack=config.name,
-            outcome=outcome,
-            wall_s=wall_s,
-            clock_skipped=segment.words[System.CLOCK_SKIPPED],
-            tasks={
-                task.name: {
-                    **{
-                        name.lower(): segment.block(task.name)[getattr(Block, name)]
-                        for name in COUNTED
-                    },
-                    **segment.count_cycles(task, outcome.ticks)._asdict(),
-                }
-                for task in segment.layout.tasks
-            },
-            recording=recording,
-            rows_lost=rows_lost,
-            faults=strikes(segment, config.joints),
-            clock_offset_ns=time.time_ns() - time.monotonic_ns(),
-            refused={queue.mailbox: queue.refused for queue in queue_fills(Newest(segment))},
+        result = replace(
+            result_of(segment, config, outcome, wall_s, recording, rows_lost),
             others=others.ends(),
             failed=failed,
         )
@@ -209,8 +191,11 @@ def run_rack(
         return cut_off if log.has_failed else result
 
 
-def _begin_folder(folder: Path, config: RackConfig, origin: Origin | None, log: EventLog) -> None:
-    """Write into the folder of a run what is known of it before it begins. Raises `Failure`."""
+def begin_folder(
+    folder: Path, config: RackConfig, log: EventLog, origin: Origin | None = None
+) -> None:
+    """Write what is known when a run begins into its folder: config, code, the events so far.
+    Raises `Failure`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "config.toml").write_text(config.text())
@@ -220,6 +205,37 @@ def _begin_folder(folder: Path, config: RackConfig, origin: Origin | None, log: 
         log.open(folder / "events.jsonl")
     except OSError as error:
         raise Failure(f"{folder}: {error.strerror}") from None
+
+
+def result_of(
+    segment: Segment,
+    config: RackConfig,
+    outcome: Outcome,
+    wall_s: float,
+    recording: str,
+    rows_lost: dict[str, int],
+) -> RunResult:
+    """Return the result of a run that is over, by the words of its segment."""
+    return RunResult(
+        rack=config.name,
+        outcome=outcome,
+        wall_s=wall_s,
+        clock_skipped=segment.words[System.CLOCK_SKIPPED],
+        tasks={
+            task.name: {
+                **{
+                    name.lower(): segment.block(task.name)[getattr(Block, name)] for name in COUNTED
+                },
+                **segment.count_cycles(task, outcome.ticks)._asdict(),
+            }
+            for task in segment.layout.tasks
+        },
+        recording=recording,
+        rows_lost=rows_lost,
+        faults=strikes(segment, config.joints),
+        clock_offset_ns=time.time_ns() - time.monotonic_ns(),
+        refused={queue.mailbox: queue.refused for queue in queue_fills(Newest(segment))},
+    )
 
 
 def _open_viewer(port: int) -> News:
@@ -263,7 +279,9 @@ def _watch(
     return rack.outcome
 
 
-def _compare(folder: Path, segment: Segment, why: str, ticks: int) -> tuple[str, dict[str, int]]:
+def compare_recording(
+    folder: Path, segment: Segment, why: str, ticks: int
+) -> tuple[str, dict[str, int]]:
     """Compare the files with what the rings say was written; `why` is how the recorder ended.
 
     Return "complete" or what is missing, and the rows missing by task and by mailbox.

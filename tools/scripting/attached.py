@@ -65,6 +65,10 @@ class AttachedRack:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def __repr__(self) -> str:
+        state = "over" if self._segment.run_is_over else "not over"
+        return f"<attached to rack '{self._segment.rack}': {state}>"
+
     def close(self) -> None:
         """Leave the rack, which runs on; finish its recording."""
         self._closing.close()

@@ -26,6 +26,9 @@ class RecordedMoment:
         self._recording = recording
         self._in_force = in_force
 
+    def __repr__(self) -> str:
+        return f"<run {self._recording.folder} at {self.time_s:g} s, tick {self.tick}>"
+
     @property
     def time_s(self) -> float:
         """Its simulated time, s."""

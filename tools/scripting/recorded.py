@@ -1,4 +1,4 @@
-"""A recorded run, for a Python program: signals as arrays and as tables of pandas."""
+"""A recorded run, for a Python program: signals as arrays, as tables of pandas, as curves."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
+from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.live.continued import tick_in
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
@@ -19,7 +20,11 @@ from rack.tools.scripting.moment import RecordedMoment
 from rack.tools.timing.analysis.stored import newest_report
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from pandas import DataFrame
+
+MOST_NAMED = 12
+"""Most curves and marks of one plot that its legend names."""
 
 
 def open_run(folder: str | Path) -> RecordedRun:
@@ -38,6 +43,11 @@ class RecordedRun:
         """Every field of every mailbox; also found is a number of one, as in
         `servo.status.position[2]`."""
 
+    def __repr__(self) -> str:
+        end = self._recording.ended.get("outcome", {}).get("cause", "no outcome")
+        rack = self._recording.layout.rack
+        return f"<run {self.folder} of rack '{rack}': {end}, {len(self.signals)} signals>"
+
     def at(self, time_s: float) -> RecordedMoment:
         """Return the run at a simulated time, s. Raises `Failure` for one outside."""
         tick = tick_in(self._recording, str(time_s))
@@ -46,8 +56,7 @@ class RecordedRun:
     @cached_property
     def events(self) -> list[Event]:
         """What happened, oldest first; none in a recording by `rack record`."""
-        found = self._recording.events
-        return [Event(**event) for event in found if event["kind"] != "outcome"]
+        return _events(self._recording)
 
     @cached_property
     def report(self) -> Document:
@@ -70,17 +79,35 @@ class RecordedSignals(dict[str, "RecordedSignal"]):
         for name, signal in Signal.all(self._boxes).items():
             self[name] = RecordedSignal(recording, signal)
 
+    def __repr__(self) -> str:
+        names = ", ".join([*self][:2])
+        return f"<{len(self)} signals of {len(self._boxes)} mailboxes: {names}, ...>"
+
     def __missing__(self, name: str) -> RecordedSignal:
         return RecordedSignal(self._recording, Signal.of(name, self._boxes))
 
 
 class RecordedSignal:
-    """A signal of a run, read on first use; `unit` is empty for counts, names and text."""
+    """A signal of a run, read on first use.
+
+    Attributes:
+        name: Its name, as in `servo.status.position[2]`.
+        unit: Its unit; empty for counts, names and text.
+        meaning: What its field says.
+        shape: Shape of its value in one message.
+    """
 
     def __init__(self, recording: Recording, signal: Signal) -> None:
         self._recording = recording
         self.signal = signal
+        self.name = signal.name
         self.unit = signal.unit
+        self.meaning = signal.spec.meaning
+        self.shape = signal.shape[len(signal.index) :]
+
+    def __repr__(self) -> str:
+        what = [self.unit] * bool(self.unit) + [f"shape {self.shape}"] * bool(self.shape)
+        return f"<signal {', '.join([self.name, *what])}: {self.meaning}>"
 
     @cached_property
     def values(self) -> np.ndarray:
@@ -103,6 +130,57 @@ class RecordedSignal:
         by name. Raises `Failure` without pandas."""
         return _table([self])
 
+    def plot(self, axes: Axes | None = None) -> Axes:
+        """Draw its numbers over simulated time, and mark where faults began and processes died.
+
+        Args:
+            axes: Axes of matplotlib to draw on; by default those of a new figure.
+
+        Raises:
+            Failure: It is text, or matplotlib is missing.
+        """
+        if self.signal.is_text:
+            raise Failure(f"{self.name}: text; a plot needs numbers", 2)
+        if not can_draw():
+            raise Failure(NO_PICTURES)
+        from matplotlib import pyplot
+
+        axes = axes or pyplot.figure(layout="constrained").add_subplot()
+        curves = self.values.reshape(len(self.values), -1)
+        places = [_place(index) or self.name for index in np.ndindex(self.shape)]
+        axes.step(self.time_s, curves, where="post", label=places)
+        axes.set_xlabel("simulated time, s")
+        axes.set_ylabel(self.signal.head)
+        if self.signal.spec.values:
+            names, numbers = zip(*self.signal.spec.values, strict=True)
+            axes.set_yticks(numbers, names)
+        tick_s = self._recording.layout.clock_ns * 1e-9
+        marks = self._marks()
+        for tick, text in marks.items():
+            label = f"{tick * tick_s:g} s: {text}"
+            axes.axvline(tick * tick_s, color="tab:red", linestyle="--", label=label)
+        if 1 < len(places) + len(marks) <= MOST_NAMED:
+            axes.legend(fontsize="small")
+        return axes
+
+    def _marks(self) -> dict[int, str]:
+        """Return what a plot marks, by tick; a process that died in place of what killed it."""
+        marks: dict[int, str] = {}
+        for event in _events(self._recording):
+            if event.kind == "fault" and event.code == "begins":
+                marks[event.tick] = f"{event.board}: {event.text}"
+            elif event.kind == "died":
+                marks[event.tick] = event.text
+        return marks
+
+
+def _events(recording: Recording) -> list[Event]:
+    return [Event(**event) for event in recording.events if event["kind"] != "outcome"]
+
+
+def _place(index: Sequence[int]) -> str:
+    return "".join(f"[{number}]" for number in index)
+
 
 def _table(signals: Sequence[RecordedSignal]) -> DataFrame:
     """Return the signals of one mailbox as a table."""
@@ -114,6 +192,5 @@ def _table(signals: Sequence[RecordedSignal]) -> DataFrame:
     for one in signals:
         values = one.signal.named(one.values)
         for index in np.ndindex(values.shape[1:]):
-            place = "".join(f"[{number}]" for number in index)
-            columns[f"{one.signal.name}{place}"] = values[(slice(None), *index)]
+            columns[f"{one.name}{_place(index)}"] = values[(slice(None), *index)]
     return DataFrame(columns, index=Index(signals[0].time_s, name="time_s"))

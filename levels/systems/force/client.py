@@ -24,8 +24,8 @@ from pydantic import ValidationError
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
-from rack.levels.host_program import Bus
-from rack.levels.level import Input, LevelContext, Misfits, Output, Program
+from rack.levels.host_program import Bus, HostReceiver, HostSender, ProgramInput, ProgramOutput
+from rack.levels.level import LevelContext, Misfits, Program
 from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
 from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
@@ -140,11 +140,18 @@ class ForceMotions(Motions):
     """Requests for forces and motions as calls. A call raises `LevelError` at once for a contact
     that is impossible."""
 
-    def __init__(self, bus: Bus, context: LevelContext) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        motion: HostReceiver[ServerStatus],
+        requests: HostSender[ServerRequest],
+        context: LevelContext,
+    ) -> None:
+        self._server = motion
         self._program = ForceProgram.model_validate(dict(context.task))
         self._sign_ticks = round(SIGN_S / context.tick_s)
         self._signed = bus.tick  # tick of the last sign of life
-        super().__init__(bus, context.robot, context.scene)
+        super().__init__(bus, motion, requests, context)
 
     def comply(self, contact: str, **changes: Any) -> int:
         """Make axes ones of force, at rest; done when their forces are as wanted."""
@@ -171,8 +178,7 @@ class ForceMotions(Motions):
     @property
     def _status(self) -> ServerStatus:
         """The newest status of the server."""
-        status: ServerStatus = self._bus.read("motion").message
-        return status
+        return self._server.read().message
 
     def wrench(self) -> Mapping[str, float]:
         """Return the wrench of the tool on the surroundings, N, N m, by axis of the task frame."""
@@ -212,17 +218,17 @@ class ForceMotions(Motions):
     def _look(self) -> None:
         if self._bus.tick - self._signed >= self._sign_ticks:
             self._signed = self._bus.tick
-            self._bus.send("requests", id=0)
+            self._send({"id": 0})
         super()._look()
 
 
 class ForceClient(CommandEnvironment):
     """Runs a script that commands forces and motions by name; a prompt offers the same names."""
 
-    motion = Input(ServerStatus, "below.motion")
-    requests = Output(ServerRequest)
+    motion = ProgramInput(ServerStatus, "below.motion")
+    requests = ProgramOutput(ServerRequest)
     program = ForceProgram
 
     def motions(self, bus: Bus) -> Motions:
         """Return what makes requests of calls."""
-        return ForceMotions(bus, self.context)
+        return ForceMotions(bus, self.motion, self.requests, self.context)

@@ -185,8 +185,8 @@ class GraspStatus(AnsweringStatus, version=1):
 
 
 class GraspPlan(RelayedCommand, version=1):
-    """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on an
-    object, and the posture from which they close. The newest plan with an `id` above 0 is used."""
+    """From a planner, on a board or on the host side, to the grasp loop: contacts of the fingers on
+    an object, and the posture from which they close. The newest with an `id` above 0 is used."""
 
     object: int = integer("row of the object in the world model", "i2")
     sensed: int = field(unit="tick", doc="tick of the world model on which it depends")

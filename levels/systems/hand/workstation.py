@@ -26,8 +26,8 @@ from pydantic import Field
 from rack.backplane.words import Block
 from rack.levels.algebra import Array, Ints, norm, transposed_mat_vec
 from rack.levels.errors import LevelError
-from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input, LevelContext, Output
+from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
+from rack.levels.level import LevelContext
 from rack.levels.messages import WorldState
 from rack.levels.robot.cell import Cell, cell_of
 from rack.levels.systems.hand.kinematics import FingerKinematics
@@ -243,9 +243,9 @@ class WorkstationParams(Table):
 class Workstation(HostProgram):
     """Plans a grasp of one object, and plans it again if the object moves before it is gripped."""
 
-    world = Input(WorldState, "below.world")
-    grasp = Input(GraspStatus, "below.grasp")
-    plan = Output(GraspPlan)
+    world = ProgramInput(WorldState, "below.world")
+    grasp = ProgramInput(GraspStatus, "below.grasp")
+    plan = ProgramOutput(GraspPlan)
     params = WorkstationParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -264,15 +264,15 @@ class Workstation(HostProgram):
         """Plan grasps until the run is over."""
         while not bus.is_over:
             bus.wait(self._params.every_s)
-            self.plan_grasp(bus)
+            self.plan_grasp()
 
-    def plan_grasp(self, bus: Bus) -> PlannedGrasp | None:
+    def plan_grasp(self) -> PlannedGrasp | None:
         """Plan and send a grasp if one is needed; return the newest grasp, None without one."""
-        world = bus.read("world")
-        status = bus.read("grasp")
+        world = self.world.read()
+        status = self.grasp.read()
         if not (world.is_there and status.is_there) or status.message.kind > GraspKind.PRESHAPE:
             return self._planned
-        model: WorldState = world.message
+        model = world.message
         position = model.position[self._row]
         if norm(position - self._at) < MOVED_M:
             return self._planned
@@ -280,21 +280,20 @@ class Workstation(HostProgram):
         grasp = self._planner.plan(self._row, position, model.quaternion[self._row])
         self._planned = grasp
         if grasp is not None:
-            bus.send(
-                "plan",
-                object=self._row,
-                sensed=model.sensed,
-                contact=grasp.contact,
-                normal=grasp.normal,
-                posture=grasp.posture,
-                grip=grasp.grip,
-            )
+            plan = self.plan.message
+            plan.object = self._row
+            plan.sensed = model.sensed
+            plan.contact = grasp.contact
+            plan.normal = grasp.normal
+            plan.posture = grasp.posture
+            plan.grip = grasp.grip
+            self.plan.send()
         return grasp
 
     def names(self, bus: Bus) -> Mapping[str, Any]:
         """Return the functions that a prompt offers, by name."""
         return {
-            "plan": lambda: self.plan_grasp(bus),
+            "plan": self.plan_grasp,
             "boards": lambda: self.read_counts(bus),
         }
 

@@ -21,15 +21,22 @@ from pathlib import Path
 from typing import Any
 
 from rack.levels.errors import LevelError
-from rack.levels.host_program import Bus, HostProgram
-from rack.levels.level import Input, LevelContext, Output
+from rack.levels.host_program import (
+    Bus,
+    HostProgram,
+    HostReceiver,
+    HostSender,
+    ProgramInput,
+    ProgramOutput,
+)
+from rack.levels.level import LevelContext
 from rack.levels.systems.trajectory.messages import (
     MotionKind,
     MotionRequest,
     MotionStatus,
     RequestEnd,
 )
-from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, Table, read_params
+from rack.levels.tables import GripperConfig, Table, read_params
 
 DOWN = (0.0, 1.0, 0.0, 0.0)
 """Orientation of a tool that points straight down, w, x, y, z."""
@@ -46,12 +53,20 @@ class Motions:
     What a former process of the board has left in the queue is cancelled first.
     """
 
-    def __init__(self, bus: Bus, robot: RobotConfig, scene: SceneConfig) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        motion: HostReceiver[MotionStatus],
+        requests: HostSender[MotionRequest],
+        context: LevelContext,
+    ) -> None:
         self._bus = bus
-        self._robot = robot
-        self._bodies = scene.bodies
+        self._motion = motion
+        self._requests = requests
+        self._robot = context.robot
+        self._bodies = context.scene.bodies
         # No request of a former process has a greater number than it has sent messages.
-        self._newest = bus.sent("requests")
+        self._newest = requests.sent
         self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
         # Time since when nothing is under way, though requests are open.
         self._idle_since: float | None = None
@@ -145,19 +160,28 @@ class Motions:
 
     @property
     def _status(self) -> MotionStatus:
-        """The newest `MotionStatus`, or that of the level in its place."""
-        status: MotionStatus = self._bus.read("motion").message
-        return status
+        """The newest status of the level that moves the arm."""
+        return self._motion.read().message
 
     def _request(self, **fields: Any) -> int:
         request = {"body": WORLD, **fields, "id": self._newest + 1}
-        while not self._bus.send("requests", **request):
+        while not self._send(request):
             if self._bus.is_over:
                 raise LevelError("the run is over")
             self._look()
         self._newest += 1
         self._open[self._newest] = request
         return self._newest
+
+    def _send(self, fields: Mapping[str, Any]) -> bool:
+        """Send a request with these fields, all others 0. Raises `AttributeError` for an unknown
+        field."""
+        request = self._requests.message
+        # One that was refused, or had an unknown field, has left its fields.
+        request.clear()
+        for name, value in fields.items():
+            setattr(request, name, value)
+        return self._requests.send()
 
     def _look(self) -> None:
         """Wait for news; send the requests again that are lost: nothing is under way, and not all
@@ -176,7 +200,7 @@ class Motions:
             self._idle_since = None
             # One that only waits is there twice then, and done once.
             for request in self._open.values():
-                self._bus.send("requests", **request)
+                self._send(request)
 
 
 class ScriptParams(Table):
@@ -189,8 +213,8 @@ class ScriptParams(Table):
 class CommandEnvironment(HostProgram):
     """Runs a script that commands motions by name; a prompt offers the same names."""
 
-    motion = Input(MotionStatus, "below.motion")
-    requests = Output(MotionRequest)
+    motion = ProgramInput(MotionStatus, "below.motion")
+    requests = ProgramOutput(MotionRequest)
     params = ScriptParams
 
     def __init__(self, context: LevelContext) -> None:
@@ -213,4 +237,4 @@ class CommandEnvironment(HostProgram):
 
     def motions(self, bus: Bus) -> Motions:
         """Return what makes requests of calls."""
-        return Motions(bus, self.context.robot, self.context.scene)
+        return Motions(bus, self.motion, self.requests, self.context)

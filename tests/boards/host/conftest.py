@@ -20,6 +20,7 @@ from rack.boards.host.entries import Outward
 from rack.boards.run.ports import InputPorts, OutputPorts
 from tests.boards.conftest import MakeConfig
 from tests.boards.host.test_board import HOSTED
+from tests.boards.host_programs import Host
 
 EVERY = 4
 """Ticks of a cycle of the bridge."""
@@ -108,3 +109,21 @@ def open_bus() -> Iterator[Callable[[Site], HostBus]]:
 
 
 OpenBus = Callable[[Site], HostBus]
+
+
+@pytest.fixture
+def open_program(open_bus: OpenBus) -> Callable[[Site], Host]:
+    def open_it(site: Site) -> Host:
+        return connected(open_bus(site), site)
+
+    return open_it
+
+
+def connected(bus: HostBus, site: Site) -> Host:
+    """Return the board's program, with its ports."""
+    program = Host(site.plan.hosts[0].context)
+    bus.connect(program)
+    return program
+
+
+OpenProgram = Callable[[Site], Host]

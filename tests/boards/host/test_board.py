@@ -18,8 +18,9 @@ from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config import resolve
 from rack.boards.host.bus import HostBus
+from rack.levels.errors import LevelError
 from tests.boards.conftest import CLOCK, MakeConfig
-from tests.boards.host_programs import Failing
+from tests.boards.host_programs import Failing, Host
 from tests.boards.runs import end_of, stop
 from tests.processes import BOUND_S, runs, wait_until
 
@@ -180,19 +181,24 @@ def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConf
     with Rack(found) as rack:
         rack.start()
         (wiring,) = resolve(found).hosts
+        program = Host(wiring.context)
         first = HostBus(rack.segment, wiring)
         with pytest.raises(
             MailboxError, match=rf"'program' is already running \(process {os.getpid()}\)"
         ):
             HostBus(rack.segment, wiring)
-        assert first.send("numbers", value=2.0)
+        with pytest.raises(LevelError, match="port 'numbers': no board has connected it"):
+            program.send_number(2.0)
+        first.connect(program)
+        assert program.send_number(2.0)
         first.close()
         second = HostBus(rack.segment, wiring)
-        assert second.send("numbers", value=3.0)
-        wait_until(lambda: rack.watch(0.01) and second.read("sum").message.last == 2)
-        assert (second.read("sum").message.sum, second.sent("numbers")) == (5.0, 2)
+        second.connect(program)
+        assert program.send_number(3.0)
+        wait_until(lambda: rack.watch(0.01) and program.sum.read().message.last == 2)
+        assert (program.sum.read().message.sum, program.numbers.sent) == (5.0, 2)
         with pytest.raises(AttributeError, match="no field 'valu'; did you mean 'value'"):
-            second.send("numbers", valu=1)
+            program.numbers.message.valu = 1  # type: ignore[attr-defined]
         second.finish()
         assert end_of(rack).cause == "task done"
         assert second.is_over

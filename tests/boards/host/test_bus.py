@@ -7,10 +7,15 @@ import time
 import pytest
 
 from rack.backplane.errors import MailboxError
+from rack.backplane.message import State
 from rack.backplane.semaphores import done_semaphore, wake_semaphore
 from rack.backplane.words import Block, Head, System, TaskState
 from rack.boards.host.bus import WORD, HostBus
-from tests.boards.host.conftest import MakeSite, OpenBus
+from rack.levels.errors import LevelError
+from rack.levels.host_program import HostProgram
+from rack.levels.level import Input
+from tests.boards.host.conftest import MakeSite, OpenBus, OpenProgram
+from tests.boards.host_programs import Sum
 from tests.processes import BOUND_S, in_thread, wait_until
 
 TICK_S = 0.0025
@@ -38,34 +43,56 @@ def test_no_fault_can_signal_a_program_of_another_pid_namespace(
         HostBus(site.segment, site.plan.hosts[0])
 
 
-def test_a_message_without_an_id_has_its_number(make_site: MakeSite, open_bus: OpenBus) -> None:
+def test_a_message_without_an_id_has_its_number(
+    make_site: MakeSite, open_program: OpenProgram
+) -> None:
     site = make_site()
-    bus = open_bus(site)
-    for value, given in ((1.5, {}), (2.5, {"id": 40}), (3.5, {})):
-        assert bus.send("numbers", value=value, **given)
+    program = open_program(site)
+    for number, value in ((1, 1.5), (40, 2.5), (3, 3.5)):
+        message = program.numbers.message
+        assert (message.id, message.value) == (program.numbers.sent + 1, 0.0)
+        message.id = number
+        message.value = value
+        assert program.numbers.send()
     site.cycle()
-    reading = bus.read("sum")
-    assert not reading.is_there
+    assert not program.sum.read().is_there
     ids = []
     entry = site.adapter._entries[0][1]
     ring = entry._ring._slots  # type: ignore[attr-defined]
     for serial in (1, 2, 3):
         assert ring.fetch(serial)
         ids.append((ring.message.id, ring.message.value, ring.message.colour))
-    # A field that is not given is zero, whatever the message before it had.
+    # A field that is not filled is zero, whatever the message before it had.
     assert ids == [(1, 1.5, 0), (40, 2.5, 0), (3, 3.5, 0)]
-    assert bus.sent("numbers") == 3
+    assert program.numbers.sent == 3
 
 
-def test_unknown_ports_and_fields_are_named(make_site: MakeSite, open_bus: OpenBus) -> None:
-    bus = open_bus(make_site())
-    with pytest.raises(AttributeError, match="no port 'number'; ports: numbers"):
-        bus.send("number", value=1.0)
-    with pytest.raises(AttributeError, match="no port 'numbers'; ports: sum"):
-        bus.read("numbers")
-    with pytest.raises(AttributeError, match="speed"):
-        bus.send("numbers", speed=1.0)
-    assert bus.sent("numbers") == 0
+def test_a_message_that_is_not_sent_stays_as_it_is(
+    make_site: MakeSite, open_program: OpenProgram
+) -> None:
+    site = make_site()
+    program = open_program(site)
+    while program.send_number(1.0):
+        pass
+    sent = program.numbers.sent
+    assert sent == site.segment.layout.mailbox("program.numbers").capacity
+    assert (program.numbers.message.id, program.numbers.message.value) == (sent + 1, 1.0)
+    site.cycle()
+    assert program.numbers.send()
+    assert (program.numbers.sent, program.numbers.message.value) == (sent + 1, 0.0)
+
+
+def test_unknown_fields_and_ports_of_levels_are_named(
+    make_site: MakeSite, open_program: OpenProgram
+) -> None:
+    program = open_program(make_site())
+    with pytest.raises(AttributeError, match="message 'number' has no field 'speed'; fields: id, "):
+        program.numbers.message.speed = 1.0  # type: ignore[attr-defined]
+    assert program.sum.read().message.state is State.IDLE
+    with pytest.raises(LevelError, match="'sum' is a level's Input; permitted: ProgramInput, "):
+
+        class _OfALevel(HostProgram):
+            sum = Input(Sum, "below.sum")
 
 
 def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bus: OpenBus) -> None:

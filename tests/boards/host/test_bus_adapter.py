@@ -12,19 +12,19 @@ from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.entries import NEVER, EntryConfig, Replayed
 from rack.boards.run.ports import InputPorts, OutputPorts
 from tests.bare_level import BareLevel
-from tests.boards.host.conftest import EVERY, MakeSite, OpenBus
+from tests.boards.host.conftest import EVERY, MakeSite, OpenBus, OpenProgram, connected
 
 NEWEST = ("board.bridge.params.pass.numbers.asynchronous=false",)
 
 
 def test_each_message_crosses_once_and_in_order_as_many_as_a_cycle_may_take(
-    make_site: MakeSite, open_bus: OpenBus
+    make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site("board.bridge.params.pass.numbers.most=3")
-    bus = open_bus(site)
-    sent = [bus.send("numbers", value=float(k)) for k in range(1, 6)]
+    program = open_program(site)
+    sent = [program.send_number(float(k)) for k in range(1, 6)]
     assert sent == [True] * 5
-    assert bus.sent("numbers") == 5
+    assert program.numbers.sent == 5
     site.cycle()
     assert site.count("numbers") == {"passed": 3, "waiting": 2}
     site.segment.words[System.TICK] = 6
@@ -36,12 +36,12 @@ def test_each_message_crosses_once_and_in_order_as_many_as_a_cycle_may_take(
 
 
 def test_of_messages_that_are_sampled_the_newest_crosses(
-    make_site: MakeSite, open_bus: OpenBus
+    make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site(*NEWEST)
-    bus = open_bus(site)
+    program = open_program(site)
     for k in range(1, 4):
-        assert bus.send("numbers", value=float(k))
+        assert program.send_number(float(k))
     site.cycle()
     assert (site.crossed(), site.count("numbers")) == ([3.0], {"passed": 1, "superseded": 2})
     site.cycle()
@@ -50,12 +50,12 @@ def test_of_messages_that_are_sampled_the_newest_crosses(
 
 @pytest.mark.parametrize("settings", [(), NEWEST])
 def test_what_no_number_may_be_is_refused_and_counted(
-    make_site: MakeSite, open_bus: OpenBus, settings: tuple[str, ...]
+    make_site: MakeSite, open_program: OpenProgram, settings: tuple[str, ...]
 ) -> None:
     site = make_site(*settings)
-    bus = open_bus(site)
+    program = open_program(site)
     site.cycle()
-    assert bus.send("numbers", value=float("nan"))
+    assert program.send_number(float("nan"))
     site.cycle()
     nothing_yet = {"arrived": NEVER, "age": NEVER}
     assert site.count("numbers") == {"refused": 1} | nothing_yet
@@ -63,22 +63,22 @@ def test_what_no_number_may_be_is_refused_and_counted(
 
 
 def test_a_full_ring_refuses_and_the_bridge_says_how_often(
-    make_site: MakeSite, open_bus: OpenBus
+    make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site()
-    bus = open_bus(site)
+    program = open_program(site)
     capacity = site.segment.layout.mailbox("program.numbers").capacity
-    answers = [bus.send("numbers") for _ in range(capacity + 2)]
+    answers = [program.numbers.send() for _ in range(capacity + 2)]
     assert answers == [True] * capacity + [False] * 2
     site.cycle()
     assert site.count("numbers")["full"] == 2
 
 
 def test_what_a_program_still_computes_does_not_cross(
-    make_site: MakeSite, open_bus: OpenBus
+    make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site()
-    assert open_bus(site).send("numbers", value=1.0)
+    assert open_program(site).send_number(1.0)
     site.host[Block.DEADLINE] = EVERY
     site.cycle()
     assert site.count("numbers") == {"waiting": 1, "arrived": NEVER, "age": NEVER}
@@ -87,23 +87,23 @@ def test_what_a_program_still_computes_does_not_cross(
 
 
 def test_a_restarted_bridge_counts_on_and_repeats_what_it_said(
-    make_site: MakeSite, open_bus: OpenBus
+    make_site: MakeSite, open_program: OpenProgram
 ) -> None:
     site = make_site(*NEWEST)
-    bus = open_bus(site)
+    program = open_program(site)
     for value in (1.0, 2.0, float("nan")):
-        bus.send("numbers", value=value)
+        program.send_number(value)
     site.cycle()
     before = site.count("numbers")
     assert before == {"passed": 1, "refused": 1, "superseded": 1}
     site.restart()
-    bus.send("numbers", value=float("nan"))
+    program.send_number(float("nan"))
     site.cycle()
     assert site.crossed() == [2.0]
     assert site.count("numbers") == before | {"refused": 2, "age": EVERY}
     site.restart()
     for value in (3.0, 4.0):
-        bus.send("numbers", value=value)
+        program.send_number(value)
     site.cycle()
     assert site.crossed() == [4.0]
     assert site.count("numbers") == {
@@ -118,6 +118,7 @@ def test_a_restarted_bridge_counts_on_and_repeats_what_it_said(
 def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: OpenBus) -> None:
     site = make_site()
     bus = open_bus(site)
+    program = connected(bus, site)
     semaphore = wake_semaphore(site.segment, "program")
     site.cycle()
     assert (semaphore.value, site.count("sum")) == (0, {"arrived": NEVER, "age": NEVER})
@@ -134,7 +135,7 @@ def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: Op
     # A sample crosses in each cycle; it was written at tick 1.
     assert site.count("sum") == {"passed": 2, "arrived": 8, "age": 7}
     assert bus.wait(0.0)
-    assert bus.read("sum").message.sum == 2.5
+    assert program.sum.read().message.sum == 2.5
     assert not bus.wait(0.0)
 
 

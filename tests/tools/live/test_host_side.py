@@ -134,7 +134,9 @@ def test_a_prompt_reaches_the_levels_and_a_second_one_is_refused(
         # A prompt that was killed leaves its place to the next one.
         script = hosted.parent / "more.py"
         script.write_text(
-            "number(5)\nwhile bus.read('sum').message.sum < 9:\n    bus.wait(1.0)\nbus.finish()\n"
+            "number(5)\n"
+            "while program.sum.read().message.sum < 9:\n    bus.wait(1.0)\n"
+            "bus.finish()\n"
         )
         done = rack("prompt", rack_name, "program", script)
         assert (done.returncode, done.stderr) == (0, "")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +13,10 @@ import pytest
 import rack
 from rack.boards import Rack
 from rack.boards.config import load
+from rack.boards.events import Event
 from rack.tools.live.display import Display
 from rack.tools.live.launch import run_rack
+from rack.tools.recording.checksums import checked_line
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED
 from tests.conftest import SMALL
@@ -85,12 +89,75 @@ def test_events_and_report_are_those_of_the_run(small: Path) -> None:
     assert (small / "report.json").is_file()
 
 
+def test_runs_and_signals_say_what_they_are(small: Path) -> None:
+    run = rack.open_run(small)
+    name = run._recording.layout.rack
+    ends = f"time over, {len(run.signals)} signals>"
+    assert repr(run) == f"<run {small} of rack '{name}': {ends}"
+    count = run.signals["lower.status.count"]
+    assert repr(run.signals).startswith(f"<{len(run.signals)} signals of ")
+    assert repr(run.at(1.2)) == f"<run {small} at 1.2 s, tick 480>"
+    spec = count.signal.spec
+    assert (count.meaning, count.unit) == (spec.meaning, "")
+    assert repr(count) == f"<signal lower.status.count: {spec.meaning}>"
+
+
+def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
+    from matplotlib import pyplot
+
+    folder = tmp_path / "run"
+    shutil.copytree(small, folder)
+    with (folder / "events.jsonl").open("a") as events:
+        for tick, kind, code, text in (
+            (400, "fault", "begins", "wave begins"),
+            (800, "fault", "begins", "kill begins"),
+            (800, "died", "died", "board 'lower' ended"),
+            (900, "fault", "ends", "wave ends"),
+        ):
+            event = Event(0, tick, kind, "lower", text, code)  # type: ignore[arg-type]
+            events.write(checked_line(asdict(event)))
+    signals = rack.open_run(folder).signals
+    axes = signals["lower.status.count"].plot()
+    count, *marks = axes.get_lines()
+    np.testing.assert_array_equal(count.get_ydata(), signals["lower.status.count"].values)
+    assert axes.get_xlabel() == "simulated time, s"
+    assert axes.get_ylabel() == "lower.status.count"
+    assert [(mark.get_xdata()[0], mark.get_label()) for mark in marks] == [
+        (1.0, "1 s: lower: wave begins"),
+        (2.0, "2 s: board 'lower' ended"),
+    ]
+    state = signals["lower.status.state"].plot(pyplot.figure().add_subplot())
+    assert "executing" in [label.get_text() for label in state.get_yticklabels()]
+    pyplot.close("all")
+    with pytest.raises(rack.Failure, match=r"^lower\.status\.reason: text; a plot needs numbers"):
+        signals["lower.status.reason"].plot()
+
+
+def test_a_plot_of_an_array_has_a_curve_a_number(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    from matplotlib import pyplot
+
+    axes = rack.open_run(nasrem_run(tmp_path_factory)).signals["servo.status.position"].plot()
+    assert [line.get_label() for line in axes.get_lines()] == [f"[{joint}]" for joint in range(6)]
+    assert axes.get_ylabel() == "servo.status.position, rad"
+    pyplot.close("all")
+
+
 def test_without_pandas_one_line_says_what_to_install(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(rack.Failure, match=r"^tables need pandas: pip install 'nasrem-rack\["):
         rack.open_run(small).to_pandas("lower.status")
+
+
+def test_without_matplotlib_one_line_says_what_to_install(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(rack.Failure, match=r"^no pictures: they need matplotlib: pip install 'n"):
+        rack.open_run(small).signals["lower.status.count"].plot()
 
 
 def test_a_rack_of_a_program_is_recorded(tmp_path: Path, rack_name: str) -> None:

@@ -2,16 +2,18 @@
 
     import rack
 
-    with rack.Rack.from_file("nasrem") as nasrem, rack.attach("nasrem") as live:
-        nasrem.run_in_background()
+    with rack.Rack("nasrem", lockstep=True, out="run") as nasrem, rack.attach("nasrem") as live:
+        nasrem.run_in_background(seconds=10)
         live.wait_until("servo.status.position[2] > -2.5", timeout_s=30)
         print(live["servo.status.torque"])
-    run = rack.open_run("runs/nasrem-20250101-120000")
-    run.signals["servo.status.position"].to_pandas()
+        nasrem.wait()
+    run = rack.open_run("run")
+    run.signals["servo.status.position"].plot()
 
-- `Rack` launches the boards of a config; `attach` reads and commands a rack that is running, of any
-  program; `open_run` reads what `rack run` or `rack record` left.
-- `Failure` is what goes wrong with either of the two; its text is that of the command.
+- `Rack` launches the boards of a config, and may record them; `attach` reads and commands a rack
+  that is running, of any program; `open_run` reads what `rack run` or `rack record` left.
+- `Failure` is what goes wrong with them; its text is that of the command. `ConfigError` is the one
+  that lists the mistakes of a config.
 
 Names are imported on first use: to import `rack` costs nothing.
 """
@@ -30,18 +32,22 @@ __path__ = [
 from rack.backplane.exports import on_first_use
 
 if TYPE_CHECKING:
-    from rack.boards.crate.rack import Rack
-    from rack.tools.console.answer import Failure
+    from rack.boards.errors import ConfigError, Failure
     from rack.tools.scripting.attached import attach
+    from rack.tools.scripting.launched import Rack
     from rack.tools.scripting.recorded import open_run
 
-__all__ = ["Failure", "Rack", "attach", "open_run"]
+__all__ = ["ConfigError", "Failure", "Rack", "attach", "open_run"]
 _PLACES = {
-    "rack.boards.crate.rack": ("Rack",),
-    "rack.tools.console.answer": ("Failure",),
+    "rack.boards.errors": ("ConfigError", "Failure"),
     "rack.tools.scripting.attached": ("attach",),
+    "rack.tools.scripting.launched": ("Rack",),
     "rack.tools.scripting.recorded": ("open_run",),
 }
 
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
     __getattr__ = on_first_use(__name__, _PLACES)
+
+
+def __dir__() -> list[str]:
+    return __all__

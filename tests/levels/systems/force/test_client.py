@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import copied
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.force.client import ForceMotions, ForceProgram
-from rack.levels.systems.force.messages import Mode, ServerStatus
+from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.messages import MotionKind
 from tests.levels.arms import config
 
@@ -39,12 +40,15 @@ CONTEXT = LevelContext(
 
 
 class Bus:
-    """Takes requests, and a tick of the clock for every wait."""
+    """Takes requests, and a tick of the clock for every wait; both ports of a program."""
+
+    sent = 0
 
     def __init__(self) -> None:
         self.tick, self.is_over = 0, False
-        self.requests: list[dict[str, Any]] = []
+        self.requests: list[ServerRequest] = []
         self.status = ServerStatus.zeros({"joints": 6})
+        self.message = ServerRequest.zeros({"joints": 6})
 
     @property
     def time_s(self) -> float:
@@ -54,15 +58,12 @@ class Bus:
         self.tick += 20
         return True
 
-    def read(self, port: str) -> Reading:
+    def read(self) -> Reading[ServerStatus]:
         return Reading(self.status, Verdict.NEW)
 
-    def send(self, port: str, **fields: Any) -> bool:
-        self.requests.append(fields)
+    def send(self) -> bool:
+        self.requests.append(copied(self.message))
         return True
-
-    def sent(self, port: str) -> int:
-        return 0
 
     def finish(self) -> None:
         """Do nothing."""
@@ -75,7 +76,7 @@ def bus() -> Bus:
 
 @pytest.fixture
 def arm(bus: Bus) -> ForceMotions:
-    return ForceMotions(bus, CONTEXT)
+    return ForceMotions(bus, bus, bus, CONTEXT)
 
 
 def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
@@ -83,20 +84,20 @@ def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
     arm.guard("wall")
     arm.free()
     comply, guard, free = bus.requests
-    assert [request["kind"] for request in bus.requests] == [
+    assert [request.kind for request in bus.requests] == [
         MotionKind.COMPLY,
         MotionKind.GUARD,
         MotionKind.COMPLY,
     ]
-    assert comply["selected"].tolist() == [False, False, True, True, False, False]
-    assert comply["wrench"].tolist() == [0, 0, 20, 0, 0, 0]
-    assert comply["speed"].tolist() == [0, 0, 0.1, 0, 0, 0]
-    assert guard["guard"].tolist() == [8, 0, 0, 0, 0.5, 0]
-    assert np.allclose(comply["frame"], guard["frame"])
-    assert "selected" not in free
+    assert comply.selected.tolist() == [0, 0, 1, 1, 0, 0]
+    assert comply.wrench.tolist() == [0, 0, 20, 0, 0, 0]
+    assert comply.speed.tolist() == [0, 0, 0.1, 0, 0, 0]
+    assert guard.guard.tolist() == [8, 0, 0, 0, 0.5, 0]
+    assert np.allclose(comply.frame, guard.frame)
+    assert not free.selected.any()
     # The frame has the axes of the config.
     axes = np.zeros(9)
-    mujoco.mju_quat2Mat(axes, guard["frame"])
+    mujoco.mju_quat2Mat(axes, guard.frame)
     assert np.allclose(axes.reshape(3, 3)[:, 0], (0, 1, 0))
     assert np.allclose(axes.reshape(3, 3)[:, 2], (0, 0, -1))
     bus.status.wrench, bus.status.mode = (0, 0, 14.5, 0, 0, 0), Mode.FORCE
@@ -107,7 +108,7 @@ def test_calls_become_requests(bus: Bus, arm: ForceMotions) -> None:
 def test_a_wait_gives_signs_of_life(bus: Bus, arm: ForceMotions) -> None:
     request = arm.free()
     assert not arm.wait(request, until=lambda: bus.tick >= 1000)
-    signs = [fields for fields in bus.requests if fields["id"] == 0]
+    signs = [fields for fields in bus.requests if fields.id == 0]
     assert len(signs) == 9
 
 

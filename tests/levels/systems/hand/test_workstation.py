@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import Message, copied
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
-from rack.levels.systems.hand.messages import GraspKind
+from rack.levels.messages import WorldState
+from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
 from rack.levels.systems.hand.workstation import Workstation
 from tests.levels.arms import cell, config
 
@@ -19,20 +20,41 @@ START = HAND.start()
 SIZES = {"joints": 16, "fingers": 4, "bodies": 1, "state": 1}
 
 
+class Received:
+    """An input of a program, whose message the test sets."""
+
+    def __init__(self, message: Message) -> None:
+        self.message: Any = message
+        self.verdict = Verdict.OLD
+
+    def read(self) -> Reading[Any]:
+        return Reading(self.message, self.verdict)
+
+
+class Sent:
+    """An output of a program, whose messages the test looks at."""
+
+    def __init__(self) -> None:
+        self.message = GraspPlan.zeros(SIZES)
+        self.plans: list[GraspPlan] = []
+
+    def send(self) -> bool:
+        self.plans.append(copied(self.message))
+        return True
+
+
 class Crate:
-    """A bus with one board, whose messages the test sets: ports of `Workstation`. A second passes
-    between two looks."""
+    """A bus, and the ports of a `Workstation` on it. A second passes between two looks."""
 
     tasks = ("coordinator",)
     tick = 12
 
     def __init__(self) -> None:
-        self.messages = {
-            port: source.message.zeros(SIZES) for port, source in Workstation.inputs.items()
-        }
-        self.sends: list[dict[str, Any]] = []
+        self.world = Received(WorldState.zeros(SIZES))
+        self.grasp = Received(GraspStatus.zeros(SIZES))
+        self.plan = Sent()
         self.looks = 20
-        world = self.messages["world"]
+        world = self.world.message
         world.position, world.quaternion = START.xpos[HAND.bodies], START.xquat[HAND.bodies]
         world.sensed = 7
 
@@ -48,13 +70,8 @@ class Crate:
     def wait(self, timeout_s: float) -> bool:
         return True
 
-    def read(self, port: str) -> Reading:
-        return Reading(self.messages[port], Verdict.OLD)
-
-    def send(self, port: str, **fields: Any) -> bool:
-        assert port == "plan"
-        self.sends.append(fields)
-        return True
+    def connect(self, host: Workstation) -> None:
+        vars(host).update(world=self.world, grasp=self.grasp, plan=self.plan)
 
 
 def workstation(**params: Any) -> Workstation:
@@ -83,24 +100,24 @@ def workstation(**params: Any) -> Workstation:
 @pytest.mark.slow
 def test_it_plans_once_and_anew_when_the_object_moves_before_it_is_held() -> None:
     crate, host = Crate(), workstation()
+    crate.connect(host)
     host.run(crate)  # type: ignore[arg-type]
-    (plan,) = crate.sends
-    assert (plan["object"], plan["sensed"]) == (0, 7)
-    assert {key: np.shape(plan[key]) for key in ("contact", "normal", "posture")} == {
-        "contact": (4, 3),
-        "normal": (4, 3),
-        "posture": (16,),
-    }
-    crate.messages["world"].position[0, 2] += 0.002
-    host.plan_grasp(crate)  # type: ignore[arg-type]
-    assert len(crate.sends) == 1
-    crate.messages["world"].position[0, 0] += 0.004
-    host.plan_grasp(crate)  # type: ignore[arg-type]
-    assert len(crate.sends) == 2
-    crate.messages["grasp"].kind = GraspKind.HOLD
-    crate.messages["world"].position[0, 0] += 0.01
-    host.plan_grasp(crate)  # type: ignore[arg-type]
-    assert len(crate.sends) == 2
+    (plan,) = crate.plan.plans
+    assert (plan.object, plan.sensed) == (0, 7)
+    assert plan.contact.any(axis=1).all()
+    assert plan.normal.any(axis=1).all()
+    assert plan.posture.any()
+    assert plan.grip > 0.0
+    crate.world.message.position[0, 2] += 0.002
+    host.plan_grasp()
+    assert len(crate.plan.plans) == 1
+    crate.world.message.position[0, 0] += 0.004
+    host.plan_grasp()
+    assert len(crate.plan.plans) == 2
+    crate.grasp.message.kind = GraspKind.HOLD
+    crate.world.message.position[0, 0] += 0.01
+    host.plan_grasp()
+    assert len(crate.plan.plans) == 2
 
 
 def test_it_waits_until_it_knows_object_and_coordinator() -> None:
@@ -109,6 +126,7 @@ def test_it_waits_until_it_knows_object_and_coordinator() -> None:
     with pytest.raises(LevelError, match="opposing = little: the hand has no such finger"):
         workstation(opposing="little")
     crate, host = Crate(), workstation()
-    crate.read = lambda port: Reading(crate.messages[port], Verdict.NONE)  # type: ignore[method-assign]
+    crate.connect(host)
+    crate.world.verdict = crate.grasp.verdict = Verdict.NONE
     host.run(crate)  # type: ignore[arg-type]
-    assert not crate.sends
+    assert not crate.plan.plans

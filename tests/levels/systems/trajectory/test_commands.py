@@ -4,70 +4,84 @@ done."""
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
 
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import copied
 from rack.levels.errors import LevelError
+from rack.levels.level import LevelContext
 from rack.levels.systems.trajectory.commands import Motions
-from rack.levels.systems.trajectory.messages import MotionKind, MotionStatus, RequestEnd
+from rack.levels.systems.trajectory.messages import (
+    MotionKind,
+    MotionRequest,
+    MotionStatus,
+    RequestEnd,
+)
 from tests.levels.arms import config
 
 PUMA, SCENE = config("puma560")
 SIZES = {"joints": 6}
+CONTEXT = LevelContext(
+    board="program",
+    every=1,
+    within_cycles=1,
+    clock_ns=1_000_000,
+    seed=1,
+    robot=PUMA,
+    scene=SCENE,
+    task={},
+    sizes=SIZES,
+)
 
 
 class Level:
-    """A bus with a level at its other end, which does one request at each wait, a second. `room`
-    messages may wait."""
+    """A bus with a level at its other end, which does one request at each wait, a second; and both
+    ports of its program. `room` messages may wait."""
 
     def __init__(self, room: int = 100, sent: int = 0) -> None:
-        self.room, self.serial, self.is_over, self.tick = room, sent, False, 0
+        self.room, self.sent, self.is_over, self.tick = room, sent, False, 0
         self.time_s = 0.0
-        self.queue: deque[dict[str, Any]] = deque()
-        self.done: list[dict[str, Any]] = []
+        self.queue: deque[MotionRequest] = deque()
+        self.done: list[MotionRequest] = []
         self.loses: set[int] = set()
         self.status = MotionStatus.zeros(SIZES)
+        self.message = MotionRequest.zeros(SIZES)
 
     def wait(self, timeout_s: float) -> bool:
         """Do the next request, or lose it."""
         self.time_s += 1.0
         if self.queue:
             request = self.queue.popleft()
-            if request["id"] in self.loses:
-                self.loses.remove(request["id"])
+            if request.id in self.loses:
+                self.loses.remove(request.id)
             elif (
-                request["id"] == self.status.done + 1
+                request.id == self.status.done + 1
                 or not self.done
-                or request["kind"] == MotionKind.CANCEL
+                or request.kind == MotionKind.CANCEL
             ):
                 self.done.append(request)
-                self.status.done = self.status.taken = request["id"]
-                self.status.ended[0], self.status.ends[0] = request["id"], RequestEnd.DONE
+                self.status.done = self.status.taken = request.id
+                self.status.ended[0], self.status.ends[0] = request.id, RequestEnd.DONE
         return True
 
-    def read(self, port: str) -> Reading:
-        assert port == "motion"
+    def read(self) -> Reading[MotionStatus]:
         return Reading(self.status, Verdict.NEW)
 
-    def send(self, port: str, **fields: Any) -> bool:
-        assert port == "requests"
+    def send(self) -> bool:
         if len(self.queue) >= self.room:
             return False
-        self.serial += 1
-        self.queue.append(fields)
+        self.sent += 1
+        self.queue.append(copied(self.message))
+        self.message.clear()
         return True
-
-    def sent(self, port: str) -> int:
-        return self.serial
 
     def finish(self) -> None:
         """Do nothing."""
 
 
 def motions(level: Level) -> Motions:
-    return Motions(level, PUMA, SCENE)
+    return Motions(level, level, level, CONTEXT)
 
 
 def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> None:
@@ -79,11 +93,11 @@ def test_calls_become_requests_in_their_order_and_wait_ends_with_the_last() -> N
     last = arm.move()
     assert (last, arm.done()) == (4, False)
     assert arm.wait()
-    assert [request["id"] for request in level.done] == [1, 2, 3, 4]
+    assert [request.id for request in level.done] == [1, 2, 3, 4]
     kinds = [MotionKind.GRIP, MotionKind.POSE, MotionKind.GRIP, MotionKind.JOINTS]
-    assert [request["kind"] for request in level.done] == kinds
-    assert (level.done[1]["body"], level.done[1]["segment"]) == (SCENE.bodies.index("block2"), 2.0)
-    assert level.done[3]["joints"] == PUMA.home
+    assert [request.kind for request in level.done] == kinds
+    assert (level.done[1].body, level.done[1].segment) == (SCENE.bodies.index("block2"), 2.0)
+    assert tuple(level.done[3].joints) == PUMA.home
     assert arm.end_of(last) is RequestEnd.DONE
     first, last = arm.stay(0.1), arm.stay(0.1)
     # A wait ends when its condition holds.
@@ -105,14 +119,14 @@ def test_with_a_full_queue_or_a_lost_request_nothing_is_left_out(
     for _ in range(10):
         arm.stay(0.1)
     assert arm.wait()
-    assert [request["id"] for request in level.done] == [*range(1, 11)]
+    assert [request.id for request in level.done] == [*range(1, 11)]
 
 
 def test_a_process_that_is_restarted_cancels_first_and_numbers_beyond_all_before() -> None:
     level = Level(sent=7)
     arm = motions(level)
     arm.stay(0.1)
-    assert [(request["id"], request["kind"]) for request in level.queue] == [
+    assert [(request.id, request.kind) for request in level.queue] == [
         (8, MotionKind.CANCEL),
         (9, MotionKind.STAY),
     ]

@@ -1,0 +1,159 @@
+"""A rack that a Python program launches, and may record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import asdict
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from rack.boards import Rack as CrateRack
+from rack.boards.config import load
+from rack.boards.config.schema import RackConfig
+from rack.boards.events import Event
+from rack.tools.live.display import Display
+from rack.tools.live.folder import EventLog, folder_of
+from rack.tools.live.holds import Standstill
+from rack.tools.live.launch import NO_RECORDER, begin_folder, compare_recording, result_of
+from rack.tools.recording.recorder_process import RecorderProcess
+from rack.tools.scripting.settings import settings_of
+
+
+class LaunchedRack(CrateRack):
+    """A rack of boards, launched by a program. Use it as a context: it ends with the block.
+
+    ```python
+    with Rack("nasrem", lockstep=True, settings={"clock.speed": 2}, out="run") as nasrem:
+        print(nasrem.run(seconds=10))
+    ```
+    """
+
+    def __init__(
+        self,
+        config: str | Path | RackConfig,
+        *,
+        lockstep: bool = False,
+        settings: Mapping[str, Any] = MappingProxyType({}),
+        faults: str | Path | None = None,
+        out: str | Path | None = None,
+        on_event: Callable[[Event], None] | None = None,
+    ) -> None:
+        """Read the config; `launch`, or the context, starts its boards.
+
+        Args:
+            config: A config by name or path, or a loaded one.
+            lockstep: Start a tick only when every due task has finished: exact and repeatable.
+            settings: Values in place of the config's, by dotted keys or nested:
+                {"clock.speed": 2} or {"clock": {"speed": 2}}. A key that contains a dot is quoted,
+                as in TOML.
+            faults: A fault script by name or path.
+            out: Folder into which the run is recorded, as `rack run` does; it is created, and must
+                be empty. None: the run is not recorded.
+            on_event: Called with every event, as it happens.
+
+        Raises:
+            ConfigError: The config, a setting or a fault has mistakes: all of them.
+            Failure: `out` holds files already.
+        """
+        wanted = [*settings_of(settings), *["clock.mode=lockstep"] * lockstep]
+        if not isinstance(config, RackConfig):
+            config = load(config, wanted, faults)
+        elif wanted or faults is not None:
+            raise TypeError("a loaded config takes no settings and no faults")
+        super().__init__(config, self._note)
+        self.folder = None if out is None else folder_of(Path(out), config.name)
+        self._on_event = on_event
+        self._record: RunRecord | None = None
+
+    def __repr__(self) -> str:
+        end = "not over" if self.outcome is None else self.outcome.cause
+        where = "not recorded" if self.folder is None else f"recorded into {self.folder}"
+        return f"<rack '{self.config.name}': {end}, {where}>"
+
+    def _note(self, event: Event) -> None:
+        if self._record is not None:
+            self._record.log.add(event)
+        if self._on_event is not None:
+            self._on_event(event)
+
+    def launch(self) -> None:
+        """Power on every board except the clock, and wait until all have passed their self-tests;
+        begin to record. Raises as `rack.boards.Rack.launch` does, and `Failure` for `out`."""
+        if self.folder is not None:
+            self._record = RunRecord(self.folder)
+        super().launch()
+        if self._record is not None:
+            try:
+                self._record.begin(self)
+            except BaseException:
+                self.close()
+                raise
+
+    def watch(self, timeout_s: float) -> bool:
+        """Supervise the boards for `timeout_s` or until the run is over; return False when it is
+        over. Raises `Failure` when its recording cannot be written."""
+        is_running = super().watch(timeout_s)
+        if self._record is not None:
+            self._record.look()
+        return is_running
+
+    def close(self) -> None:
+        """End everything: no process and no segment of this rack is left; finish the recording."""
+        record = self._record
+        if record is not None and self.outcome is not None:
+            record.await_begun()
+        super().close()
+        self._record = None
+        if record is not None:
+            record.finish(self)
+
+
+Rack = LaunchedRack
+"""Its name in the package `rack`."""
+
+
+class RunRecord:
+    """The recording of a run: its events, and the recorder's process, which imports its libraries
+    while the boards start."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._recorder = RecorderProcess(folder)
+        self._standstill: Standstill | None = None
+        self._began_s = 0.0
+        self.log = EventLog(Display())
+
+    def begin(self, rack: LaunchedRack) -> None:
+        """Record a rack that has been launched. Raises `Failure`."""
+        begin_folder(self._folder, rack.config, self.log)
+        if not self._recorder.attach(rack.config.name, None, rack.segment.words):
+            self._add(NO_RECORDER)
+        self._standstill = Standstill(rack.segment)
+        self._began_s = time.monotonic()
+
+    def look(self) -> None:
+        """Record what only the host side sees. Raises `Failure` when the recorder cannot write."""
+        for text in self._recorder.news():
+            self._add(text)
+        for event in () if self._standstill is None else self._standstill.look():
+            self.log.add(event)
+
+    def await_begun(self) -> None:
+        """Wait until the recorder has begun: later it would find no rack to attach to."""
+        self._recorder.await_begun()
+
+    def finish(self, rack: LaunchedRack) -> None:
+        """Finish the files of a rack that is closed; of a run that is over, write its outcome."""
+        wall_s = time.monotonic() - self._began_s
+        with closing(self.log):
+            why = self._recorder.finish()
+            if rack.outcome is not None:
+                found = compare_recording(self._folder, rack.segment, why, rack.outcome.ticks)
+                result = result_of(rack.segment, rack.config, rack.outcome, wall_s, *found)
+                self.log.end(asdict(result))
+
+    def _add(self, text: str) -> None:
+        self.log.add(Event(time.time_ns(), -1, "recorder", "", text))

@@ -1,0 +1,40 @@
+"""Settings as values of Python, for a rack that a program launches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from rack.boards.errors import ConfigError, Mistake
+
+
+def settings_of(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
+    """Yield the settings in tables of Python values, whose keys may be dotted, as --set takes them.
+
+    Raises:
+        ConfigError: A value is none of TOML.
+    """
+    for key, value in tables.items():
+        if isinstance(value, Mapping) and value:
+            yield from settings_of(value, f"{outer}{key}.")
+        else:
+            try:
+                yield f"{outer}{key}={_inline(value)}"
+            except TypeError as error:
+                raise ConfigError([Mistake("settings", f"{outer}{key}", str(error))]) from None
+
+
+def _inline(value: Any) -> str:
+    """Return a Python value as TOML on one line; an array of numpy as a list, a path as text."""
+    if isinstance(value, Mapping):
+        items = (f"{_inline(str(key))} = {_inline(item)}" for key, item in value.items())
+        return f"{{{', '.join(items)}}}"
+    if isinstance(value, np.ndarray | list | tuple):
+        return f"[{', '.join(map(_inline, value))}]"
+    plain = str(value) if isinstance(value, Path) else value
+    plain = plain.item() if isinstance(plain, np.generic) else plain
+    return tomli_w.dumps({"value": plain}).partition("=")[2].strip()
