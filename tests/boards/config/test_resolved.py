@@ -141,7 +141,7 @@ def test_in_lockstep_the_clock_is_on_the_core_of_the_fastest_board_that_gives_it
     cores = ["clock.core=0", "board.upper.core=0", "board.lower.core=1"]
 
     def core(*settings: str) -> int:
-        return resolve(load(small, [*cores, *settings]))._clock_core
+        return resolve(load(small, [*cores, *settings])).clock(None).core
 
     assert core() == 1
     assert core("clock.mode=realtime") == 0
