@@ -229,7 +229,7 @@ def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
     # By hand, once the first path is planned.
     arm._data.qpos[arm.cell.qpos[0]] -= 0.5
     arm._refresh()
-    arm._brake.hold_at(arm._state[0])
+    arm._rest[:] = arm._state[0]
     rack.run(0.5)
     operator.say("servo", Operation.ENABLE)
     assert rack.run_to_end(30.0).state == State.DONE

@@ -42,7 +42,7 @@ def test_samples_are_steps_of_the_resolution_a_joint_and_brakes_and_gate_see_the
     assert position[0] == pytest.approx(0.123, abs=1e-12)
     assert position[1] == robot.home[1]
     arm.brake()
-    assert arm._brake.rest[0] == 0.1234567
+    assert arm._rest[0] == 0.1234567
 
 
 @pytest.mark.slow
