@@ -14,10 +14,9 @@ sees when it ends, or is not `heard` any more.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
 
 from rack.backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
 from rack.backplane.byte_lock import ByteLock, locked
@@ -92,19 +91,6 @@ class RequestEntry:
         )
 
 
-class RequestClaim(NamedTuple):
-    """A request that its client has added. While it waits, its `lock` shows that the client
-    lives."""
-
-    entry: RequestEntry
-    ticket: int
-    lock: ByteLock
-
-    def leave(self) -> None:
-        """Be its client no more."""
-        self.lock.close()
-
-
 class OperatorTable:
     """The table of one rack. `entries` holds all entries, free ones too."""
 
@@ -119,9 +105,8 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        claim = self.enter(request, Client.NONE)
-        claim.leave()
-        return claim.entry
+        with locked(self._segment.fd, self._segment.map.operator):
+            return self._fill(request, Client.NONE)
 
     @contextmanager
     def claim(self, request: Request, client: Client = Client.WAITS) -> Iterator[RequestEntry]:
@@ -130,43 +115,15 @@ class OperatorTable:
 
         Raises `OperatorTableError` when all entries wait for their ticks.
         """
-        claim = self.enter(request, client)
-        try:
-            yield claim.entry
-        finally:
-            self.withdraw(claim.entry, claim.ticket)
-            claim.leave()
-
-    def enter(self, request: Request, client: Client = Client.WAITS) -> RequestClaim:
-        """Add a request as its client, until that leaves.
-
-        Raises `OperatorTableError` when all entries wait for their ticks.
-        """
-        with locked(self._segment.fd, self._segment.map.operator):
-            settled = [e for e in self.entries if not self.is_waiting(e) and not e.is_leased]
-            if not settled:
-                why = f"{len(self.entries)} commands wait for their ticks"
-                raise OperatorTableError(
-                    f"the operator table is full: {why}; permitted: once one of them is given"
-                )
-            entry = min(settled, key=lambda e: (e.stage, e.serial))
-            ticket = self._words[System.REQUESTED] + 1
-            lock = ByteLock(self._segment.fd, _CLAIMS + ticket)
-            if client:
+        with ExitStack() as stack:
+            with locked(self._segment.fd, self._segment.map.operator):
+                ticket = self._words[System.REQUESTED] + 1
+                # While the request waits, this shows that its client lives.
+                lock = stack.enter_context(closing(ByteLock(self._segment.fd, _CLAIMS + ticket)))
                 lock.take()
-            entry.stage = RequestStage.FREE
-            entry.ticket = ticket
-            entry.client = client
-            entry.mailbox = request.mailbox
-            entry.tick = request.tick
-            entry.serial = 0
-            entry.given_tick = -1
-            entry.heard = -1
-            entry.message[: len(request.message)] = request.message
-            # From here the clock may issue it.
-            entry.stage = RequestStage.WAITING
-            self._words[System.REQUESTED] += 1
-        return RequestClaim(entry, ticket, lock)
+                entry = self._fill(request, client)
+            stack.callback(self.withdraw, entry, ticket)
+            yield entry
 
     def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
         """Withdraw a request that still waits; False when it was issued."""
@@ -216,3 +173,26 @@ class OperatorTable:
             else:
                 waiting.remove(entry)
         return found
+
+    def _fill(self, request: Request, client: Client) -> RequestEntry:
+        """Fill an entry, while no other process fills one. Raises `OperatorTableError`."""
+        settled = [e for e in self.entries if not self.is_waiting(e) and not e.is_leased]
+        if not settled:
+            why = f"{len(self.entries)} commands wait for their ticks"
+            raise OperatorTableError(
+                f"the operator table is full: {why}; permitted: once one of them is given"
+            )
+        entry = min(settled, key=lambda e: (e.stage, e.serial))
+        entry.stage = RequestStage.FREE
+        entry.ticket = self._words[System.REQUESTED] + 1
+        entry.client = client
+        entry.mailbox = request.mailbox
+        entry.tick = request.tick
+        entry.serial = 0
+        entry.given_tick = -1
+        entry.heard = -1
+        entry.message[: len(request.message)] = request.message
+        # From here the clock may issue it.
+        entry.stage = RequestStage.WAITING
+        self._words[System.REQUESTED] += 1
+        return entry

@@ -100,9 +100,8 @@ def test_a_claimed_request_waits_as_long_as_its_client_holds_it(segment: Segment
     assert table.waiting() == []
     # One without a client waits in an entry that a client had.
     assert table.add(Request(0, b"", 9)).index == first.index
-    claim = table.enter(Request(0, b"", 9))
-    assert [entry.index for entry in table.waiting()] == [first.index, claim.entry.index]
-    claim.leave()
+    with table.claim(Request(0, b"", 9)) as second:
+        assert [entry.index for entry in table.waiting()] == [first.index, second.index]
     assert [entry.index for entry in table.waiting()] == [first.index]
     assert descriptors() == before
 

@@ -3,6 +3,8 @@ the arm."""
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
 
 import pytest
@@ -27,6 +29,7 @@ from rack.levels.messages import TaskStatus
 from rack.levels.operator import Operation, OperatorCommand
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus
+from tests.processes import FORKS, forked, wait_until
 from tests.tools.faults.test_ending import box
 
 RESTART_TICKS = 200
@@ -131,15 +134,24 @@ def test_the_clock_follows_the_network_adapter_at_its_tick(make_bus: MakeBus) ->
     assert rack.demand(9) is Demand.NONE
 
 
+@pytest.mark.filterwarnings(FORKS)
 def test_a_command_whose_client_has_died_is_not_issued_and_says_so(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox(name="left.operator", writer="clock"), *BOARDS)
     rack, table = Controlled(segment), OperatorTable(segment)
-    claim = table.enter(Request(0, b"", tick=2))
-    rack.controller.begin(1)
-    claim.leave()
+
+    def wait_for_ever() -> None:
+        with table.claim(Request(0, b"", tick=2)):
+            signal.pause()
+
+    with forked(wait_for_ever) as client:
+        wait_until(table.waiting)
+        (entry,) = table.waiting()
+        rack.controller.begin(1)
+        os.kill(client, signal.SIGKILL)
+        wait_until(lambda: not table.client_lives(entry))
     rack.controller.begin(2)
-    assert claim.entry.given_tick == -1
-    assert claim.entry.stage == RequestStage.WAITING
+    assert entry.given_tick == -1
+    assert entry.stage == RequestStage.WAITING
     assert segment.words[System.COMMANDED] == 0
     # Left out for good: the clock has no more to do with it.
     assert not table.waiting()
@@ -158,17 +170,16 @@ def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     operator = open_observer(segment, "left.operator")
     goto = hold(box)
     goto.what = Operation.GOTO
-    claim = table.enter(Request(0, bytes(goto.raw)), Client.LEASES)
-    for tick in (1, 2, 3):
-        rack.controller.begin(tick)
-    assert operator.peek().message.what == Operation.GOTO
-    if is_restarted:
-        for writer in rack.controller._desk._writers.values():
-            writer.close()
-        rack = Controlled(segment)
-    if is_released:
-        table.release(claim.entry)
-    claim.leave()
+    with table.claim(Request(0, bytes(goto.raw)), Client.LEASES) as entry:
+        for tick in (1, 2, 3):
+            rack.controller.begin(tick)
+        assert operator.peek().message.what == Operation.GOTO
+        if is_restarted:
+            for writer in rack.controller._desk._writers.values():
+                writer.close()
+            rack = Controlled(segment)
+        if is_released:
+            table.release(entry)
     for tick in (4, 5, 6):
         rack.controller.begin(tick)
     codes = rack.alarms.drain().rows["code"].tolist()

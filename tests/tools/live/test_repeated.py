@@ -6,13 +6,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from rack.backplane.operator_table import Client, OperatorTable, Request, RequestClaim
+from rack.backplane.operator_table import Client, OperatorTable, Request
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, load, resolve
@@ -57,7 +57,7 @@ class ByHand(Display):
         self._given = [*given]
         self._client = client
         self._segment: Segment | None = None
-        self._claims: list[RequestClaim] = []
+        self._claims = ExitStack()
 
     def show(self, snapshot: Snapshot) -> None:
         """Command what is due, and step the rack to the next command."""
@@ -68,13 +68,13 @@ class ByHand(Display):
             return
         if self._given and words[System.HELD] - 1 == self._given[0].tick:
             now = replace(self._given.pop(0), tick=-1)
-            self._claims.append(OperatorTable(self._segment).enter(now, self._client))
+            claim = OperatorTable(self._segment).claim(now, self._client)
+            self._claims.enter_context(claim)
         words[System.HOLD_AT] = self._given[0].tick + 1 if self._given else 0
 
     def close(self) -> None:
         """Leave the rack."""
-        for claim in self._claims:
-            claim.leave()
+        self._claims.close()
         if self._segment is not None:
             self._segment.close()
 
