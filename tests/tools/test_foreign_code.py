@@ -75,6 +75,7 @@ class Spied(NamedTuple):
 
 
 ARGUMENTS: dict[str, Callable[[Spied], Sequence[Sequence[object]]]] = {
+    "new": lambda spied: [("level", "fresh_level", "--out", spied.run.parent / "fresh")],
     "list": lambda spied: [()],
     "status": lambda spied: [(spied.rack,), (spied.rack, "--json")],
     "watch": lambda spied: [

@@ -106,7 +106,7 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
             idle.add(fault.kind)
     # The others have been something to judge, and many were certain before the end.
     assert len(idle) <= 3, idle
-    assert cut > len(kinds) // 3
+    assert cut >= len(kinds) // 3
 
 
 @pytest.fixture
