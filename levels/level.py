@@ -101,7 +101,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.compiled import preload
 from rack.levels.errors import LevelError, ProgramError
-from rack.levels.faults import Fault
+from rack.levels.fault_steps import Fault
 from rack.levels.messages import ArmState
 from rack.levels.operator import (
     AnsweringStatus,
@@ -340,7 +340,7 @@ class Executor(LevelSection, ABC):
 
     faults: ClassVar[tuple[type, ...]] = ()
     """Classes of steps by which faults can strike what the level drives: see
-    `rack.levels.faults`."""
+    `rack.levels.fault_steps`."""
     commands: ClassVar[Commands] = {}
     """An operator's commands to the level, with the forms of their goals; for a level that reads
     "own.operator"."""

@@ -25,17 +25,20 @@ IMPORTED = 117
 
 MOVED = {
     "rack.boards.adapters": "rack.boards.host",
-    "rack.levels.arm.sharing": "rack.levels.systems.cell.sharing_arm",
-    "rack.levels.cell": "rack.levels.systems.cell",
+    "rack.levels.arm.sharing": "rack.levels.systems.coordination.sharing_arm",
+    "rack.levels.cell": "rack.levels.systems.coordination",
     "rack.levels.figures": "rack.levels.systems.figures",
     "rack.levels.force": "rack.levels.systems.force",
     "rack.levels.hand": "rack.levels.systems.hand",
     "rack.levels.servo:ArmExecutor": "rack.levels.systems.joint_boards:ArmExecutor",
     "rack.levels.servo:JointGateway": "rack.levels.systems.joint_boards:JointGateway",
     "rack.levels.servo:JointServo": "rack.levels.systems.joint_boards:JointServo",
-    "rack.levels.servo:SharingServoExecutor": "rack.levels.systems.cell:SharingServoExecutor",
-    "rack.levels.shared_bodies": "rack.levels.systems.cell.shared_bodies",
+    "rack.levels.servo:SharingServoExecutor": (
+        "rack.levels.systems.coordination:SharingServoExecutor"
+    ),
+    "rack.levels.shared_bodies": "rack.levels.systems.coordination.shared_bodies",
     "rack.levels.state_table": "rack.levels.systems.state_table",
+    "rack.levels.systems.cell": "rack.levels.systems.coordination",
     "rack.levels.trajectory": "rack.levels.systems.trajectory",
 }
 """Packages, modules and classes that have moved: the configs of users and of saved runs name their

@@ -37,7 +37,7 @@ others = ["lan.shared", "lan.third"]
 
 [adapter.lan.import.third]
 from = "cell-other/servo.shared"
-type = "rack.levels.systems.cell.shared_bodies:SharedBodies"
+type = "rack.levels.systems.coordination.shared_bodies:SharedBodies"
 rate_hz = 50
 max_age_ms = 200
 """
@@ -62,7 +62,8 @@ MISTAKES = {
     ),
     "no copies": (
         "board.servo.params.arm=rack.levels.arm:SimulatedArm",
-        "the arm shares no objects; permitted: rack.levels.systems.cell.sharing_arm:SharingArm",
+        "the arm shares no objects; permitted:"
+        " rack.levels.systems.coordination.sharing_arm:SharingArm",
     ),
     "from nowhere": ("board.servo.reads.others=lan.shred", '"lan.shred": no task writes it'),
     "of another type": (

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.report.report import write_report
 
 pytestmark = pytest.mark.thorough
 

@@ -34,7 +34,7 @@ ROOMS = (
     "boards/lan",
     "boards/run",
     "levels/systems/state_table",
-    "levels/timing",
+    "boards/timing",
     "tools/faults",
     "tools/faults/campaigns",
 )

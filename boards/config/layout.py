@@ -21,9 +21,9 @@ from rack.backplane.layout import (
 )
 from rack.backplane.mailbox.queue import QueueTaken, taken_name
 from rack.backplane.message_type import MessageType
+from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.protocols import UNREAD
 from rack.boards.config.schema import RackConfig, TaskPlace
-from rack.boards.config.wiring import TaskPorts, Wiring
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox; commands are rare."""

@@ -19,8 +19,8 @@ from pydantic.fields import FieldInfo
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.segment import Segment
+from rack.boards.config.connections import executors, takes_commands
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.wiring import executors, takes_commands
 from rack.boards.faults.kind import KINDS, Kind
 from rack.boards.faults.kinds import BUILT_IN
 from rack.levels.errors import LevelError

@@ -16,10 +16,10 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
+from rack.boards.config.connections import Wiring, executors
 from rack.boards.config.files import EXTENDS
 from rack.boards.config.rules.mailboxes import exchange, ports
 from rack.boards.config.schema import LAN, RackConfig
-from rack.boards.config.wiring import Wiring, executors
 from rack.boards.errors import ConfigError, shown
 from rack.boards.faults.kind import KINDS
 from rack.levels.ports import FindingKind

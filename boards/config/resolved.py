@@ -20,7 +20,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Demand
 from rack.boards.config.cell import cell_sizes
 from rack.boards.config.commands import command_mistakes, requests
-from rack.boards.config.faults import fault_mistakes, injections, places
+from rack.boards.config.connections import TaskPorts, Wiring
+from rack.boards.config.injections import fault_mistakes, injections, places
 from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core, shared_out
 from rack.boards.config.published import PublishedRack, publish
 from rack.boards.config.rules import broken_rules, network_rules
@@ -28,7 +29,6 @@ from rack.boards.config.rules.levels import memory, neighbours, sizes
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
 from rack.boards.config.timing import is_critical, reservation
 from rack.boards.config.toml import table_of, without
-from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import ConfigError, LaunchError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS

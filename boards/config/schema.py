@@ -121,7 +121,7 @@ class TimingConfig(Table):
 
 class ScheduleConfig(Table):
     """`[schedule]`: a static cyclic schedule, in which every board has its place; see
-    `rack.levels.timing.frames`."""
+    `rack.boards.timing.frames`."""
 
     minor_ms: Positive
     """minor frame, ms; a whole number of ticks, of which every board's cycle is a multiple"""

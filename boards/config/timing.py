@@ -17,10 +17,10 @@ from rack.boards.config.schema import (
     ScheduleConfig,
 )
 from rack.boards.faults.config import FaultConfig
-from rack.levels.timing.interrupts import InboxTiming
-from rack.levels.timing.level import BoardTiming
-from rack.levels.timing.rack import CyclicSchedule, RackTiming
-from rack.levels.timing.tasks import Budget, Part, TimedTask, Unit
+from rack.boards.timing.interrupts import InboxTiming
+from rack.boards.timing.level import BoardTiming
+from rack.boards.timing.rack import CyclicSchedule, RackTiming
+from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
 
 NS_PER_MS = 1e6
 RESERVED = 2

@@ -26,7 +26,7 @@ from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.faults.bounds import struck_mailboxes
 from rack.boards.faults.describe import board_of
 from rack.boards.faults.kind import kind_of
-from rack.boards.faults.messages import Babble, forge
+from rack.boards.faults.message_steps import Babble, forge
 
 OPEN = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000

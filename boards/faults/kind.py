@@ -85,7 +85,7 @@ class Kind:
     """One kind of fault.
 
     `step` does the damage. Its type depends on `where`: a `ClockStep`, a subclass of `MessageStep`,
-    a `LoadStep`, a function run by a separate process (`core`), a step of `rack.levels.faults`
+    a `LoadStep`, a function run by a separate process (`core`), a step of `rack.levels.fault_steps`
     (`arm`); `start` needs none. `tasks` lists the roles that can be struck. `detected_as`: alarms,
     or "died", that count as its detection, within `bound`. `lasts` draws its duration in a
     campaign, ticks.

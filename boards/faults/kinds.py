@@ -6,10 +6,11 @@ from __future__ import annotations
 from functools import partial
 
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.faults import bounds, clock_board, messages, tasks
+from rack.boards.faults import bounds, clock_board, tasks
 from rack.boards.faults import drawing as draw
+from rack.boards.faults import message_steps as messages
 from rack.boards.faults.kind import DIED, KINDS, Consequence, Kind, Parameter
-from rack.levels import faults as arm
+from rack.levels import fault_steps as arm
 
 BRAKED = ("brakes_closed",)
 DEATH = Consequence(

@@ -17,7 +17,7 @@ from rack.backplane.process import pin
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 from rack.boards.faults.kind import kind_of
-from rack.levels.faults import Fault
+from rack.levels.fault_steps import Fault
 
 if TYPE_CHECKING:
     from rack.levels.level import Executor, Planner

@@ -26,13 +26,13 @@ from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.host.entries import last_written
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanTable
-from rack.boards.lan.desk import Desk
 from rack.boards.lan.entries import Export, Import
 from rack.boards.lan.envelope import Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import Peers
+from rack.boards.lan.remote_estop import Desk
 from rack.boards.lan.replayed import ReplayedNetwork
 from rack.boards.lan.status import status_of
 from rack.boards.wiring import Entries

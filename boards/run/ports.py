@@ -18,7 +18,7 @@ from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
-from rack.boards.faults.messages import FaultyWriter
+from rack.boards.faults.message_steps import FaultyWriter
 from rack.boards.wiring import Source
 from rack.levels.level import LevelSection, Reading, Verdict
 from rack.levels.ports import Sender

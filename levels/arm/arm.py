@@ -16,7 +16,7 @@ from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.drivable import ArmLinks
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm, kept_bounds
-from rack.levels.arm.present import present_link
+from rack.levels.arm.latency_compensation import present_link
 from rack.levels.errors import RobotError
 from rack.levels.messages import Scene
 from rack.levels.robot.cell import Cell

@@ -1,7 +1,7 @@
 """The link between the servo level and its arm, with faults injected into samples, torques and
 motors.
 
-The steps that act the faults are in `rack.levels.faults`.
+The steps that act the faults are in `rack.levels.fault_steps`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from rack.levels.algebra import Array, Mask
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.drivable import JointTarget, Link, Sensed
-from rack.levels.faults import ActiveFault, CommandStep, Key, MotorStep, SensorStep
+from rack.levels.fault_steps import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
 from rack.levels.robot.dynamics import FRICTION_SPEED
 from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS

@@ -10,7 +10,7 @@ from rack.levels.algebra import Array
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.drivable import DriveState, Exceeded, JointTarget, Link, Sensed
 from rack.levels.arm.drives import LimitGate, SetPointGate
-from rack.levels.arm.present import PresentLink
+from rack.levels.arm.latency_compensation import PresentLink
 from rack.levels.errors import RobotError
 from rack.levels.level import Finding
 from rack.levels.messages import Error

@@ -20,16 +20,23 @@ from rack.levels.messages import (
 from rack.levels.motion import path as paths
 from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLDABLE, OperatorCommand, Orders
 from rack.levels.planning import collision
-from rack.levels.primitive.guard import Guard, Sight
-from rack.levels.primitive.path_motion import JointSetPoint
-from rack.levels.primitive.planner import Plans
-from rack.levels.primitive.segment import (
+from rack.levels.primitive.motion_segment import (
     Memory,
     MotionSegment,
     SegmentFault,
     read_segment,
     recall,
     window,
+)
+from rack.levels.primitive.path_guard import Guard, Sight
+from rack.levels.primitive.path_motion import JointSetPoint
+from rack.levels.primitive.planner import Plans
+from rack.levels.primitive.segment_work import (
+    GripperWork,
+    PathWork,
+    PrimitiveParams,
+    WorkCycle,
+    WorkRules,
 )
 from rack.levels.primitive.tracking import (
     LEAD_CYCLES,
@@ -38,7 +45,6 @@ from rack.levels.primitive.tracking import (
     Straying,
     Tracking,
 )
-from rack.levels.primitive.work import GripperWork, PathWork, PrimitiveParams, WorkCycle, WorkRules
 from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
 

@@ -11,8 +11,8 @@ from rack.levels.level import Input, LevelContext, Output, Planner, Reading
 from rack.levels.messages import Error, MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory, make_trajectory
-from rack.levels.primitive.segment import MotionSegment, SegmentFault, read_segment, window
-from rack.levels.primitive.work import PrimitiveParams, WorkRules
+from rack.levels.primitive.motion_segment import MotionSegment, SegmentFault, read_segment, window
+from rack.levels.primitive.segment_work import PrimitiveParams, WorkRules
 from rack.levels.robot.cell import cell_of
 from rack.levels.tables import read_params
 

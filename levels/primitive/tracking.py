@@ -9,7 +9,7 @@ import numpy as np
 from rack.backplane.message import State
 from rack.levels.level import Reading
 from rack.levels.messages import DrivenArm, Error
-from rack.levels.primitive.segment import SegmentFault
+from rack.levels.primitive.motion_segment import SegmentFault
 
 LEAD_CYCLES = 2
 """Cycles from the release that makes a set point to the tick at which it is due.

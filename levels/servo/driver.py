@@ -15,7 +15,7 @@ from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import DrivableArm, DriveState, Sensed, find_arm, preload
 from rack.levels.arm.drivable import Link
-from rack.levels.faults import ARM_STEPS
+from rack.levels.fault_steps import ARM_STEPS
 from rack.levels.level import (
     Executor,
     Fault,

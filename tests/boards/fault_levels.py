@@ -5,7 +5,7 @@ from __future__ import annotations
 from wave_levels import Watch
 
 from rack.backplane.message import State, Status, field
-from rack.levels.faults import CommandStep, MotorStep, SensorStep, TendonStep
+from rack.levels.fault_steps import CommandStep, MotorStep, SensorStep, TendonStep
 from rack.levels.level import Executor, LevelContext, Output
 
 

@@ -11,7 +11,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults import drawing as draw
 from rack.boards.faults.bounds import DELIVERY, writes
-from rack.boards.faults.messages import MessageStep, Outgoing
+from rack.boards.faults.message_steps import MessageStep, Outgoing
 from rack.levels.level import Executor, Input, Output
 
 OPENS_AT = 40

@@ -13,8 +13,8 @@ from rack.boards.config import rack_timing, wire
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.recovery import Supervision
 from rack.boards.errors import ConfigError
-from rack.levels.timing.command_path import command_paths
-from rack.levels.timing.system_response import mailboxes_along
+from rack.boards.timing.command_path import command_paths
+from rack.boards.timing.system_response import mailboxes_along
 from tests.boards.conftest import MakeConfig
 from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rack.tools.console.tables import render_text
-from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.tables import analysis_blocks
+from rack.tools.report.analysis import Analysis
+from rack.tools.report.tables import analysis_blocks
 
 
 def text(analysis: Analysis, width: int | None = None) -> str:

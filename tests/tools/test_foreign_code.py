@@ -36,7 +36,7 @@ from commanded_levels import Homing, Upper
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults.bounds import DELIVERY, writes
-from rack.boards.faults.messages import Drop
+from rack.boards.faults.message_steps import Drop
 
 KINDS.add(
     Kind(

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.report.report import write_report
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES
 from tests.tools.command_line import rack

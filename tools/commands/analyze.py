@@ -10,8 +10,8 @@ from rack.tools.console.parameters import Json, RunFolder, option
 from rack.tools.console.progress import reading_progress
 from rack.tools.console.tables import print_blocks
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.tables import analysis_blocks, document
+from rack.tools.report.analysis import Analysis
+from rack.tools.report.tables import analysis_blocks, document
 from rack.tools.timing.operator_response import show
 
 

@@ -85,7 +85,7 @@ def campaign(
     from rack.tools.console.interrupt import INTERRUPT
     from rack.tools.console.progress import progress_for
     from rack.tools.faults.campaigns.campaign import ORDER, Campaign, Order
-    from rack.tools.live.folder import folder_of
+    from rack.tools.launch.folder import folder_of
 
     if lockstep and realtime:
         raise Failure(

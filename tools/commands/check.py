@@ -13,11 +13,11 @@ from rack.boards.config import load, shared_out
 from rack.boards.config.cell import built_cell
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
-from rack.levels.timing.forecast import Forecast
+from rack.boards.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, option
 from rack.tools.console.tables import TextTable, print_blocks
-from rack.tools.live.folder import folder_of
+from rack.tools.launch.folder import folder_of
 from rack.tools.timing.inventory import arm_lines, inventory, inventory_blocks
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import Repair, repair

@@ -15,7 +15,7 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, Timeout, argument, check_timeout, option
 
 if TYPE_CHECKING:
-    from rack.tools.live.replies import Reply
+    from rack.tools.monitor.replies import Reply
 
 Tick = Annotated[
     int | None, typer.Option(metavar="T", help="tick at which it is given; default: the next one")
@@ -100,8 +100,8 @@ def command(
     """
     from rack.backplane.segment import Segment
     from rack.levels.operator import EFFECTS, Operation
-    from rack.tools.live.desk import LiveDesk, goal_of
-    from rack.tools.live.holds import resume_command
+    from rack.tools.monitor.desk import LiveDesk, goal_of
+    from rack.tools.monitor.holds import resume_command
 
     check_timeout(timeout, wait)
     if lease and wait:

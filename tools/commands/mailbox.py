@@ -11,8 +11,8 @@ from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName, argument, option
 from rack.tools.console.tables import console, fitted_records
-from rack.tools.live.message_text import DROPPED, MessageText, list_mailboxes
-from rack.tools.live.watched import looks
+from rack.tools.monitor.message_text import DROPPED, MessageText, list_mailboxes
+from rack.tools.monitor.polling import looks
 from rack.tools.recording.signal import mailbox_of
 
 LOOK_S = 0.1

@@ -9,7 +9,7 @@ from rack.backplane.segment import Segment
 from rack.tools.console.answer import print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName
-from rack.tools.live import pausing
+from rack.tools.monitor import pausing
 
 
 def pause(rack: RackName, as_json: Json = False) -> None:

@@ -17,7 +17,7 @@ from rack.tools.commands.status import recorded_by
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, View, named_here, option
-from rack.tools.live.folder import folder_of
+from rack.tools.launch.folder import folder_of
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.parquet import CONFIG, PUBLISHED
 from rack.tools.recording.recorder_process import (

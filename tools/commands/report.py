@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rack.tools.console.answer import Failure
 from rack.tools.console.parameters import Json, RunFolder, option
-from rack.tools.timing.analysis.stored import print_report, show_report
+from rack.tools.report.stored import print_report, show_report
 
 
 def report(
@@ -57,7 +57,7 @@ def report(
         show_report(run, as_json)
         return
     from rack.tools.recording.divergence import other_run
-    from rack.tools.timing.analysis.report import OtherRun, write_report
+    from rack.tools.report.report import OtherRun, write_report
 
     other = other_run(run, against)
     data, text = write_report(run, OtherRun(other, of, repeat))

@@ -10,7 +10,7 @@ from pathlib import Path
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, option
-from rack.tools.live.folder import RUNS
+from rack.tools.launch.folder import RUNS
 
 PAGE = RUNS / "paper"
 """Where the page is made unless a folder is given: always the same one, so that the command

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rack.boards.config.schema import RackConfig
     from rack.boards.config.toml import Tables
     from rack.boards.crate.line import CrateLine
-    from rack.tools.live.launch import RunResult
+    from rack.tools.launch.launch import RunResult
 
 
 def run(
@@ -120,17 +120,17 @@ def run(
     if origin is not None and entries is not None:
         raise Failure("--entries and --from: a run that is continued has its own; leave one out", 2)
     if origin is not None:
-        from rack.tools.live.continued import beginning, run_of
+        from rack.tools.launch.continued import beginning, run_of
 
         config = str(run_of(origin))
     assert config is not None
     read = assembled(config, overrides, faults)
     crate = _informed(context.obj, read.tables)
     from rack.boards.config.loader import validated
-    from rack.tools.live.display import display_for
-    from rack.tools.live.folder import folder_of
-    from rack.tools.live.launch import NO_TIME, Beginning, run_rack
-    from rack.tools.live.verdict import headline
+    from rack.tools.launch.display import display_for
+    from rack.tools.launch.folder import folder_of
+    from rack.tools.launch.launch import NO_TIME, Beginning, run_rack
+    from rack.tools.launch.verdict import headline
 
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries
@@ -178,9 +178,9 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
     """Make the report, print it and return it. A run that has no report where one is wanted has
     failed."""
     from rack.tools.recording.recorder_process import recorded_line
-    from rack.tools.timing.analysis.report import unrecorded, write_report
-    from rack.tools.timing.analysis.report_markdown import summary
-    from rack.tools.timing.analysis.stored import print_report
+    from rack.tools.report.report import unrecorded, write_report
+    from rack.tools.report.report_markdown import summary
+    from rack.tools.report.stored import print_report
 
     data = unrecorded(config, asdict(result))
     text = "\n".join(summary(data))

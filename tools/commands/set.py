@@ -8,7 +8,7 @@ from rack.backplane.segment import Segment
 from rack.tools.commands.command import At, Tick, print_reply
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, argument
-from rack.tools.live.desk import LiveDesk
+from rack.tools.monitor.desk import LiveDesk
 
 
 def set_param(

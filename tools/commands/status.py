@@ -14,8 +14,8 @@ from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import Json, named_here, rack_names
 from rack.tools.console.tables import console
-from rack.tools.live.display import RackView
-from rack.tools.live.snapshot import RackMonitor
+from rack.tools.launch.display import RackView
+from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.recording.recorder_process import SPOOL, recorded_line, size_of
 
 OnlyRack = Annotated[

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from rack.backplane.segment import Segment
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName, argument, option
-from rack.tools.live.pausing import Stepper
+from rack.tools.monitor.pausing import Stepper
 
 
 def step(

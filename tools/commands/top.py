@@ -39,14 +39,14 @@ def top(rack: OnlyRack = None) -> None:
     """
     from rack.backplane.segment import Segment
     from rack.tools.console.tables import console
-    from rack.tools.live.display import display_for
-    from rack.tools.live.snapshot import RackMonitor
+    from rack.tools.launch.display import display_for
+    from rack.tools.monitor.snapshot import RackMonitor
 
     ended = threading.Event()
     with INTERRUPT.orderly(ended.set), closing(Segment.attach(rack or only_rack())) as segment:
         if console().is_terminal and sys.stdin.isatty():
             if find_spec("textual") is not None:
-                from rack.tools.live.full_screen import RackScreen
+                from rack.tools.monitor.full_screen import RackScreen
 
                 screen = RackScreen(segment, ended.is_set)
                 screen.run()

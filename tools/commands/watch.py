@@ -15,8 +15,8 @@ from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, argument, option
 from rack.tools.console.tables import console
-from rack.tools.live.signals import Lines, Plot, Rows, Strip, cell
-from rack.tools.live.watched import looks
+from rack.tools.monitor.polling import looks
+from rack.tools.monitor.signals import Lines, Plot, Rows, Strip, cell
 from rack.tools.recording.signal import Signal, Trigger
 
 LOOK_S = 0.02

@@ -15,7 +15,7 @@ from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import read_stored
-from rack.boards.config.faults import injection
+from rack.boards.config.injections import injection
 from rack.boards.config.mistakes import mistakes_of
 from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError, Mistake

@@ -18,10 +18,10 @@ import zenoh
 
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.credentials import Credentials
-from rack.boards.lan.desk import CHECK, ESTOP_KIND
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import estop_answer_key, estop_key
 from rack.boards.lan.link import Arrived, LanLink
+from rack.boards.lan.remote_estop import CHECK, ESTOP_KIND
 from rack.levels.errors import LevelError
 from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure

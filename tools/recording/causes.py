@@ -5,7 +5,7 @@ Messages become visible at ticks, so the recording has all that a task had read 
 was visible until then. While some of that differs, the way goes back to who wrote it, and to an
 earlier cycle. It ends at a task whose inputs were equal: what befell that task (a fault, its death,
 a cycle missed) or its config differs, or else its code, or what its level remembers. The last two
-are in no recording: see `rack.tools.timing.analysis.cycle_again`.
+are in no recording: see `rack.tools.report.cycle_again`.
 """
 
 from __future__ import annotations

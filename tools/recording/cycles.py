@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rack.backplane.layout import TaskSpec
-from rack.levels.timing.tasks import Budget
-from rack.levels.timing.trace_times import Occupation, overhead_ns, plans, unit_times
+from rack.boards.timing.tasks import Budget
+from rack.boards.timing.trace_times import Occupation, overhead_ns, plans, unit_times
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
 

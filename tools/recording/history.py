@@ -11,8 +11,8 @@ import numpy as np
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.message import State
+from rack.boards.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
 from rack.levels.operator import Operation
-from rack.levels.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
 from rack.tools.console.answer import Document
 
 if TYPE_CHECKING:

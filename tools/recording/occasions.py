@@ -13,7 +13,7 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, alarm_ring
 from rack.boards.config.record import RecordConfig
-from rack.levels.timing.trace_times import is_missed, skipped
+from rack.boards.timing.trace_times import is_missed, skipped
 
 ORDINARY = (Alarm.COMMANDED,)
 """Alarms of an ordinary run. All others count: faults, detections, brakes, restarts."""

@@ -184,7 +184,7 @@ class Recording:
 
     @cached_property
     def ended(self) -> Document:
-        """Counts at the end of the run, as in `rack.tools.live.launch.RunResult`; empty where they
+        """Counts at the end of the run, as in `rack.tools.launch.launch.RunResult`. Empty if they
         are not recorded."""
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 

@@ -18,7 +18,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.driver import LATE_PART
 from rack.backplane.trace import Flag
 from rack.boards.config.layout import obtained_core
-from rack.levels.timing.trace_times import STAMPS, Occupation, is_missed, skipped
+from rack.boards.timing.trace_times import STAMPS, Occupation, is_missed, skipped
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 

@@ -22,12 +22,12 @@ from rack.boards.crate.alarm_events import AlarmWatch
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure, as_failure
 from rack.tools.faults.live import LiveRack
-from rack.tools.live import pausing
-from rack.tools.live.desk import LiveDesk
-from rack.tools.live.folder import folder_of
-from rack.tools.live.replies import Reply
-from rack.tools.live.signals import SignalTap
-from rack.tools.live.snapshot import RackMonitor, Snapshot
+from rack.tools.launch.folder import folder_of
+from rack.tools.monitor import pausing
+from rack.tools.monitor.desk import LiveDesk
+from rack.tools.monitor.replies import Reply
+from rack.tools.monitor.signals import SignalTap
+from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder_process import RecorderProcess
 from rack.tools.recording.signal import Signal, Trigger, mailbox_of

@@ -8,7 +8,7 @@ from typing import Any
 from rack.backplane.message import AnyMessage
 from rack.boards import Rack
 from rack.tools.console.answer import Document, Failure, as_failure
-from rack.tools.live.continued import RunAgain, branched
+from rack.tools.launch.continued import RunAgain, branched
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, mailbox_of

@@ -12,12 +12,12 @@ import numpy as np
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.pictures import NO_PICTURES, can_draw
-from rack.tools.live.continued import tick_in
+from rack.tools.launch.continued import tick_in
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, mailbox_of, signals_of
+from rack.tools.report.stored import newest_report
 from rack.tools.scripting.moment import RecordedMoment
-from rack.tools.timing.analysis.stored import newest_report
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,19 +17,19 @@ from typing import Any, Self
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure, as_failure
 from rack.tools.console.tables import fitted
-from rack.tools.live.continued import RunAgain, branched, tick_in
-from rack.tools.live.display import Display, event_text
-from rack.tools.live.folder import folder_of
-from rack.tools.live.launch import run_rack
-from rack.tools.live.message_text import MessageText
-from rack.tools.live.signals import cell
+from rack.tools.launch.continued import RunAgain, branched, tick_in
+from rack.tools.launch.display import Display, event_text
+from rack.tools.launch.folder import folder_of
+from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.message_text import MessageText
+from rack.tools.monitor.signals import cell
 from rack.tools.recording.divergence import first_difference, ticks_of
 from rack.tools.recording.in_force import InForce
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import NEAREST, Signal, Trigger
+from rack.tools.report.report import write_report
+from rack.tools.report.report_markdown import summary
 from rack.tools.scripting.moment import RecordedMoment
-from rack.tools.timing.analysis.report import write_report
-from rack.tools.timing.analysis.report_markdown import summary
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from rack.backplane.layout import Layout
 from rack.boards.classes import find_class
 from rack.boards.config.cell import built_cell
 from rack.boards.config.schema import CLOCK_SLOT, LAN, RackConfig
+from rack.boards.timing.chains import spanned
 from rack.levels.level import Executor
 from rack.levels.tables import read_params
-from rack.levels.timing.chains import spanned
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks, TextTable
 

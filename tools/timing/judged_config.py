@@ -12,11 +12,11 @@ from rack.backplane.layout import Layout, Protocol
 from rack.boards.config import RackConfig, loads, rack_timing, resolve
 from rack.boards.config.layout import obtained_core
 from rack.boards.errors import ConfigError
-from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.system_response import predict
-from rack.levels.timing.tasks import Budget
-from rack.levels.timing.verdicts import (
+from rack.boards.timing.level import LevelTiming
+from rack.boards.timing.rack import RackTiming
+from rack.boards.timing.system_response import predict
+from rack.boards.timing.tasks import Budget
+from rack.boards.timing.verdicts import (
     LOAD,
     EquationVerdict,
     level_verdicts,

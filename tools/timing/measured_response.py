@@ -13,13 +13,13 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.boards.config import rack_timing
-from rack.levels.timing.chains import ParallelChains
-from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.system_response import mailboxes_along
-from rack.levels.timing.trace_times import counts, distribution
-from rack.levels.timing.verdicts import response_subject
+from rack.boards.timing.chains import ParallelChains
+from rack.boards.timing.rack import RackTiming
+from rack.boards.timing.system_response import mailboxes_along
+from rack.boards.timing.trace_times import counts, distribution
+from rack.boards.timing.verdicts import response_subject
 from rack.tools.console.answer import Document
-from rack.tools.live.network import exchanged
+from rack.tools.monitor.network import exchanged
 from rack.tools.recording.recording import Recording
 
 LOSSES = ("died", "hang")

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from rack.boards.config import rack_timing
+from rack.boards.timing.command_path import CommandPath, command_paths
+from rack.boards.timing.trace_times import distribution
 from rack.levels.operator import Answer, Operation
-from rack.levels.timing.command_path import CommandPath, command_paths
-from rack.levels.timing.trace_times import distribution
 from rack.tools.console.answer import Document, Failure, print_json, write_json
 from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
 from rack.tools.console.tables import Blocks, TextTable, decimal, print_blocks

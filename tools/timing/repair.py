@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
-from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.verdicts import EquationVerdict
+from rack.boards.timing.level import LevelTiming
+from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Document
 from rack.tools.timing.judged_config import Change, JudgedConfig, Settings
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from rack.levels.timing.forecast import NO_BUDGET, Forecast
-from rack.levels.timing.verdicts import EQUATIONS, EquationVerdict
+from rack.boards.timing.forecast import NO_BUDGET, Forecast
+from rack.boards.timing.verdicts import EQUATIONS, EquationVerdict
 from rack.tools.console.tables import Blocks
 from rack.tools.timing.repair import Repair
 from rack.tools.timing.tables import side_text, verdict_table

@@ -8,11 +8,11 @@ from itertools import pairwise
 from math import isinf
 from typing import Any
 
-from rack.levels.timing.chains import spanned
-from rack.levels.timing.forecast import Forecast
-from rack.levels.timing.level import LevelTiming
-from rack.levels.timing.response_time import TaskResponse
-from rack.levels.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
+from rack.boards.timing.chains import spanned
+from rack.boards.timing.forecast import Forecast
+from rack.boards.timing.level import LevelTiming
+from rack.boards.timing.response_time import TaskResponse
+from rack.boards.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
 from rack.tools.console.tables import Blocks, Cell, TextTable, ms
 
 TABLED = {*BEYOND} - {PLAN_WITHIN}

@@ -13,10 +13,10 @@ import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State, text_of
+from rack.boards.timing.rack import RackTiming
+from rack.boards.timing.trace_times import is_missed
 from rack.levels.messages import Verb
 from rack.levels.systems.hand.messages import GraspKind
-from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.trace_times import is_missed
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, change_finder
 from rack.tools.viewer.style import STATES, packed, style_lane, write_spans
 

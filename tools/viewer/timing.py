@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
-from rack.levels.timing.trace_times import (
+from rack.boards.timing.trace_times import (
     execution_ns,
     is_missed,
     lateness_ns,

@@ -3,7 +3,7 @@ wiring to mistakes.
 
 All mistakes are reported at once. A rule skips what depends on a broken table, whose own mistakes
 are already reported. Faults and commands, which may come live too, have rules of their own:
-`rack.boards.config.faults` and `rack.boards.config.commands`.
+`rack.boards.config.injections` and `rack.boards.config.commands`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import ModuleType
 
+from rack.boards.config.connections import Wiring
 from rack.boards.config.rules import boards, levels, mailboxes
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.wiring import Wiring
 from rack.boards.errors import Mistake, Mistakes
 
 NETWORK = "rack.boards.config.rules.lan"

@@ -10,6 +10,7 @@ from graphlib import CycleError, TopologicalSorter
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.system_clock import rate_text
 from rack.backplane.errors import ClockError
+from rack.boards.config.connections import Wiring
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import repeated
 from rack.boards.config.record import RecordConfig
@@ -22,7 +23,6 @@ from rack.boards.config.schema import (
     ScheduleConfig,
 )
 from rack.boards.config.timing import PLANNER_BUDGET, frames
-from rack.boards.config.wiring import Wiring
 from rack.boards.errors import Mistake, Mistakes
 
 RESERVED = (CLOCK, "above", "below", "own")

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from rack.backplane.clock.system_clock import ticks_of
 from rack.backplane.errors import ClockError
+from rack.boards.config.connections import Wiring, is_taken
 from rack.boards.config.mistakes import repeats
 from rack.boards.config.schema import LAN, LanConfig, RackConfig
-from rack.boards.config.wiring import Wiring, is_taken
 from rack.boards.errors import Mistake, Mistakes
 from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable

@@ -12,8 +12,8 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.layout import Layout
 from rack.backplane.regular_file import check_regular_file
 from rack.boards.config.cell import cell_sizes
+from rack.boards.config.connections import Wiring
 from rack.boards.config.mistakes import mistakes_of, repeated
-from rack.boards.config.wiring import Wiring
 from rack.boards.errors import Mistake, Mistakes
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, LevelContext

@@ -5,8 +5,8 @@ from __future__ import annotations
 from rack.backplane.layout import BY_TICKS
 from rack.backplane.mailbox.queue import taken_name
 from rack.backplane.message import State
+from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.schema import LAN
-from rack.boards.config.wiring import TaskPorts, Wiring
 from rack.boards.errors import Mistake, Mistakes
 from rack.boards.exchange import EXCHANGE, exchange_message
 from rack.boards.host.adapter import Adapter

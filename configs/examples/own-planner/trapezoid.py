@@ -10,7 +10,7 @@ import numpy as np
 from rack.levels import Error, Input, LevelContext, Output, Planner
 from rack.levels.messages import MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
-from rack.levels.primitive.segment import read_segment, window
+from rack.levels.primitive.motion_segment import read_segment, window
 from rack.levels.robot.cell import build_cell
 
 SHARE = 0.7

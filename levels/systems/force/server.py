@@ -30,8 +30,8 @@ from rack.levels.systems.trajectory import TrajectoryExecutor
 from rack.levels.systems.trajectory.boards import JointBoards
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
+from rack.levels.systems.trajectory.request_work import MotionTools, RequestWork, TrajectoryParams
 from rack.levels.systems.trajectory.requests import Agenda
-from rack.levels.systems.trajectory.work import MotionTools, RequestWork, TrajectoryParams
 from rack.levels.tables import Positive, read_params
 
 LEAST = np.array([5.0] * 3 + [0.5] * 3)

@@ -11,8 +11,8 @@ from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
 from rack.levels.algebra import Array
 from rack.levels.arm import substeps
-from rack.levels.arm.above import CommandsAbove
-from rack.levels.faults import TendonStep
+from rack.levels.arm.commands_above import CommandsAbove
+from rack.levels.fault_steps import TendonStep
 from rack.levels.level import (
     Executor,
     Fault,

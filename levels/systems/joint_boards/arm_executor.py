@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
-from rack.levels.arm.above import CommandsAbove
+from rack.levels.arm.commands_above import CommandsAbove
 from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output, Reading
 from rack.levels.messages import ArmState
 from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders

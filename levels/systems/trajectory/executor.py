@@ -28,8 +28,8 @@ from rack.levels.systems.trajectory.messages import (
     MotionStatus,
 )
 from rack.levels.systems.trajectory.motion import SampledMotion
+from rack.levels.systems.trajectory.request_work import MotionTools, RequestWork, TrajectoryParams
 from rack.levels.systems.trajectory.requests import Agenda
-from rack.levels.systems.trajectory.work import MotionTools, RequestWork, TrajectoryParams
 from rack.levels.tables import read_params
 
 LEAD_CYCLES = 2

@@ -8,7 +8,7 @@ from rack.backplane.mailbox.history import chains, digest
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.faults.messages import forge
+from rack.boards.faults.message_steps import forge
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork

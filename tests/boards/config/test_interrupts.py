@@ -14,7 +14,7 @@ from rack.boards.config.loader import validated
 from rack.boards.config.timing import without_interrupts
 from rack.boards.config.toml import override, parse
 from rack.boards.errors import ConfigError
-from rack.levels.timing.verdicts import INBOX, verdicts
+from rack.boards.timing.verdicts import INBOX, verdicts
 from tests.boards.run.test_interrupts import BOARDS, RACK
 
 INTERRUPT = "protocol.default=interrupt"

@@ -9,7 +9,7 @@ import pytest
 from rack.boards.config import budgets, load, loads, rack_timing, wire
 from rack.boards.config.timing import with_budgets
 from rack.boards.errors import ConfigError
-from rack.levels.timing.tasks import Budget, Part, Unit
+from rack.boards.timing.tasks import Budget, Part, Unit
 
 MEASURED = Budget(
     read_ns=10_123, process_ns=500_001, write_ns=7, exchange_ns=31, plan_ns=2_000_003, update_ns=11

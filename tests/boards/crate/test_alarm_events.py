@@ -15,7 +15,7 @@ from rack.backplane.watch.alarms import BY_DEMAND, MISSES, NO_TORQUE, Alarm, Ala
 from rack.backplane.words import Demand
 from rack.boards.config import load, wire
 from rack.boards.config.cell import geom_name
-from rack.boards.config.faults import injections
+from rack.boards.config.injections import injections
 from rack.boards.config.published import PublishedFinding, PublishedLevel
 from rack.boards.crate.alarm_events import AlarmEvents
 from rack.boards.events import Event

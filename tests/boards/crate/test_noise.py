@@ -35,8 +35,8 @@ from rack.boards.events import Ending, Journal
 from rack.tools.faults.campaigns.trial import levels_of
 from rack.tools.faults.ending import arm_of, strikes
 from rack.tools.faults.live import LiveRack
-from rack.tools.live.desk import LiveDesk
-from rack.tools.live.snapshot import RackMonitor
+from rack.tools.monitor.desk import LiveDesk
+from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.recording.spool import rings
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, named, wait_until

@@ -17,9 +17,9 @@ from rack.boards.crate.line import WarmCrate
 from rack.boards.events import Event
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.lab.benches.observed import record
-from rack.tools.live.continued import RunAgain
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.continued import RunAgain
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording.recording import Recording
 from tests import golden
 from tests.conftest import EXHAUSTIVE

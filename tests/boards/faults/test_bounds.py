@@ -8,7 +8,7 @@ import pytest
 
 from rack.backplane.layout import Layout
 from rack.boards.config import wire
-from rack.boards.config.faults import injections
+from rack.boards.config.injections import injections
 from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack

@@ -9,7 +9,7 @@ import pytest
 from rack.backplane.fault_table import Injection
 from rack.backplane.message import State
 from rack.boards.config import wire
-from rack.boards.config.faults import injections
+from rack.boards.config.injections import injections
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 

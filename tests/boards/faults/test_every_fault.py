@@ -14,7 +14,7 @@ from rack.backplane.message import State
 from rack.backplane.trace import trace_ring
 from rack.backplane.words import Block
 from rack.boards import Rack
-from rack.boards.config.faults import injections
+from rack.boards.config.injections import injections
 from rack.boards.errors import LaunchError
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.kind import KINDS, Kind

@@ -10,7 +10,7 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import wire
-from rack.boards.config.faults import injections
+from rack.boards.config.injections import injections
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults.bounds import cycles
 from rack.tools.commands.inject import kinds_text

@@ -24,7 +24,7 @@ from rack.boards.faults.tasks import (
     slow_plan,
     take_core,
 )
-from rack.levels.faults import Fault
+from rack.levels.fault_steps import Fault
 from rack.levels.level import Executor
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus

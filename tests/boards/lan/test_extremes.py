@@ -20,15 +20,15 @@ from rack.boards.config.schema import RackConfig
 from rack.levels.messages import Error
 from rack.levels.operator import Goal
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.systems.cell.coordinator import CellProgram
-from rack.levels.systems.cell.messages import (
+from rack.levels.systems.coordination.coordinator import CellProgram
+from rack.levels.systems.coordination.messages import (
     CellOrder,
     CellReport,
     OrderAction,
     OrderVerb,
     Response,
 )
-from rack.levels.systems.cell.shared_bodies import SharedBodies
+from rack.levels.systems.coordination.shared_bodies import SharedBodies
 from rack.tools.viewer.window import free_port
 from tests.boards.lan.extreme_levels import Case, cases, message_class
 from tests.boards.lan.racks import Ended, run_together
@@ -37,9 +37,9 @@ from tests.test_brown_network import configs
 pytestmark = pytest.mark.thorough
 
 FOLDER = CONFIGS / "cell"
-ORDER = "rack.levels.systems.cell.messages:CellOrder"
-REPORT = "rack.levels.systems.cell.messages:CellReport"
-BODIES = "rack.levels.systems.cell.shared_bodies:SharedBodies"
+ORDER = "rack.levels.systems.coordination.messages:CellOrder"
+REPORT = "rack.levels.systems.coordination.messages:CellReport"
+BODIES = "rack.levels.systems.coordination.shared_bodies:SharedBodies"
 JOINT_BOARDS = "rack.levels.systems.joint_boards"
 BROWN = {
     "rack.levels.messages:TaskStatus",

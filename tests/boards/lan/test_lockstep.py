@@ -14,8 +14,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.crate import patience
 from rack.levels.peer import Presence, peer_port
-from rack.tools.live.holds import find_holds
-from rack.tools.live.newest import Newest
+from rack.tools.monitor.holds import find_holds
+from rack.tools.monitor.newest_messages import Newest
 from tests.boards.lan.racks import (
     Ended,
     configs,

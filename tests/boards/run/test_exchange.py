@@ -13,7 +13,7 @@ from rack.boards import Rack
 from rack.boards.config import resolve
 from rack.boards.errors import ConfigError
 from rack.boards.exchange import PortAge
-from rack.tools.live.snapshot import RackMonitor
+from rack.tools.monitor.snapshot import RackMonitor
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill

@@ -11,7 +11,7 @@ from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config import wire
 from rack.boards.config.timing import rack_timing
-from rack.levels.timing.schedule import simulate
+from rack.boards.timing.schedule import simulate
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill

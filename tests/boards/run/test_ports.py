@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
-from rack.boards.faults.messages import forge
+from rack.boards.faults.message_steps import forge
 from rack.levels.level import Output
 from tests.backplane.bus import NAME, Point
 from tests.link import MakeLink, links

@@ -15,7 +15,7 @@ from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.trace import FIELDS, TraceWriter
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.boards.faults import messages
+from rack.boards.faults import message_steps as messages
 from rack.boards.faults.kind import KINDS
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading

@@ -10,9 +10,9 @@ import pytest
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config import load
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
-from rack.tools.timing.analysis.analysis import Analysis
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.report.analysis import Analysis
 from tests.tools.analysis_text import brief, text
 from tests.tools.command_line import rack
 from tests.tools.recordings import MS, Cycle, recorded

@@ -26,7 +26,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.report.report import write_report
 from rack.tools.viewer.reading import read
 from rack.tools.viewer.window import ViewerWindow
 from tests.boards.lan.racks import configs, ring_texts

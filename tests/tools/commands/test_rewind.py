@@ -15,9 +15,9 @@ import pytest
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.events import CONTINUES, Event
-from rack.tools.live.continued import RunAgain
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.continued import RunAgain
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording.recording import Recording
 from tests.boards.remembering_racks import REMEMBERING
 from tests.processes import descriptors

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.live.verdict import UNRECORDED
+from rack.tools.launch.verdict import UNRECORDED
 from tests.tools.command_line import rack
 
 CRASHES = (

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
-from rack.tools.timing.analysis.report import write_report
-from rack.tools.timing.analysis.report_markdown import markdown
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.report.report import write_report
+from rack.tools.report.report_markdown import markdown
 from rack.tools.viewer.reading import read
 from tests.conftest import SMALL
 

@@ -24,7 +24,7 @@ from rack.tools.recording.parquet import CONFIG, HEAD
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.report.report import write_report
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 

@@ -10,13 +10,13 @@ import pytest
 
 from rack.backplane.trace import Flag
 from rack.boards.config import load
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording import cores
 from rack.tools.recording.cores import UNMEASURED, CoreMeter, CoreRecord, Stolen
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.report import report_of
-from rack.tools.timing.analysis.report_markdown import markdown
+from rack.tools.report.report import report_of
+from rack.tools.report.report_markdown import markdown
 from tests.tools.recordings import MS, Cycle, recorded
 
 HEAD = "cpu  9 9 9 9 9 9 9 99 0 0\n"

@@ -11,10 +11,10 @@ import pytest
 
 from rack.backplane.trace import Flag
 from rack.boards.config import RackConfig, load
-from rack.levels.timing.tasks import Budget
+from rack.boards.timing.tasks import Budget
 from rack.tools.console.answer import Failure
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cycles import measured_budgets
 from rack.tools.recording.recording import Recording

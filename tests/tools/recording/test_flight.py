@@ -18,9 +18,9 @@ from rack.boards.config import RackConfig, load
 from rack.tools.commands.record import save_run
 from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
-from rack.tools.live.display import Display
-from rack.tools.live.launch import RunResult, run_rack
-from rack.tools.live.snapshot import Snapshot
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import RunResult, run_rack
+from rack.tools.monitor.snapshot import Snapshot
 from rack.tools.recording.divergence import first_difference
 from rack.tools.recording.occasions import Retention
 from rack.tools.recording.parquet import CONFIG
@@ -29,7 +29,7 @@ from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import find_missing, tally
 from rack.tools.recording.spool import STRETCHES
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.report.report import write_report
 from rack.tools.viewer.parts import FILE
 from rack.tools.viewer.reading import read
 from tests.conftest import SMALL

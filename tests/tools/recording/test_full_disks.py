@@ -16,8 +16,8 @@ import pytest
 from rack.backplane.segment import racks
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
@@ -139,7 +139,7 @@ def test_a_run_whose_report_cannot_be_written_fails(
     def fail(folder: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("rack.tools.timing.analysis.report.write_report", fail)
+    monkeypatch.setattr("rack.tools.report.report.write_report", fail)
     done = rack(
         *("run", small, "--seconds", 0.2, "--set", f"name={rack_name}", "--out", tmp_path / "run")
     )

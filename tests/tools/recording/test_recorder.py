@@ -14,11 +14,11 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.commands.status import recorded_by
 from rack.tools.console.answer import Failure
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.report import report_of
+from rack.tools.report.report import report_of
 from tests.shared_runs import SMALL_S, small_run
 
 TICKS = 1600

@@ -16,8 +16,8 @@ from rack.backplane.trace import RECORD
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load, wire
 from rack.tools.console.answer import Failure
-from rack.tools.live.display import Display
-from rack.tools.live.launch import NO_RECORDER, run_rack
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import NO_RECORDER, run_rack
 from rack.tools.recording import recorder_process
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.parquet import CONFIG
@@ -26,8 +26,8 @@ from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import mend
 from rack.tools.recording.spool import Spool, locked
-from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.report.analysis import Analysis
+from rack.tools.report.report import write_report
 from tests.tools.analysis_text import text as analysis_text
 from tests.tools.recording.struck_recorders import (
     LONG_S,

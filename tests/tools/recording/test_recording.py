@@ -19,8 +19,8 @@ from rack.tools.recording.checksums import Checksums, checked_line, read_line
 from rack.tools.recording.parquet import HEAD, signal_tables
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import TABLES
-from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.report import write_report
+from rack.tools.report.analysis import Analysis
+from rack.tools.report.report import write_report
 from rack.tools.timing.charts.gantt import subject_of
 from tests.shared_runs import nasrem_run, small_run
 

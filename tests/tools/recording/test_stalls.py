@@ -21,10 +21,10 @@ from rack.tools.recording.stalls import (
     Stalls,
     stalls_of,
 )
-from rack.tools.timing.analysis.analysis import Analysis
-from rack.tools.timing.analysis.report import report_of
-from rack.tools.timing.analysis.report_markdown import markdown
-from rack.tools.timing.analysis.tables import document
+from rack.tools.report.analysis import Analysis
+from rack.tools.report.report import report_of
+from rack.tools.report.report_markdown import markdown
+from rack.tools.report.tables import document
 from tests.tools.analysis_text import text
 from tests.tools.recordings import MS, Cycle, recorded
 

@@ -12,9 +12,9 @@ import pytest
 
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.boards.config import load
-from rack.levels.timing.forecast import Forecast
-from rack.levels.timing.interrupts import InboxTiming
-from rack.levels.timing.verdicts import INBOX, verdicts
+from rack.boards.timing.forecast import Forecast
+from rack.boards.timing.interrupts import InboxTiming
+from rack.boards.timing.verdicts import INBOX, verdicts
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.summary import tightest
 from tests.tools.command_line import rack

@@ -11,9 +11,9 @@ import pytest
 from rerun.chunk import RrdReader
 
 from rack.boards.config import load
-from rack.tools.live.continued import RunAgain, branched
-from rack.tools.live.display import Display
-from rack.tools.live.launch import run_rack
+from rack.tools.launch.continued import RunAgain, branched
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.viewer.merged import write_merged

@@ -10,9 +10,9 @@ from typing import Any, Literal
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.queue import is_position
+from rack.boards.config.connections import executors
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.toml import to_toml
-from rack.boards.config.wiring import executors
 from rack.boards.faults.bounds import between_reads, cycle_ticks
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind

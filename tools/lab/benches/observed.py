@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.levels.timing.trace_times import lateness_ns, skipped
-from rack.tools.live.display import Display
-from rack.tools.live.launch import RunResult, run_rack
+from rack.boards.timing.trace_times import lateness_ns, skipped
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import RunResult, run_rack
 from rack.tools.recording.recording import Recording
 
 SETTLE_NS = 250_000_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rack.boards.config import load, rack_timing, wire
 from rack.boards.errors import ConfigError
-from rack.levels.timing.forecast import Forecast
+from rack.boards.timing.forecast import Forecast
 from rack.tools.lab.reproduction.experiments.figures import FIG2, FigureRack
 from rack.tools.lab.reproduction.experiments.nasrem import NAME
 from rack.tools.lab.reproduction.page import Evidence

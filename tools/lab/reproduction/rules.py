@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from math import ceil, inf
 
 from rack.boards.config import load, rack_timing, wire
-from rack.levels.timing.verdicts import EquationVerdict
+from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.lab.reproduction.experiments.figures import (
     FIG2,
     LEAST_X,

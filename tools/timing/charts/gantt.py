@@ -9,7 +9,7 @@ from pathlib import Path
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, budgets, load, wire
 from rack.tools.console.answer import Document, Failure
-from rack.tools.live.folder import RUNS
+from rack.tools.launch.folder import RUNS
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.charts.letters import column_for, lines
 from rack.tools.timing.charts.measured import TracedRun

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import count, groupby
 
-from rack.levels.timing.schedule import Chart, Job
+from rack.boards.timing.schedule import Chart, Job
 from rack.tools.console.tables import ms
 from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.patterns import IDLE, Lane

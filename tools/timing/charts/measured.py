@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 
 from rack.boards.config import RackConfig, rack_timing
-from rack.levels.timing.schedule import Chart, Job, Span
-from rack.levels.timing.tasks import Budget, TimedTask, Unit
-from rack.levels.timing.trace_times import UNITS, plans, response_ns, skipped, waking_ns
+from rack.boards.timing.schedule import Chart, Job, Span
+from rack.boards.timing.tasks import Budget, TimedTask, Unit
+from rack.boards.timing.trace_times import UNITS, plans, response_ns, skipped, waking_ns
 from rack.tools.recording.recording import Recording
 from rack.tools.timing.charts.panel import Count, Panel, union, without
 from rack.tools.timing.charts.patterns import Detail, Lane, Patterns, Stretch, lanes_of, patterns

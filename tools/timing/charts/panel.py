@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from rack.levels.timing.schedule import Chart, Job, Span
+from rack.boards.timing.schedule import Chart, Job, Span
 from rack.tools.console.answer import Document
 from rack.tools.timing.charts.patterns import Lane, Patterns, Stretch
 

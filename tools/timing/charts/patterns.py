@@ -14,8 +14,8 @@ from itertools import accumulate, groupby
 from operator import itemgetter
 from typing import NamedTuple
 
-from rack.levels.timing.schedule import Chart, Span
-from rack.levels.timing.tasks import TimedTask, Unit
+from rack.boards.timing.schedule import Chart, Span
+from rack.boards.timing.tasks import TimedTask, Unit
 
 Stretch = tuple[int, int]
 """Start and end, ns."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from rack.levels.timing.tasks import Unit
+from rack.boards.timing.tasks import Unit
 from rack.tools.console.pictures import paths_of, picture
 from rack.tools.console.tables import ms
 from rack.tools.timing.charts.letters import COLUMNS, label_times, numbered_frames
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-    from rack.levels.timing.schedule import Chart, Job
+    from rack.boards.timing.schedule import Chart, Job
     from rack.tools.timing.charts.patterns import Lane
 
 COLOURS = {

@@ -9,9 +9,9 @@ from typing import TypeVar
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, rack_timing
-from rack.levels.timing.frames import core_frames
-from rack.levels.timing.schedule import Chart, Job, Span, simulate
-from rack.levels.timing.tasks import Part, Unit
+from rack.boards.timing.frames import core_frames
+from rack.boards.timing.schedule import Chart, Job, Span, simulate
+from rack.boards.timing.tasks import Part, Unit
 from rack.tools.console.answer import Failure
 from rack.tools.timing.charts.panel import Count, Panel
 from rack.tools.timing.charts.patterns import Detail, lanes_of, patterns

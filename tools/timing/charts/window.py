@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rack.levels.timing.tasks import TimedTask
+from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import ms
 from rack.tools.timing.charts.panel import NS_PER_MS

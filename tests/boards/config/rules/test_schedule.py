@@ -6,8 +6,8 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import load, resolve
+from rack.boards.config.connections import Wiring
 from rack.boards.config.rules.boards import schedule
-from rack.boards.config.wiring import Wiring
 from rack.boards.errors import ConfigError
 
 FIT = "does not fit the schedule, a multiple of the minor frame, 4 ms, that divides the major one,"

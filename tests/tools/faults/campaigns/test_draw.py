@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load, wire
-from rack.boards.config.faults import fault_mistakes, places
+from rack.boards.config.injections import fault_mistakes, places
 from rack.boards.config.published import publish
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.bounds import cycle_ticks

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load, rack_timing, wire
-from rack.levels.timing.command_path import command_paths
+from rack.boards.timing.command_path import command_paths
 from rack.tools.lab.reproduction.experiments import response
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.response import (

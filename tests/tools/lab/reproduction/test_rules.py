@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rack.levels.timing.verdicts import EquationVerdict
+from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
 from rack.tools.lab.reproduction.experiments.experiment import Kept
 from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.levels.timing.schedule import Chart
+from rack.boards.timing.schedule import Chart
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import union, without
 from tests.tools.recordings import cycle, recorded

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from rack.levels.timing.schedule import Chart, Job, Span, simulate
-from rack.levels.timing.tasks import Part, TimedTask, Unit
+from rack.boards.timing.schedule import Chart, Job, Span, simulate
+from rack.boards.timing.tasks import Part, TimedTask, Unit
 from rack.tools.timing.charts.patterns import Detail, Lane, Patterns, lanes_of, patterns
 
 

@@ -9,7 +9,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 from rack.boards.config import load, wire
-from rack.levels.timing.tasks import Unit
+from rack.boards.timing.tasks import Unit
 from rack.tools.timing.charts.letters import column_for, lines
 from rack.tools.timing.charts.panel import NS_PER_MS, Panel
 from rack.tools.timing.charts.picture import WIDTH_IN, draw

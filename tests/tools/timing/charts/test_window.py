@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rack.levels.timing.tasks import TimedTask
+from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
 from rack.tools.timing.charts.window import WindowOptions, shown_task, times_of
 

@@ -8,7 +8,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from rack.boards.config import RackConfig, load, wire
-from rack.levels.timing.trace_times import plans
+from rack.boards.timing.trace_times import plans
 from rack.tools.lab.reproduction.experiments import storing
 from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Workshop
 from rack.tools.timing.charts.letters import column_for, lines

@@ -11,9 +11,9 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from rack.boards.config import load
-from rack.levels.timing.rack import RackTiming
-from rack.levels.timing.trace_times import counts, gaps_ns
-from rack.levels.timing.verdicts import EquationVerdict
+from rack.boards.timing.rack import RackTiming
+from rack.boards.timing.trace_times import counts, gaps_ns
+from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
 from rack.tools.faults.judge import Judgement, faults
 from rack.tools.lab.benches.observed import Recorded
@@ -23,7 +23,7 @@ from rack.tools.recording.cycles import Cycles
 from rack.tools.recording.divergence import Difference, first_difference
 from rack.tools.recording.history import misses
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.analysis import Analysis, slice_ns
+from rack.tools.report.analysis import Analysis, slice_ns
 
 NAME = "nasrem"
 TASK_S = 34.0

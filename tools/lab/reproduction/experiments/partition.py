@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from rack.backplane.layout import TaskSpec
 from rack.boards.config import RackConfig, loads, rack_timing, resolve
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
-from rack.levels.timing.trace_times import counts, plans
+from rack.boards.timing.trace_times import counts, plans
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.recording.cycles import cycles_of
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.analysis.analysis import core_loads
+from rack.tools.report.analysis import core_loads
 
 NAME = "nasrem"
 SECONDS = 12.0

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rack.backplane.process import die_with_parent, pin, set_priority
-from rack.levels.timing.trace_times import Distribution, distribution
+from rack.boards.timing.trace_times import Distribution, distribution
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.harness import pinned
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop

@@ -16,8 +16,8 @@ from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import UNVIEWED, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import RUNS, Experiment, Workshop
-from rack.tools.live.host_side import entries_of
-from rack.tools.live.launch import RunResult
+from rack.tools.launch.launch import RunResult
+from rack.tools.monitor.host_side import entries_of
 from rack.tools.recording.history import fired_rows
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackGrid

@@ -1,0 +1,237 @@
+"""Verdicts: every equation of the timing model applied to every level, core and task of a rack.
+
+Equations 3.1 to 3.10 (NISTIR 90-4251, section 3) are judged as in the paper, each level as if it
+had its own processor. Response times and core loads account for levels that share a core.
+
+The paper's symbols: R_i is a level's response time, which is its cycle; R_max the longest cycle of
+all levels; t_exec the executor's processing in a cycle; t_comm its reading and writing, waiting
+included; t_residual the rest of the cycle; t_plan one plan with its update; d the cycles that a
+plan may take; t_cs one context switch.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import chain
+from math import inf, isfinite
+from typing import Any, Literal
+
+from rack.boards.timing.chains import ParallelChains
+from rack.boards.timing.frames import core_frames
+from rack.boards.timing.level import LevelTiming
+from rack.boards.timing.rack import RackTiming
+
+Sign = Literal["<", "<=", "="]
+_HOLDS: dict[Sign, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    "=": operator.eq,
+}
+SYSTEM = "system"
+"""The subject of the system's response."""
+LOOSE_PLAN = "fig. 4"
+"""A loosely coupled planner's time slice: in the paper's text and its figure 4, without an equation
+number."""
+PLAN_WITHIN = "plan within"
+RESPONSE_TIME = "response time"
+LOAD = "load"
+FRAMES = "frames"
+INBOX = "inbox"
+"""Criteria beyond the paper."""
+EQUATIONS = "3.1", "3.2", "3.3", "3.4", "3.5", "3.6", "3.7", "3.8", LOOSE_PLAN, "3.9", "3.10"
+BEYOND = PLAN_WITHIN, RESPONSE_TIME, LOAD, FRAMES, INBOX
+ORDER = (*EQUATIONS, *BEYOND)
+"""All equations and criteria, in the order of the verdicts."""
+
+
+@dataclass(frozen=True)
+class EquationVerdict:
+    """Both sides of one equation for one subject; predicted or measured.
+
+    `equation` is the paper's number, as in "3.8", or one of `BEYOND`. `subject` is a board, a task,
+    a core or "system". `left` and `right` are ns, or numbers if `unit` is "1". `meaning` names both
+    sides in the paper's terms, as in "t_plan / d < t_residual - 2 t_cs". `endless` says in a
+    sentence why the left side has no bound; empty if it has one.
+    """
+
+    equation: str
+    subject: str
+    left: float
+    sign: Sign
+    right: float
+    meaning: str
+    unit: str = "ns"
+    endless: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the numbers satisfy the equation."""
+        return _HOLDS[self.sign](self.left, self.right)
+
+    @property
+    def margin(self) -> float:
+        """Right side minus left side, in `unit`; negative if the equation fails."""
+        return self.right - self.left
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Identity of the judgement, the same before and after a change of the rack."""
+        return self.equation, self.subject, self.meaning
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain data; an infinite side is None."""
+        sides = {"left": self.left, "right": self.right, "margin": self.margin}
+        finite = {name: side if isfinite(side) else None for name, side in sides.items()}
+        return {**asdict(self), "holds": self.holds, **finite}
+
+
+def verdicts(rack: RackTiming) -> list[EquationVerdict]:
+    """Return the verdicts on everything that has a budget, in the order of the equations.
+
+    A response time without a bound is infinite.
+    """
+    levels = (level_verdicts(rack, level) for level in rack.levels.values())
+    beyond = _of_tasks(rack), _of_cores(rack), _of_frames(rack), _of_inboxes(rack)
+    found = chain(system_verdicts(rack), *levels, *beyond)
+    return sorted(found, key=lambda verdict: ORDER.index(verdict.equation))
+
+
+def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
+    """Yield the verdicts on one level by itself."""
+    yield from _of_cycle(level, rack.tick_ns)
+    yield from _of_planner(level, rack.context_switch_ns, rack.small_share)
+
+
+def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield the verdicts on the system's response, chain by chain; with a goal for it, also on
+    every cycle in them."""
+    goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
+    for found in rack.parallel:
+        yield from _of_chains(rack, found, goal_ns)
+    if goal_ns is not None:
+        for name in dict.fromkeys(chain(*rack.chains)):
+            cycle_ns = rack.boards[name].every * rack.tick_ns
+            longest_ns = round(rack.longest_cycles[name] * rack.tick_ns)
+            yield EquationVerdict("3.1", name, cycle_ns, "<=", longest_ns, "R_i <= R_max = R_s / n")
+
+
+def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
+    """Return the subject of the system's response along these chains; where there are others, it
+    names them."""
+    return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
+
+
+def _of_chains(
+    rack: RackTiming, chains: ParallelChains, goal_ns: float | None
+) -> Iterator[EquationVerdict]:
+    subject = response_subject(rack, chains)
+    bound = goal_ns
+    limit = "timing.response_ms"
+    if bound is None:
+        bound = chains.bound * rack.tick_ns
+        limit = "n R_max"
+    total = sum(chains.cycles) * rack.tick_ns
+    yield EquationVerdict("3.3", subject, total, "<=", bound, f"R_s = sum of R_i <= {limit}")
+    for way, ticks in (
+        ("command", rack.command_ticks(chains)),
+        ("status", rack.status_ticks(chains)),
+    ):
+        meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
+        yield EquationVerdict("3.2", subject, ticks * rack.tick_ns, "<=", bound, meaning)
+
+
+def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
+    board = level.board
+    cycle = level.cycle_ns
+    used = level.execution_ns + level.communication_ns
+    yield EquationVerdict("3.1", board, used, "<=", cycle, "t_proc + t_c <= R_i")
+    longest = level.longest_cycle_ns
+    yield EquationVerdict("3.4", board, level.execution_ns, "<", longest, "t_exec < R_max")
+    # A cycle too short for its parts has a residual of 0: they then exceed it.
+    meaning = "t_exec + t_comm + t_residual = R_i"
+    yield EquationVerdict("3.5", board, max(used, cycle), "=", cycle, meaning)
+    yield EquationVerdict("3.6", board, 0, "<", level.residual_ns, "0 < t_residual <= alpha")
+    on_grid = max(round(cycle / tick_ns), 1) * tick_ns
+    yield EquationVerdict("3.7", board, cycle, "=", on_grid, "R_i = k c, k whole")
+
+
+def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
+    if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
+        return
+    board = level.board
+    cycle = level.cycle_ns
+    within_ns = level.plan_within_ns
+    if within_ns is not None:
+        meaning = "d R_i <= budget.plan_within_ms"
+        yield EquationVerdict(PLAN_WITHIN, board, level.slice_ns, "<=", within_ns, meaning)
+    if level.coupling == "loose":
+        time_slice = level.slice_ns
+        yield EquationVerdict(
+            LOOSE_PLAN, board, level.planning_ns, "<=", time_slice, "t_plan <= d R_i"
+        )
+        return
+    share = level.planning_ns / level.within_cycles
+    left = level.residual_ns - 2 * switch_ns
+    yield EquationVerdict("3.8", board, share, "<", left, "t_plan / d < t_residual - 2 t_cs")
+    # In the worst cycle the plan is updated, too.
+    talks = level.interlevel_ns + level.executor_planner_ns
+    taken = level.execution_ns + talks + 2 * switch_ns
+    meaning = "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
+    yield EquationVerdict("3.9", board, taken, "<", cycle, meaning)
+    update = level.executor_planner_ns / cycle
+    meaning = "t_executor-planner / R_i, small"
+    yield EquationVerdict("3.10", board, update, "<=", small, meaning, "1")
+
+
+def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
+    for task in rack.responses:
+        response_ns: float | None = task.response_ns
+        endless = ""
+        if response_ns is None:
+            response_ns = inf
+            load = rack.loads[task.core]
+            what = "is overloaded" if load > 1 else "leaves it too little time"
+            role = "planner" if task.task.endswith(".planner") else "board"
+            endless = (
+                f"{role} '{task.task}' never finishes: core {task.core} {what} (load {load:.3g})"
+            )
+        yield EquationVerdict(
+            equation=RESPONSE_TIME,
+            subject=task.task,
+            left=response_ns,
+            sign="<=",
+            right=task.deadline_ns,
+            meaning="worst-case response <= deadline",
+            endless=endless,
+        )
+
+
+def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
+    for core, load in rack.loads.items():
+        meaning = "share of its time that its tasks compute"
+        yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
+
+
+def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield the verdicts on the places of a static schedule: one for all frames in which a place is
+    the same."""
+    for alike in core_frames(rack):
+        for place in alike.places:
+            limit = f"'{place.until}' begins" if place.until else "the frame ends"
+            meaning = f"done before {limit}, in frame {alike.frames[0]}"
+            end_ns = place.limit_ns - place.slack_ns
+            yield EquationVerdict(FRAMES, place.board, end_ns, "<=", place.limit_ns, meaning)
+
+
+def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
+    for name, inbox in rack.inboxes.items():
+        burst = inbox.burst
+        most = inf
+        endless = f"interrupts of '{name}' come faster than it serves them (load {burst.load:.3g})"
+        if burst.waiting is not None:
+            most = burst.waiting
+            endless = ""
+        meaning = "interrupts that wait after a burst of all senders <= depth"
+        yield EquationVerdict(INBOX, name, most, "<=", inbox.depth, meaning, "1", endless)

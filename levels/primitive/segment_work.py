@@ -1,0 +1,287 @@
+"""Execution of segments.
+
+A path starts when it is planned and clear, holds on command or for the guard, and is done when the
+arm has settled. A gripper segment is done when the gripper rests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from rack.levels.algebra import Array
+from rack.levels.messages import DrivenArm, Error, WorldState
+from rack.levels.motion.path import BlendedPath
+from rack.levels.motion.trajectory import Trajectory
+from rack.levels.primitive.motion_segment import MotionSegment, SegmentFault
+from rack.levels.primitive.path_guard import Guard
+from rack.levels.primitive.path_motion import PathMotion
+from rack.levels.primitive.tracking import HANDOVER_CYCLES
+from rack.levels.robot.limits import Limits
+from rack.levels.tables import GripperConfig, Positive, Table
+
+ANSWER_CYCLES = 3
+"""Cycles from the end of a trajectory until its segment is reported done, in addition to those of
+settling.
+
+In these the last set point becomes due, the servo's status shows it, and this level's status
+becomes visible."""
+
+
+class PrimitiveParams(Table):
+    """Bounds of following, settling and guarding, in `[board.<name>.params]`."""
+
+    following: Positive = 0.05
+    """largest distance of a joint from its set point under way, rad"""
+    straying: Positive = 0.1
+    """time that a joint may be farther than that before it is an error, s"""
+    settled: Positive = 0.003
+    """largest distance of a settled joint from its goal, rad"""
+    settled_opening: Positive | None = None
+    """largest speed of a settled gripper, m/s or rad/s; default: a twentieth of its way in a
+    second"""
+    settled_cycles: int = Field(3, ge=1, le=100)
+    """consecutive cycles that a settled arm stays so"""
+    settling: Positive = 3.0
+    """longest time that arm or gripper may take to settle, s"""
+    astray: Positive = 0.02
+    """largest distance of a joint from the path when motion begins, rad"""
+    bridging: Positive = 0.5
+    """time in which such a distance is removed, s"""
+    silent: Positive = 10.0
+    """time without status from below, restarts included, that is an error, s"""
+    blind: Positive = 0.2
+    """time without a new scene in the world model after which motion holds, s"""
+    braking: float = Field(1.5, ge=1.0, le=3.0)
+    """multiple of the planned acceleration and jerk limits that a hold may use"""
+    lookahead: Positive = 2.0
+    """time ahead of the arm that the guard watches in every cycle, s"""
+    clear: Positive = 0.5
+    """time that the way must be clear before held motion continues, s"""
+
+
+@dataclass(frozen=True)
+class WorkRules:
+    """The bounds within which segments are executed."""
+
+    joints: tuple[str, ...]
+    limits: Limits
+    params: PrimitiveParams
+    period_s: float  # the level's cycle
+
+    @property
+    def braking(self) -> Limits:
+        """Limits of a hold: planned motion on a curve may use all of its own."""
+        planned = self.limits
+        factor = self.params.braking
+        return replace(
+            planned, acceleration=factor * planned.acceleration, jerk=factor * planned.jerk
+        )
+
+    def cycles(self, time_s: float) -> int:
+        """Return the cycles that fill `time_s`."""
+        return max(1, round(time_s / self.period_s))
+
+    @property
+    def latency_s(self) -> float:
+        """Time from the end of a trajectory until its segment is reported done, in s."""
+        return (self.params.settled_cycles + ANSWER_CYCLES) * self.period_s
+
+
+class Quiet:
+    """Counts cycles: enough consecutive quiet ones mean settled; too many in total mean that it
+    will never settle."""
+
+    def __init__(self, rules: WorkRules) -> None:
+        self._wanted_cycles = rules.params.settled_cycles
+        self._most_cycles = rules.cycles(rules.params.settling)
+        self._quiet = 0
+        self._cycles = 0
+
+    def settled(self, quiet: bool) -> bool:
+        """Count one cycle; return whether it has settled."""
+        self._cycles += 1
+        self._quiet = self._quiet + 1 if quiet else 0
+        return self._quiet >= self._wanted_cycles
+
+    @property
+    def overdue(self) -> bool:
+        """True when it should have settled long ago."""
+        return self._cycles > self._most_cycles
+
+
+class WorkCycle(NamedTuple):
+    """The inputs of one cycle of a path."""
+
+    hold: bool
+    plan: Trajectory | None  # from where the motion rests
+    world: WorldState
+    due_s: float  # simulated time of the set point commanded last
+    passed_s: float  # since the cycle before
+    part: float = 1.0  # of full speed, for a trajectory that begins
+
+
+class PathWork:
+    """One PATH segment."""
+
+    def __init__(
+        self, segment: MotionSegment, path: BlendedPath, guard: Guard, rules: WorkRules
+    ) -> None:
+        self.segment = segment
+        self.motion = PathMotion(path, rules.braking, rules.params.bridging)
+        self.fault: SegmentFault | None = None  # why it cannot be done
+        self.blocked = False  # something is in the way
+        self.astray = False  # the arm is off the path
+        self.obstacle = ""  # what was in the way when the motion was blocked last
+        self.unplanned_cycles = 0  # consecutive cycles in which the motion waits for a trajectory
+        self._guard = guard
+        self._rules = rules
+        self._quiet = Quiet(rules)
+        self._clear_cycles = 0
+        self._fresh = True
+
+    def begin_at(self, position: Array) -> None:
+        """Prepare to start from `position` (joints,), rad, where the path must begin."""
+        permitted = self._rules.params.astray
+        distance = self.motion.rest_at(position)
+        if distance > permitted:
+            begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
+            self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
+
+    def begin_near(self, position: Array, progress: float) -> None:
+        """Prepare to continue from `position` (joints,), rad; blocked if that is off the path.
+
+        `progress`, 0 to 1, is about the part of the path that is done.
+        """
+        self._fresh = False
+        self._clear_cycles = 0
+        self._quiet = Quiet(self._rules)
+        away = self.motion.rest_near(position, progress)
+        self.astray = self.blocked = away > self._rules.params.astray
+        self.obstacle = f"the arm is {away:.3f} rad off its path"
+
+    def step(self, cycle: WorkCycle) -> None:
+        """Advance by one cycle."""
+        motion = self.motion
+        waits = self.begin_wanted is not None
+        if motion.trajectory is not None and not motion.stopping:
+            self._block(
+                not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world)
+            )
+            if cycle.hold or self.blocked:
+                motion.hold()
+        elif waits and cycle.plan is not None:
+            self._start(cycle, cycle.plan)
+        self.unplanned_cycles = self.unplanned_cycles + 1 if waits and cycle.plan is None else 0
+        motion.advance(cycle.passed_s)
+
+    def done(self, status: DrivenArm) -> bool:
+        """Return whether set point and arm rest at the end of the path."""
+        if not self.motion.finished:
+            return False
+        away = np.abs(status.position - self.motion.set_point.position)
+        settled = self._quiet.settled(bool((away < self._rules.params.settled).all()))
+        if self._quiet.overdue and not settled:
+            joint = int(away.argmax())
+            permitted = self._rules.params.settled
+            name = self._rules.joints[joint]
+            reason = (
+                f"joint '{name}' rests {away[joint]:.4f} rad from its goal; valid: at most"
+                f" {permitted} rad"
+            )
+            self.fault = SegmentFault(Error.FOLLOWING, reason)
+        return settled
+
+    @property
+    def begin_wanted(self) -> float | None:
+        """Where on the path a trajectory is to begin, in rad; None when the motion needs none."""
+        motion = self.motion
+        return motion.s if motion.resting and not motion.finished and not self.astray else None
+
+    @property
+    def progress(self) -> float:
+        """Part of the path done, 0 to 1."""
+        length = self.motion.path.length
+        return self.motion.s / length if length > 0.0 else 1.0
+
+    def ends_s(self, due_s: float) -> float:
+        """Return the simulated time at which the segment should be done if the set point is due at
+        `due_s`, or 0."""
+        if self.motion.stopping or (self.motion.resting and not self.motion.finished):
+            return 0.0
+        return due_s + self.motion.remaining_s + self._rules.latency_s
+
+    def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
+        if cycle.part < 1.0:
+            plan = plan.stretched(1.0 / cycle.part)
+        clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
+        self._clear_cycles = self._clear_cycles + 1 if clear else 0
+        wanted = self._rules.cycles(self._rules.params.clear) if self.blocked else 1
+        self._block(self._clear_cycles < wanted)
+        if cycle.hold or self.blocked:
+            return
+        timed = self._timed(plan, cycle.due_s)
+        if timed is not None:
+            self.motion.follow(timed)
+            self._fresh = False
+            self._clear_cycles = 0
+
+    def _block(self, blocked: bool) -> None:
+        if blocked and not self.blocked:
+            self.obstacle = self._guard.obstacle
+        self.blocked = blocked
+
+    def _timed(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
+        """Stretch the trajectory to end just in time; before the start, refuse one that is too
+        late."""
+        if not self.segment.by or not trajectory.duration:
+            return trajectory
+        available = self.segment.by - self._rules.latency_s - due_s
+        if available < trajectory.duration and self._fresh:
+            self.fault = self.segment.too_late(due_s + trajectory.duration + self._rules.latency_s)
+            return None
+        return trajectory.stretched(max(1.0, available / trajectory.duration))
+
+
+class GripperWork:
+    """One GRIPPER segment: the gripper moves as far as its force permits; done when it rests."""
+
+    def __init__(self, segment: MotionSegment, gripper: GripperConfig, rules: WorkRules) -> None:
+        self.segment = segment
+        self._gripper = gripper
+        self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
+        self.fault: SegmentFault | None = None  # why it cannot be done
+        self._rules = rules
+        self.begin()
+
+    def begin(self) -> None:
+        """Start waiting until the gripper rests: at the start, and when the servo is back in
+        step."""
+        self._cycles = 0
+        self._quiet = Quiet(self._rules)
+
+    @property
+    def held_after(self) -> int:
+        """The object in the gripper afterwards: the segment's, if the gripper ends nearer to closed
+        than to open; -1: none."""
+        return self.segment.object if self._closes else -1
+
+    def done(self, status: DrivenArm) -> bool:
+        """Return whether the gripper rests."""
+        self._cycles += 1
+        # Before the command reaches it, the gripper rests too.
+        if self._cycles <= HANDOVER_CYCLES:
+            return False
+        speed = abs(status.opening_velocity)
+        permitted = self._rules.params.settled_opening or self._gripper.still
+        settled = self._quiet.settled(speed < permitted)
+        if self._quiet.overdue and not settled:
+            reason = (
+                f"gripper still moves {speed / self._gripper.travel:.1%} of its way in a second; it"
+                f" must come below {permitted / self._gripper.travel:.1%}"
+            )
+            self.fault = SegmentFault(Error.FOLLOWING, reason)
+        return settled

@@ -1,0 +1,13 @@
+"""Task levels of several racks that work together: one that takes its actions as orders, and one
+that gives them."""
+
+from rack.levels.systems.coordination.coordinator import Coordinator
+from rack.levels.systems.coordination.ordered_task import OrderedTaskExecutor, OrderedTaskPlanner
+from rack.levels.systems.coordination.sharing_executor import SharingServoExecutor
+
+__all__ = [
+    "Coordinator",
+    "OrderedTaskExecutor",
+    "OrderedTaskPlanner",
+    "SharingServoExecutor",
+]

@@ -1,0 +1,95 @@
+"""Actions of a task program as fields of a message, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from rack.levels.errors import ProgramError
+from rack.levels.level import LevelContext
+from rack.levels.operator import Goal
+from rack.levels.systems.coordination.messages import CellAction, OrderAction
+from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, misfits
+
+_ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
+
+
+def write_action(action: AnyAction, message: CellAction) -> None:
+    """Fill the `CellAction` of a message; what the action lacks is zero."""
+    for field in CellAction.message_type.fields:
+        message.record[field.name] = np.zeros((), message.record.dtype[field.name])
+    message.by = action.by or 0.0
+    if isinstance(action, Transfer):
+        message.action = OrderAction.TRANSFER
+        message.object = action.object
+        message.position[:] = action.to
+        message.turned = action.yaw is not None
+        message.yaw = action.yaw or 0.0
+        message.lift = action.lift
+    elif isinstance(action, Goto):
+        message.action = OrderAction.GOTO
+        if action.joints is not None:
+            message.goal = Goal.JOINTS
+            message.count = len(action.joints)
+            message.joints[: message.count] = action.joints
+            return
+        message.position[:] = action.position
+        if action.quaternion is not None:
+            message.goal = Goal.POSE
+            message.quaternion[:] = action.quaternion
+        else:
+            message.goal = Goal.DIRECTION
+            message.direction[:] = action.direction or DOWN
+    elif isinstance(action, Home):
+        message.action = OrderAction.HOME
+
+
+def copy_action(source: CellAction, target: CellAction) -> None:
+    """Copy the `CellAction` from one message to another."""
+    for field in CellAction.message_type.fields:
+        target.record[field.name] = source.record[field.name]
+
+
+def read_action(message: CellAction, context: LevelContext) -> AnyAction:
+    """Return the action in the `CellAction` of a message. Raises `ProgramError`: it does not
+    suit arm or scene."""
+    try:
+        action: AnyAction = _ACTION.validate_python({**_table(message), "by": message.by or None})
+    except ValidationError as error:
+        lines = [f"{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
+        raise ProgramError("\n".join(lines)) from error
+    if found := [
+        f"{key} = {value!r}: {why}"
+        for key, value, why in misfits(action, context.robot, context.scene)
+    ]:
+        raise ProgramError("\n".join(found))
+    return action
+
+
+def _table(message: CellAction) -> dict[str, Any]:
+    """Return the action, but for its `by`, as a table of a program."""
+    place = message.position.tolist()
+    match message.action, message.goal:
+        case OrderAction.HOME, _:
+            return {"do": "home"}
+        case OrderAction.TRANSFER, _:
+            yaw = message.yaw if message.turned else None
+            return {
+                "do": "transfer",
+                "object": message.object,
+                "to": place,
+                "lift": message.lift,
+                "yaw": yaw,
+            }
+        case OrderAction.GOTO, Goal.JOINTS:
+            return {"do": "goto", "joints": message.joints[: message.count].tolist()}
+        case OrderAction.GOTO, Goal.POSE:
+            return {"do": "goto", "position": place, "quaternion": message.quaternion.tolist()}
+        case OrderAction.GOTO, Goal.DIRECTION:
+            return {"do": "goto", "position": place, "direction": message.direction.tolist()}
+    raise ProgramError(
+        f"action {message.action} with goal {message.goal} is not known; permitted: transfer, goto,"
+        " home"
+    )

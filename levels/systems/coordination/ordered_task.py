@@ -1,0 +1,374 @@
+"""An ordered task level: takes its actions from a coordinator, one order at a time.
+
+Its planner makes elemental moves of an order, or finds the reason why it cannot be done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import StringConstraints, ValidationError
+
+from rack.backplane.message import Message, State, fill_counts
+from rack.backplane.rack_name import RACK_NAME
+from rack.levels.errors import ProgramError, Refused
+from rack.levels.level import Input, LevelContext, MadePorts, Output, Reading
+from rack.levels.messages import Error, MoveStatus, TaskPlan, WorldState
+from rack.levels.peer import PeerPresence, peer_port
+from rack.levels.systems.coordination.actions import copy_action, read_action
+from rack.levels.systems.coordination.agreement import TakenOrder
+from rack.levels.systems.coordination.messages import (
+    CellOrder,
+    CellReport,
+    CellRequest,
+    MailboxName,
+    Response,
+)
+from rack.levels.tables import Positive, read_params
+from rack.levels.task.executor import TaskExecutor
+from rack.levels.task.planner import TaskPlanner
+from rack.levels.task.program import AnyAction, TaskConfig, TaskParams
+from rack.levels.task.rehearsal import Rehearsed, finish_times
+
+RackName = Annotated[str, StringConstraints(pattern=f"^({RACK_NAME})?$")]
+PLANNED = (Response.POSSIBLE, Response.DOING, Response.REFUSED)
+"""Answers to an order that rest on its plan."""
+MAX_STRAY_RAD = 0.005
+"""A plan holds if no joint has moved farther since it was requested."""
+
+
+class OrderedTaskParams(TaskParams):
+    """From where a task level takes its orders, and for how long it keeps a promise."""
+
+    coordinator: RackName = ""
+    """rack that gives the orders over the network; empty: a board of this rack gives them"""
+    orders: MailboxName = "lan.orders"
+    """mailbox with the orders"""
+    decision: Positive = 5.0
+    """time between an answer and the order to do it, for which a promised time holds, s"""
+
+
+class OrderedTaskExecutor(TaskExecutor):
+    """Answers what it is asked, and does what it has answered to be possible.
+
+    While its orders are lost it holds the arm on its path. It ends its run when the coordinator
+    says so, or when that stays away for `stalled_s`.
+    """
+
+    world = Input(WorldState, "world.model")
+    last_request = Input(CellRequest, "own.request")
+    last_report = Input(CellReport, "own.report")
+    # The report last: what it says has begun is in the status.
+    request = Output(CellRequest)
+    report = Output(CellReport)
+    params = OrderedTaskParams
+    program = None
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._table = read_params(OrderedTaskParams, context.params)
+        rack = self._table.coordinator
+        self._source = f"rack '{rack}'" if rack else "the coordinator"
+        self._taken = TakenOrder()
+        self._begun = 0  # request whose plan is followed; 0: none
+        self._orders_begun = 0
+        self._orders_done = 0
+        self._moves = 0, 0  # done, of how many, of the newest order begun
+        self._halted = False  # moves were withdrawn: the arm is held until another order begins
+        self._breaking_off: int | None = None  # first move that must not begin
+        self._rests = False  # the arm is held so that the order can be broken off
+        self._absent = ""  # why there are no orders
+        self._held = ""  # why the coordinator holds the arm
+        self._waits = ""  # why an order cannot be planned yet
+        self._is_end_reported = False
+        self._nothing = TaskPlan.zeros(context.sizes)  # the plan of no order
+
+    @classmethod
+    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
+        """Return the mailboxes of the orders and, over the network, of the other rack's time."""
+        try:
+            table = OrderedTaskParams.model_validate(params)
+        except ValidationError:
+            return MadePorts(is_whole=False)
+        ports: dict[str, Input[Any]] = {"order": Input(CellOrder, table.orders)}
+        if table.coordinator:
+            ports["peer"] = Input(PeerPresence, f"lan.{peer_port(table.coordinator)}")
+        return MadePorts(ports)
+
+    def _first_actions(self) -> tuple[AnyAction, ...]:
+        return ()
+
+    def _recall(self) -> None:
+        super()._recall()
+        last = self.last_status.message
+        self._orders_begun = last.actions
+        self._orders_done = last.action
+        self._moves = last.moves_done, last.moves
+        if not self.last_report.is_there:
+            return
+        report = self.last_report.message
+        self.report.copy_from(report)
+        self.request.copy_from(self.last_request.message)
+        self._taken = TakenOrder(report)
+        self._halted = report.halted
+        self._is_end_reported = self._taken.response is Response.ENDED
+        if self._taken.is_under_way and report.moves:
+            self._begun = self.request.id
+            self._take_action(self.request)
+
+    def _plan_to_follow(self, tick: int) -> TaskPlan:
+        """Follow the orders; return the plan of the one under way."""
+        self._listen(self.ports["order"])
+        self._waits = ""
+        taken = self._taken
+        request = self.request
+        plan = self.plan.message
+        if taken.is_asked:
+            self._answer_order(request, tick)
+        elif taken.is_under_way and not self._begun:
+            self._begin(request)
+        self.status.echo = plan.id if plan.id == request.id else 0
+        # Report the earliest end, and how long a promise holds, in the coordinator's time.
+        report = self.report
+        response = self._taken.response
+        report.earliest = 0.0
+        report.until = 0.0
+        if plan.id == request.id and response in PLANNED:
+            report.earliest = plan.earliest
+        if response is Response.POSSIBLE and request.by:
+            report.until = request.begin + request.ahead + request.by - plan.earliest
+        below = self.below.message
+        self.report.operated = below.operated or self._orders.stands
+        return plan if self._begun and self._begun == plan.id else self._nothing
+
+    def _listen(self, reading: Reading[CellOrder]) -> None:
+        """Take up what the coordinator says, or note why it says nothing."""
+        order = reading.message
+        self._held = self._absent = ""
+        if not reading.is_there:
+            self._absent = f"no orders from {self._source} yet"
+        elif reading.is_lost:
+            self._absent = f"{self._source} is lost: held until it is back"
+        else:
+            self._taken.hear(order.program, order.id, order.what, order.reason)
+            if order.hold and self._taken.is_under_way:
+                self._held = order.reason
+        if self._taken.response is Response.ENDED:
+            if self._is_end_reported and not self._error:
+                self._error = self._taken.error
+                self._reason = self._taken.reason
+            self._absent = ""
+
+    def _answer_order(self, request: CellRequest, tick: int) -> None:
+        """Answer when the order is planned; have it planned as soon as the arm rests."""
+        plan = self.plan.message
+        taken = self._taken
+        if (request.program, request.order) == (taken.program, taken.order):
+            if plan.id == request.id and not plan.error:
+                taken.answer(Response.POSSIBLE)
+            elif plan.id == request.id:
+                taken.fail(plan.error, plan.reason)
+            return
+        self._waits = self._not_ready()
+        if self._waits:
+            return
+        order: CellOrder = self.ports["order"].message
+        # The coordinator's simulated time less that here.
+        ahead_s = float(self.ports["peer"].message.ahead) if self._table.coordinator else 0.0
+        now_s = tick * self.context.tick_s
+        try:
+            action = read_action(order, self.context)
+        except ProgramError as error:
+            taken.fail(Error.UNREACHABLE, str(error))
+            return
+        if action.by is not None and action.by - ahead_s <= now_s:
+            why = f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already"
+            taken.fail(Error.TOO_LATE, why)
+            return
+        request.program = taken.program
+        request.order = taken.order
+        request.ahead = ahead_s
+        copy_action(order, request)
+        planned_s = (self.context.within_cycles + 1) * self.context.period_s
+        self._request(request, now_s + planned_s + self._table.decision)
+
+    def _request(self, request: CellRequest, begin_s: float) -> None:
+        """Have the action in `request` planned, to begin at `begin_s`."""
+        request.id += 1
+        request.begin = begin_s
+        request.revision = self.world.message.revision
+        request.start = self.below.message.start
+
+    def _not_ready(self) -> str:
+        """Return why nothing can be planned now; empty: it can."""
+        if self._orders.stands or not self.below.message.resting:
+            return "the arm does not rest yet"
+        if not self.world.message.revision:
+            return "the world model knows nothing yet"
+        if self.ports["order"].message.by and self._table.coordinator:
+            peer = self.ports["peer"]
+            if not (peer.is_there and peer.message.uncertainty >= 0.0):
+                return f"the clock of {self._source} has not been compared yet"
+        return ""
+
+    def _begin(self, request: CellRequest) -> None:
+        """Begin with the plan that was promised; have it planned anew if the world has changed
+        since."""
+        if not self._actions:
+            self._take_action(request)
+        strays = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
+        if request.begin and (strays or self.world.message.revision != request.revision):
+            self._waits = self._not_ready()
+            if not self._waits:
+                self._request(request, 0.0)
+        elif self.plan.message.id == request.id:
+            self._begun = request.id
+            self._done = 0
+            self._halted = False
+            self._window.renumber(0)
+            self._orders_begun += 1
+
+    def _take_action(self, request: CellRequest) -> None:
+        self._actions = (read_action(request, self.context),)
+        self._ahead_s = request.ahead
+
+    def _step_aside(self, plan: TaskPlan, below: MoveStatus) -> int:
+        """Interrupt the order for an operator, or break it off."""
+        done = super()._step_aside(plan, below)
+        self._halted = self._halted and not self._detour.move
+        self._breaking_off = None
+        rested = self._rests
+        self._rests = False
+        if self._taken.stops and self._detour.move:
+            self._taken.answer(Response.STOPPED)
+        elif self._taken.stops:
+            self._breaking_off, self._rests = self._window.breaking_off(plan, done, below)
+            if rested and below.resting:
+                self._taken.answer(Response.STOPPED)
+                self._halted = True
+        return done
+
+    def _shown_until(self, plan: TaskPlan) -> int:
+        until = super()._shown_until(plan)
+        return until if self._breaking_off is None else min(until, self._breaking_off)
+
+    def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
+        waits = super()._reason_to_wait(below)
+        if self._orders.stands:
+            return waits
+        return self._absent or self._held or waits or self._waits
+
+    def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
+        # While the coordinator holds the arm, it also says for how long.
+        if self._held:
+            self._moved_at = tick
+        else:
+            super()._check_progress(plan, waits, tick)
+
+    def _stage(self) -> tuple[int, ...]:
+        return self._taken.order, self._taken.response, self._begun, not self._absent
+
+    def _report(self, plan: TaskPlan, waits: str) -> None:
+        report = self.report
+        status = self.status
+        echo = self.status.echo
+        self._settle(plan)
+        taken = self._taken
+        if self._begun:
+            self._moves = self._done, plan.count
+            report.moves_done, report.moves = self._moves
+        elif (report.program, report.echo) != (taken.program, taken.order):
+            report.moves_done = 0
+            report.moves = 0
+        super()._report(plan, waits)
+        status.echo = echo
+        fill_counts(status.record[["action", "actions"]], (self._orders_done, self._orders_begun))
+        status.moves_done, status.moves = self._moves
+        report.program = taken.program
+        report.echo = taken.order
+        report.response = taken.response
+        report.state = status.state
+        report.error = taken.error
+        report.halted = self._halted
+        report.reason = taken.reason or waits
+        if not taken.is_under_way:
+            self._begun = 0
+            self._actions = ()
+        self._is_end_reported = taken.response is Response.ENDED
+
+    def _about(self, action: int, why: str) -> str:
+        """Return a reason without the number: an order is one action."""
+        return why.lstrip(",: ")
+
+    def _settle(self, plan: TaskPlan) -> None:
+        """End the order that is done or has failed; what ends the run as well stays an error."""
+        taken = self._taken
+        if self._error and (taken.is_asked or taken.is_under_way):
+            if self._absent and self._error is Error.STALLED:
+                return
+            taken.fail(self._error, self._reason)
+            self._halted = self._halted or self._begun > 0
+            self._error = Error.NONE
+            self._reason = ""
+        elif taken.is_under_way and plan.count and self._done == plan.count:
+            taken.answer(Response.DONE)
+            self._orders_done += 1
+
+    def _answer(self, below: MoveStatus) -> None:
+        super()._answer(below)
+        is_held = self._taken.is_under_way and (self._absent or self._held)
+        if not self._detour.move and (self._halted or self._rests or is_held):
+            self.command.hold = True
+
+    def _state(self, plan: TaskPlan) -> State:
+        if self._error:
+            return State.ERROR
+        if self._taken.response is Response.ENDED:
+            return State.DONE if self._is_end_reported else State.EXECUTING
+        waits = self._taken.is_asked or self._taken.is_under_way or self._absent
+        return State.EXECUTING if waits else State.IDLE
+
+
+class OrderedTaskPlanner(TaskPlanner):
+    """Plans what its executor requests: the action of an order, to begin later or at once."""
+
+    request = Input(CellRequest, "own.request")
+    params = OrderedTaskParams
+    program = None
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._id = 0
+        self._begin_s = 0.0  # simulated time at which the plan may have to begin
+
+    def _first_program(self) -> TaskConfig:
+        return TaskConfig()
+
+    def wanted(self, tick: int) -> bool:
+        """Return whether a request is not answered yet, and the world is known and at rest."""
+        request = self.request.message
+        if request.id not in (0, self._id):
+            # Whoever requests it has found that it suits the arm.
+            action = read_action(request, self.context)
+            self._program = TaskConfig(action=(action,))
+            self._id = request.id
+            self._plan = None
+            self._begin_s = request.begin
+            self._ahead_s = request.ahead
+        return super().wanted(tick)
+
+    def _reason(self, refused: Refused) -> str:
+        """Return why the order is refused; it is one action, without a number."""
+        return str(refused)
+
+    def _visible_s(self, tick: int) -> float:
+        return max(super()._visible_s(tick), self._begin_s + self.context.period_s)
+
+    def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
+        super()._promise(moves, visible_s)
+        unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
+        self.output.earliest = (
+            finish_times(unhurried, visible_s, self.context, self._needs)[-1] + self._ahead_s
+        )

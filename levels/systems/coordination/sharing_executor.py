@@ -1,0 +1,117 @@
+"""The servo level of an arm that shares objects with the arms of other racks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pydantic import Field, field_validator
+
+from rack.levels.arm import find_arm
+from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output
+from rack.levels.servo.control import ServoParams
+from rack.levels.servo.executor import ServoExecutor
+from rack.levels.systems.coordination.shared_bodies import (
+    MOST_SHARED,
+    NAME_BYTES,
+    SharedBodies,
+    SharedBody,
+)
+from rack.levels.systems.coordination.sharing_arm import SharingArm
+
+SHARED = Output(SharedBodies, cycles=8)
+"""At 400 Hz 50 Hz: the fastest exchange between racks."""
+
+
+class SharingServoParams(ServoParams):
+    """`[board.servo.params]` of a servo level that shares objects."""
+
+    shared: tuple[str, ...] = Field(min_length=1, max_length=MOST_SHARED)
+    """objects of the scene that arms of other racks move too"""
+    arm: str = "rack.levels.systems.coordination.sharing_arm:SharingArm"
+    """class of the arm, package.module:Class; a SharingArm"""
+
+    @field_validator("arm")
+    @classmethod
+    def _shares(cls, reference: str) -> str:
+        if not issubclass(find_arm(reference), SharingArm):
+            raise ValueError(
+                "the arm shares no objects; permitted:"
+                " rack.levels.systems.coordination.sharing_arm:SharingArm and subclasses"
+            )
+        return reference
+
+
+class SharingServoExecutor(ServoExecutor):
+    """Claims the shared objects that its gripper touches, and places those that other arms have:
+    see `SharedBody`.
+
+    After a restart of its board it continues from its own last message.
+    """
+
+    others = Inputs(SharedBodies, "lan.shared")
+    last = Input(SharedBodies, "own.shared")
+    shared = SHARED
+    params = SharingServoParams
+    settings: SharingServoParams
+    arm: SharingArm
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        names = self.settings.shared
+        rack = context.rack.encode()
+        self._shared = {
+            context.scene.objects.index(name): SharedBody(name.encode(), rack) for name in names
+        }
+
+    @classmethod
+    def misfits(
+        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
+    ) -> Misfits:
+        """Yield shared bodies that are no objects or named twice, besides what any servo level
+        finds."""
+        names = context.params["shared"]
+        scene = context.scene
+        for name in dict.fromkeys(names):
+            why = ""
+            if name not in scene.objects:
+                why = "not in the scene"
+                if name in scene.obstacles:
+                    why = "an obstacle, which moves by itself"
+                why += f"; objects: {', '.join(scene.objects) or 'none'}"
+            elif names.count(name) > 1:
+                why = "named twice"
+            elif len(name) > NAME_BYTES or not name.isascii():
+                why = f"no name for a message; permitted: ASCII, at most {NAME_BYTES} characters"
+            if why:
+                yield "params.shared", name, why
+        yield from super().misfits(context, above, below)
+
+    def process(self, tick: int) -> None:
+        """Do the cycle of a servo level, and show the shared objects when it is due."""
+        if not self._started and self.last.is_there:
+            for body in self._shared.values():
+                body.recall(self.last.message)
+        super().process(tick)
+        if SHARED.is_due(tick, self.context.every, self.context.phase):
+            self.shared.rack = self.context.rack
+            for slot, (row, body) in enumerate(self._shared.items()):
+                body.show(self.shared.bodies[slot], self.arm.pose(row))
+
+    def started(self) -> None:
+        """Keep the grip, and the copies where the restored state has them."""
+        super().started()
+        self._keep()
+
+    def take_messages(self) -> None:
+        """Take over what is new, of other racks too."""
+        super().take_messages()
+        for row, body in self._shared.items():
+            for other in self.others.values():
+                if other.is_new and (pose := body.hear(other.message)) is not None:
+                    self.arm.place(row, pose)
+            body.touch(self.arm.is_touched(row))
+        self._keep()
+
+    def _keep(self) -> None:
+        for row, body in self._shared.items():
+            self.arm.keep(row, body.is_elsewhere)

@@ -1,0 +1,247 @@
+"""Mistakes of faults: all of them at once, each with its place, its value and what is valid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any
+
+import pytest
+
+from rack.backplane.address_map import FAULT_ENTRIES
+from rack.backplane.layout import Layout
+from rack.boards.config import load, loads, wire
+from rack.boards.config.injections import fault_mistakes
+from rack.boards.config.published import Levels, publish
+from rack.boards.config.schema import RackConfig
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.faults.config import FaultConfig
+from rack.boards.faults.kind import KINDS, Kind, Parameter
+from tests.boards.conftest import MakeConfig
+from tests.boards.fault_racks import DRIVEN, LOCKED, TARGETS, rack
+
+Fault = dict[str, Any]
+TASKS = "wave, wave.planner, watch, driven, clock"
+MISTAKES: Mapping[str, tuple[Fault, str]] = {
+    "unknown kind": (
+        {"kind": "kil", "board": "wave"},
+        f'.kind = "kil": no such kind; kinds: {", ".join(KINDS.names)}',
+    ),
+    "unknown board": (
+        {"kind": "kill", "board": "wve"},
+        f'.board = "wve": no such task; tasks: {TASKS}',
+    ),
+    "two beginnings": (
+        {"kind": "kill", "board": "wave", "tick": 1, "at": 1.0},
+        ".at = 1.0: tick is also given; permitted: one of tick, at, when",
+    ),
+    "no time": (
+        {"kind": "mute", "board": "wave", "for": "1 hour"},
+        'should be a time, as in "0.5s", "20ms" or 0.5',
+    ),
+    "parameter, no finite one": (
+        {"kind": "drop", "board": "wave", "probability": float("nan")},
+        "a finite number",
+    ),
+    "mailbox of another": (
+        {"kind": "mute", "board": "watch", "mailbox": "wave.status"},
+        ".mailbox = \"wave.status\": 'watch' does not write it; it writes: watch.status",
+    ),
+    "overrun of a planner": (
+        {"kind": "overrun", "board": "wave.planner"},
+        "overrun strikes only executors; executors: wave, watch, driven",
+    ),
+    "nothing driven": (
+        {"kind": "sensor-nan", "board": "wave"},
+        "sensor-nan cannot strike this board; boards that it can: driven",
+    ),
+    "clock kind": (
+        {"kind": "clock-skip", "board": "wave"},
+        'clock-skip strikes only the clock; permitted: "clock"',
+    ),
+    "no kind of the clock": (
+        {"kind": "mute", "board": "clock"},
+        "mute cannot strike the clock; kinds that can: kill, clock-stop, clock-skip, clock-jitter",
+    ),
+    "clock that hangs": (
+        {"kind": "hang", "board": "clock"},
+        "hang cannot strike the clock; kinds that can: kill, clock-stop",
+    ),
+    "no lock": (
+        {"kind": "lock-held", "board": "wave"},
+        "needs protocol lock; mailboxes of 'wave' that use it: none",
+    ),
+    "nobody reads": (
+        {"kind": "masquerade", "board": "watch"},
+        "missing; no mailbox of 'watch' has a reader",
+    ),
+    "condition": (
+        {"kind": "kill", "board": "wave", "when": "wave.status.state > 1"},
+        'must be mailbox.field == value, as in "elemental_move.status.verb == grasp"',
+    ),
+    "condition, mailbox": (
+        {"kind": "kill", "board": "wave", "when": "sea.status.state == done"},
+        "no mailbox 'sea.status'; mailboxes: wave.status, wave.plan, watch.status, driven.status",
+    ),
+    "condition, no integer": (
+        {"kind": "kill", "board": "wave", "when": "driven.status.position == 1"},
+        "no integer field 'position'; integer fields: echo, state, error, mode",
+    ),
+    "condition, name": (
+        {"kind": "kill", "board": "wave", "when": "wave.status.state == gone"},
+        "'gone' is not a value of 'state'; permitted: idle, executing, done, error",
+    ),
+}
+PARAMETERS = [(kind, parameter) for kind in KINDS for parameter in kind.parameters]
+
+
+def fault_of(kind: Kind, **keys: Any) -> Fault:
+    """Return a fault of that kind with a target that can have it."""
+    board = TARGETS.get(kind.name, TARGETS.get(kind.where, "wave"))
+    return {"kind": kind.name, "board": board, **keys}
+
+
+@cache
+def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Levels, Layout]:
+    """Return the rack that can have every kind, but for those that need locks, or real time."""
+    mode = "lockstep" if lockstep else "realtime"
+    text = DRIVEN.replace('mode = "lockstep"', f'mode = "{mode}"')
+    found = loads(text + ('[protocol]\ndefault = "lock"\n' if locked else ""))
+    return found, publish(found).levels, wire(found)
+
+
+def mistake_of(kind: Kind, lockstep: bool = False, **keys: Any) -> str:
+    """Return the one mistake that a fault of that kind has, as its line."""
+    fault = FaultConfig.model_validate(fault_of(kind, **keys))
+    (mistake,) = fault_mistakes([("fault[0]", fault)], *rack_for(kind.where == "lock", lockstep))
+    return str(mistake)
+
+
+def mistakes(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> list[Mistake]:
+    with pytest.raises(ConfigError) as error:
+        wire(rack(config, *faults, settings=settings))
+    return error.value.mistakes
+
+
+def only_mistake(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> str:
+    """Return the one mistake there is, as its line."""
+    (mistake,) = mistakes(config, *faults, settings=settings)
+    return str(mistake)
+
+
+@pytest.mark.parametrize(("fault", "line"), MISTAKES.values(), ids=MISTAKES)
+def test_a_mistake_is_reported_with_the_permitted_values(
+    config: MakeConfig, fault: Fault, line: str
+) -> None:
+    found = only_mistake(config, fault)
+    assert line in found
+    assert found.startswith("fault[0]")
+    assert "\n" not in found
+
+
+TAKERS = ", ".join(kind.name for kind in KINDS if kind.takes_mailbox)
+ONCE = "{} strikes once and has no duration; remove it"
+UNFIT: tuple[tuple[str, Any, Callable[[Kind], bool], str], ...] = (
+    ("strength", 2, lambda kind: True, "{} has no such parameter; parameters: "),
+    ("phase", 0.5, lambda kind: not kind.within_tick, "{} cannot strike within a tick; kinds that"),
+    ("for", 1, lambda kind: kind.once, ONCE),
+    ("cycles", 1, lambda kind: kind.once, ONCE),
+    (
+        "mailbox",
+        "wave.status",
+        lambda kind: not kind.takes_mailbox,
+        f"{{}} does not affect mailboxes; kinds that do: {TAKERS}",
+    ),
+)
+"""Keys with a value, the kinds that cannot have them, and what is then said."""
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
+def test_a_key_that_a_kind_cannot_have_is_one_mistake(kind: Kind) -> None:
+    for key, value, lacks, why in UNFIT:
+        if lacks(kind):
+            place, _, said = mistake_of(kind, **{key: value}).partition(": ")
+            assert place.startswith(f"fault[0].{key} = ")
+            assert said.startswith(why.format(kind.name))
+
+
+def test_a_parameter_that_a_kind_lacks_lists_those_it_has() -> None:
+    names = ", ".join(parameter.name for parameter in KINDS["drop"].parameters)
+    assert mistake_of(KINDS["drop"], strength=2).endswith(f"parameters: {names}")
+
+
+@pytest.mark.parametrize(("kind", "parameter"), PARAMETERS, ids=lambda given: given.name)
+def test_a_parameter_out_of_range_is_reported_with_its_range(
+    kind: Kind, parameter: Parameter
+) -> None:
+    for value in (parameter.least - 0.25, parameter.most + 0.25):
+        line = mistake_of(kind, **{parameter.name: value})
+        assert line.startswith(f"fault[0].{parameter.name} = {value!r}: out of range")
+        assert f"{parameter.least:g} to {parameter.most:g}; {parameter}" in line
+    if parameter.is_whole:
+        line = mistake_of(kind, **{parameter.name: parameter.least + 0.5})
+        assert "permitted: whole numbers" in line
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k.realtime], ids=lambda kind: kind.name)
+def test_a_kind_that_needs_real_time_says_so_in_lockstep(kind: Kind) -> None:
+    line = mistake_of(kind, lockstep=True)
+    assert (
+        line
+        == f'fault[0].kind = "{kind.name}": {kind.name} needs real time: in lockstep time waits for'
+        " every task; run without --lockstep"
+    )
+
+
+@pytest.mark.parametrize(
+    "begin", [{"tick": 4}, {"at": 1.0}, {"when": "wave.status.state == executing"}]
+)
+def test_a_self_test_fails_at_the_start_and_at_no_other_time(begin: Fault) -> None:
+    line = mistake_of(KINDS["self-test"], **begin)
+    assert "self-test strikes as the board starts; remove it" in line
+
+
+def test_a_lock_is_held_only_where_the_mailbox_has_one(config: MakeConfig) -> None:
+    fault = {"kind": "lock-held", "board": "wave", "mailbox": "wave.status"}
+    setting = 'protocol.mailbox={ "watch.status" = "lock" }'
+    assert "mailboxes of 'wave' that use it: none" in only_mistake(
+        config, fault, settings=(setting,)
+    )
+    wire(rack(config, fault, settings=(LOCKED,)))
+
+
+def test_a_joint_that_the_arm_lacks_is_refused() -> None:
+    settings = ['fault=[{ kind = "sensor-nan", board = "servo", joint = 6 }]']
+    with pytest.raises(
+        ConfigError,
+        match="joint = 6: out of range; permitted: whole numbers -1 to 5; joint, counted from 0",
+    ):
+        wire(load("nasrem", settings))
+
+
+def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None:
+    faults = [{"kind": "kill", "board": "wave", "tick": tick} for tick in range(FAULT_ENTRIES + 1)]
+    assert (
+        only_mistake(config, *faults)
+        == f"fault = {len(faults)}: too many faults for one run; permitted: {FAULT_ENTRIES}"
+    )
+
+
+def test_all_mistakes_of_all_faults_are_reported_at_once(config: MakeConfig) -> None:
+    faults = (
+        {"kind": "kil", "board": "wve", "tick": 1, "at": 1.0},
+        {
+            "kind": "mute",
+            "board": "wave",
+            "mailbox": "sea",
+            "when": "sea",
+            "strength": 1,
+            "for": 1,
+            "cycles": 1,
+        },
+    )
+    places = [mistake.place for mistake in mistakes(config, *faults)]
+    assert sorted(places) == sorted(
+        [f"fault[0].{key}" for key in ("kind", "board", "at")]
+        + [f"fault[1].{key}" for key in ("mailbox", "when", "strength", "cycles")]
+    )

@@ -1,0 +1,190 @@
+"""A rack as plain data: its chains, its longest cycles, and the verdicts on the paper's figure
+3."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rack.boards.timing.chains import spanned
+from rack.boards.timing.forecast import NO_BUDGET, Forecast
+from rack.boards.timing.level import BoardTiming
+from rack.boards.timing.rack import RackTiming
+from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
+from rack.boards.timing.verdicts import verdicts
+
+MS = 1_000_000
+CLOCK = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, ())
+FIGURE_3 = BoardTiming(
+    name="level",
+    above=(),
+    below=(),
+    coupling="tight",
+    every=3,
+    within_cycles=3,
+    core=1,
+    priority=80,
+    planner_core=1,
+    planner_priority=0,
+    has_planner=True,
+    is_critical=True,
+    budget=Budget(read_ns=MS, process_ns=2 * MS, write_ns=MS, plan_ns=6 * MS, update_ns=MS),
+    plan_within_ns=None,
+    queues=(),
+    phase=0,
+    reads={},
+)
+
+
+def rack(*boards: BoardTiming, goal_ns: float | None = None) -> RackTiming:
+    return RackTiming(
+        False,
+        1.0,
+        2 * MS,
+        CLOCK,
+        {board.name: board for board in boards},
+        0,
+        0.2,
+        goal_ns,
+        {},
+        None,
+    )
+
+
+def board(name: str, every: int, above: str = "", below: str = "") -> BoardTiming:
+    above_, below_ = tuple(above.split()), tuple(below.split())
+    return replace(FIGURE_3, name=name, every=every, above=above_, below=below_, budget=None)
+
+
+def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
+    failing = {
+        (verdict.equation, verdict.subject)
+        for verdict in verdicts(rack(FIGURE_3))
+        if not verdict.holds
+    }
+    assert failing == {("3.8", "level"), ("response time", "level.planner"), ("load", "core 1")}
+    # The paper's own way out: cycles of 8 ms, figure 2.
+    longer = rack(FIGURE_3).changed("level", every=4, within_cycles=2)
+    assert all(verdict.holds for verdict in verdicts(longer))
+
+
+def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
+    timing = rack(
+        board("top", 40, below="a"), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7)
+    )
+    assert timing.chains == (("top", "a"), ("top", "b"))
+    assert timing.hierarchy.chains == (("top", "b"),)
+    assert timing.longest_cycles == {"top": 60, "a": 60, "b": 60, "alone": 7}
+
+
+@pytest.mark.parametrize(
+    ("cycles", "ticks"),
+    [
+        ([8], 8),
+        ([400, 100, 8, 1], 509 + 4),  # 100 and 8 meet every 4 ticks only
+        ([1, 8, 100, 400], 509 + 7 + 96 + 300),
+    ],
+)
+def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(
+    cycles: list[int], ticks: int
+) -> None:
+    names = [f"b{cycle}" for cycle in cycles]
+    boards = [board(name, cycle) for name, cycle in zip(names, cycles, strict=True)]
+    assert rack(*boards).response_ticks(names) == ticks
+
+
+JOINTS = tuple(f"joint{k}" for k in range(1, 7))
+
+
+def arm_of(*joints: str) -> RackTiming:
+    """A board a joint between a trajectory level, which has a planner's board above it, and the
+    board of the arm."""
+    names = " ".join(joints)
+    boards = [
+        board("plan", 200, below="path"),
+        board("path", 20, "plan", names),
+        board("arm", 2, names),
+    ]
+    return rack(*boards, *(board(name, 4, "path", "arm") for name in joints), board("alone", 500))
+
+
+def test_a_board_a_joint_is_one_hierarchy_of_parallel_chains() -> None:
+    timing = arm_of(*JOINTS)
+    assert timing.chains == tuple(("plan", "path", joint, "arm") for joint in JOINTS)
+    (together,) = timing.parallel
+    assert timing.hierarchy == together
+    assert together.text == "plan > path > joint1 ... joint6 > arm"
+    assert timing.ranks == (("plan",), ("path",), JOINTS, ("arm",))
+    assert set(timing.longest_cycles.values()) == {200, 500}
+    # 200 + 20 + 4 + 2 ticks of 2 ms, for all joints in one line.
+    (eq_3_3,) = [verdict for verdict in verdicts(timing) if verdict.equation == "3.3"]
+    assert (eq_3_3.subject, eq_3_3.left) == ("system", 226 * 2 * MS)
+
+
+def test_a_goal_is_divided_by_the_levels_of_the_longest_chain_through_a_board() -> None:
+    boards = [board("top", 40), board("middle", 8, "top"), board("low", 4, "middle top")]
+    found = rack(*boards, board("alone", 7), goal_ns=60 * 2.0 * MS).longest_cycles
+    assert found == {"top": 20, "middle": 20, "low": 20, "alone": 7}
+
+
+def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
+    assert FIGURE_3.budget is not None
+    silent = replace(
+        FIGURE_3, name="silent", budget=replace(FIGURE_3.budget, plan_ns=0), core=2, planner_core=2
+    )
+    plain = replace(silent, name="plain", has_planner=False, core=3)
+    found = Forecast.of(rack(FIGURE_3, silent, plain, board("unknown", 4))).uncounted
+    assert found.keys() - {CLOCK.name} == {"silent.planner", "unknown", "unknown.planner"}
+    assert {why for name, why in found.items() if name != CLOCK.name} == {NO_BUDGET}
+    assert not Forecast.of(rack(FIGURE_3, plain)).uncounted.keys() - {CLOCK.name}
+    # Without any budget only the system is judged.
+    forecast = Forecast.of(rack(board("top", 40, below="a"), board("a", 4, "top")))
+    assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
+    assert {"top", "a"} <= forecast.uncounted.keys()
+
+
+def test_a_forecast_notes_what_it_leaves_out_and_nothing_else() -> None:
+    fast = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, (Part(Unit.PROCESS, MS // 10),))
+    counted = replace(rack(FIGURE_3), clock=fast)
+    ordinary = replace(FIGURE_3, planner_priority=70)
+    assert Forecast.of(replace(counted, boards={"level": ordinary})).notes == ()
+    notes = Forecast.of(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
+    expected = (
+        "in lockstep",
+        "times are of the wall clock: speed 2",
+        "cores are those of the config",
+    )
+    assert len(notes) == len(expected)
+    assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
+    queued = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
+    assert queued[0] == "the system's response is that of empty queues: plan.requests"
+    # Without a budget there is nothing to say about times.
+    bare = Forecast.of(
+        replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False
+    ).notes
+    assert bare == ()
+    # Two ordinary tasks that compute share a core; one has it to itself.
+    both = replace(FIGURE_3, priority=0, planner_priority=0)
+    assert "ordinary scheduling" in Forecast.of(replace(counted, boards={"level": both})).notes[-1]
+
+
+@pytest.mark.parametrize(
+    ("names", "text"),
+    [
+        (("joint1", "joint2", "joint3"), "joint1 ... joint3"),
+        (("joint9", "joint10", "joint11"), "joint9 ... joint11"),
+        (("j1.planner", "j2.planner", "j3.planner"), "j1.planner ... j3.planner"),
+        (("joint1", "joint2"), "joint1, joint2"),
+        (("joint1", "joint2", "joint4"), "joint1, joint2, joint4"),
+        (("joint2", "joint1", "joint3"), "joint2, joint1, joint3"),
+        (("a1", "b2", "c3"), "a1, b2, c3"),
+        (("joint1", "joint2", "joint3", "arm"), "joint1 ... joint3, arm"),
+        (("servo",), "servo"),
+        ((), ""),
+    ],
+)
+def test_numbered_names_are_shortened_only_if_none_is_left_out(
+    names: tuple[str, ...], text: str
+) -> None:
+    assert spanned(names) == text

@@ -1,0 +1,70 @@
+"""The path of an operator's command, and its longest response, against arithmetic by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from rack.backplane.layout import TickGrid
+from rack.boards.config import load, rack_timing, wire
+from rack.boards.timing.command_path import CommandPath, command_paths
+
+
+def path_of(
+    levels: Sequence[str], grids: Sequence[TickGrid], reads: Sequence[TickGrid] | None = None
+) -> CommandPath:
+    """Return a path whose first command takes a tick; each level reads in every cycle, or at
+    `reads`."""
+    return CommandPath(tuple(levels), tuple(grids), tuple(reads or grids), 1, True)
+
+
+NASREM = path_of(
+    ("task", "elemental_move", "primitive", "servo"),
+    [TickGrid(every) for every in (400, 100, 8, 1)],
+)
+
+
+@pytest.mark.parametrize(
+    ("given", "sampled", "acts"),
+    [
+        # Visible a tick later; each level's next release on the grid: 400, 800, 904 (900 is not a
+        # multiple of 8), 912.
+        (0, 400, 912),
+        (399, 400, 912),
+        (400, 800, 1312),
+        # 1200 + 400 + 100 = 1700 is not a multiple of 8: 1704, and its slice.
+        (800, 1200, 1712),
+    ],
+)
+def test_a_command_is_followed_from_release_to_release(given: int, sampled: int, acts: int) -> None:
+    assert NASREM.samples_at(given + 1) == sampled
+    assert NASREM.acts_at(given + 1) == acts
+
+
+def test_bounds_are_those_of_the_paper_and_of_the_grid() -> None:
+    assert NASREM.bound_eq_3_2 == 4 * 400
+    assert NASREM.sum_eq_3_3 == 400 + 100 + 8 + 1
+    # A cycle of the first level until it is read, the sum, and up to 4 ticks: 100 is not a multiple
+    # of 8.
+    assert NASREM.longest == 400 + 509 + 4
+
+
+@pytest.mark.parametrize("cycles", [(400, 100, 8, 1), (12, 8, 3), (7, 5), (30, 12, 9, 2), (4,)])
+def test_the_longest_on_the_grid_is_met_and_never_passed(cycles: tuple[int, ...]) -> None:
+    path = path_of([str(cycle) for cycle in cycles], [TickGrid(cycle) for cycle in cycles])
+    grid = int(np.lcm.reduce(cycles))
+    found = [path.response(given, path.acts_at(given + 1)) for given in range(2 * grid)]
+    assert max(found) <= path.longest
+    if len(cycles) <= 2:
+        assert max(found) == path.longest
+
+
+def test_paths_begin_at_every_level_that_can_be_commanded() -> None:
+    config = load("nasrem")
+    layout = wire(config)
+    found = command_paths(rack_timing(config, layout), layout)
+    assert found["task"] == NASREM
+    assert found["primitive"] == path_of(("primitive", "servo"), [TickGrid(8), TickGrid(1)])
+    assert list(found) == ["task", "elemental_move", "primitive", "servo"]

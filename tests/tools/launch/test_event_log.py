@@ -1,0 +1,40 @@
+"""The event log of a run: complete at every moment, and in order of ticks at the end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rack.boards.events import Event
+from rack.tools.launch.display import Display
+from rack.tools.launch.folder import EventLog
+
+KNOWN = (("launch", -1), ("died", 2800), ("rejoined", 3000), ("brakes", 2801), ("opened", 3000))
+"""Codes and ticks, as they become known."""
+
+
+def codes(path: Path) -> list[str]:
+    """Return what the lines of a log are about."""
+    entries = [json.loads(line) for line in path.read_text().splitlines()]
+    return [entry.get("code", entry["kind"]) for entry in entries]
+
+
+@pytest.mark.parametrize("is_ended", [True, False])
+def test_a_log_has_events_as_they_become_known_and_at_the_end_by_tick(
+    tmp_path: Path, is_ended: bool
+) -> None:
+    path = tmp_path / "events.jsonl"
+    log = EventLog(Display())
+    log.open(path)
+    for code, tick in KNOWN:
+        log.add(Event(0, tick, "detection", "", "", code))
+    assert codes(path) == [code for code, _ in KNOWN]
+    if is_ended:
+        log.end({"rack": "nasrem"})
+        assert codes(path) == ["launch", "died", "brakes", "rejoined", "opened", "outcome"]
+        assert [*tmp_path.iterdir()] == [path]
+    else:
+        log.close()
+        assert codes(path) == [code for code, _ in KNOWN]

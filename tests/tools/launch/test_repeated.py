@@ -1,0 +1,261 @@
+"""A run, in real time too, is repeated in lockstep with what its operators
+commanded."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.operator_table import Client, OperatorTable, Request
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.config import RackConfig, load, resolve
+from rack.boards.config.commands import asked, request
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import Beginning, run_rack
+from rack.tools.monitor.snapshot import Snapshot
+from rack.tools.recording.divergence import first_difference
+from rack.tools.recording.entries import commands_from, recorded_commands
+from rack.tools.recording.history import misses
+from rack.tools.recording.recording import Recording
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.tools.command_line import rack
+
+SECONDS = 2.0
+HOLD = "level = 'upper', what = 'hold', tick = 40"
+
+
+class Commanding(Display):
+    """An operator who commands a running rack when it is seen to have reached a tick."""
+
+    period_s = 0.02
+
+    def __init__(self, rack: str, given: Sequence[Request]) -> None:
+        self._rack = rack
+        self._given = [*given]
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Give what is due, at once."""
+        while self._given and snapshot.tick >= self._given[0].tick:
+            with closing(Segment.attach(self._rack)) as segment:
+                OperatorTable(segment).add(replace(self._given.pop(0), tick=-1))
+
+
+class ByHand(Display):
+    """An operator, waiting or under a lease, at a rack that is held before each command's tick."""
+
+    period_s = 0.01
+
+    def __init__(self, rack: str, given: Sequence[Request], client: Client) -> None:
+        self._rack = rack
+        self._given = [*given]
+        self._client = client
+        self._segment: Segment | None = None
+        self._claims = ExitStack()
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Command what is due, and step the rack to the next command."""
+        if self._segment is None:
+            self._segment = Segment.attach(self._rack)
+        words = self._segment.words
+        if not words[System.HELD]:
+            return
+        if self._given and words[System.HELD] - 1 == self._given[0].tick:
+            now = replace(self._given.pop(0), tick=-1)
+            claim = OperatorTable(self._segment).claim(now, self._client)
+            self._claims.enter_context(claim)
+        words[System.HOLD_AT] = self._given[0].tick + 1 if self._given else 0
+
+    def close(self) -> None:
+        """Leave the rack."""
+        self._claims.close()
+        if self._segment is not None:
+            self._segment.close()
+
+
+def requests(config: RackConfig, **ticks: int) -> tuple[Request, ...]:
+    """Return commands to the upper level, each at a tick."""
+    plan = resolve(config)
+    return tuple(
+        request(
+            asked({"level": "upper", "what": what, "tick": tick}),
+            config,
+            plan.published.levels,
+            plan.layout,
+        )
+        for what, tick in ticks.items()
+    )
+
+
+def commanded(folder: Path, name: str, mode: str) -> Recording:
+    """Return a run of 2 s in which an operator commands what no config has: in lockstep at given
+    ticks, in real time whenever it comes."""
+    file = folder / "commanded.toml"
+    file.write_text(COMMANDED)
+    settings = (f"name={name}", f"clock.mode={mode}", commands(HOLD))
+    config = load(file, settings)
+    given = requests(config, resume=80, hold=200)
+    run = folder / "one"
+    if mode == "lockstep":
+        run_rack(config, SECONDS, run, Display(), begins=Beginning(requests=given))
+    else:
+        run_rack(config, SECONDS, run, Commanding(name, given))
+    return Recording(run)
+
+
+def repeated(one: Recording, folder: Path, at: float = 0.0) -> Recording:
+    """Return the run that goes on from it."""
+    arguments = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
+    done = rack("run", *arguments)
+    assert not done.stderr
+    assert json.loads(done.stdout)["recording"] == "complete"
+    return Recording(folder)
+
+
+@pytest.mark.slow
+def test_what_an_operator_commanded_before_the_config_did_is_not_taken_for_that(
+    rack_name: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "commanded.toml"
+    file.write_text(COMMANDED)
+    config = load(file, (f"name={rack_name}", "clock.mode=lockstep", commands(HOLD)))
+    given = requests(config, hold=20, resume=30)
+    run_rack(config, 0.5, tmp_path / "one", Display(), begins=Beginning(requests=given))
+    assert recorded_commands(Recording(tmp_path / "one")) == given
+
+
+@pytest.fixture(scope="module")
+def in_lockstep(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A run in lockstep whose operator commands what no config has."""
+    return commanded(
+        tmp_path_factory.mktemp("lockstep"), f"test-repeated-{os.getpid()}", "lockstep"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("at", "ticks"), [(0.0, [40, 80, 200]), (0.3, [200]), (1.2025, [])])
+def test_a_run_in_lockstep_goes_on_from_any_tick_with_its_operators_commands(
+    in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
+) -> None:
+    two = repeated(in_lockstep, tmp_path / "two", at)
+    assert first_difference(in_lockstep, two) is None
+    assert two.signal("upper.operator", "tick").tolist() == ticks
+    assert in_lockstep.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
+
+
+@pytest.mark.slow
+def test_the_commands_are_what_makes_it_equal(in_lockstep: Recording, tmp_path: Path) -> None:
+    # The run's config has no command but the first one.
+    again = load(in_lockstep.folder / "config.toml", [])
+    assert [command.tick for command in again.command] == [40]
+    run_rack(again, SECONDS, tmp_path / "two", Display())
+    difference = first_difference(in_lockstep, Recording(tmp_path / "two"))
+    assert difference is not None
+    assert 80 <= difference.tick < 120
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
+    rack_name: str, tmp_path: Path
+) -> None:
+    one = commanded(tmp_path, rack_name, "realtime")
+    two = repeated(one, tmp_path / "two")
+    assert two.rack_config.clock.mode == "lockstep"
+    missed = [miss["tick"] for miss in misses(one)]
+    difference = first_difference(one, two)
+    if missed:
+        # Each message until then is the same; what comes later may be.
+        assert difference is None or difference.tick >= missed[0]
+    else:
+        assert difference is None
+
+
+@pytest.fixture(scope="module", params=[Client.WAITS, Client.LEASES])
+def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A run in lockstep whose operator commands at 140 and 260
+    what no config has; under a lease these are in force to the end."""
+    folder = tmp_path_factory.mktemp("by-hand")
+    (folder / "commanded.toml").write_text(COMMANDED)
+    name = f"test-by-hand-{os.getpid()}"
+    settings = (f"name={name}", "clock.mode=lockstep", commands(HOLD))
+    config = load(folder / "commanded.toml", settings)
+    given = requests(config, resume=140, hold=260)
+    with closing(ByHand(name, given, request.param)) as operator:
+        run_rack(config, SECONDS, folder / "one", operator, step=True)
+    one = Recording(folder / "one")
+    assert one.signal("upper.operator", "tick").tolist() == [40, 140, 260]
+    return one
+
+
+def continued(one: Recording, at: float, folder: Path, *settings: str) -> Recording:
+    """Return the run that goes on from it, with nothing to note."""
+    options = [option for setting in settings for option in ("--set", setting)]
+    names = ("--from", f"{one.folder}@{at}", "--seconds", SECONDS, "--out", folder, "--json")
+    done = rack("run", *names, *options)
+    assert (done.returncode, done.stderr) == (0, "")
+    return Recording(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("at", "ticks"), [(0.25, [140, 260]), (0.3, [140, 260]), (0.4, [260]), (0.6, [260]), (0.7, [])]
+)
+def test_what_operators_commanded_later_is_repeated(
+    by_hand: Recording, tmp_path: Path, at: float, ticks: list[int]
+) -> None:
+    two = continued(by_hand, at, tmp_path / "two")
+    assert first_difference(by_hand, two) is None
+    assert two.signal("upper.operator", "tick").tolist() == ticks
+    assert by_hand.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
+
+
+@pytest.mark.slow
+def test_a_command_that_waits_in_a_snapshot_is_issued_once(
+    by_hand: Recording, tmp_path: Path
+) -> None:
+    two = continued(by_hand, 0.3, tmp_path / "two")
+    # Those that two repeats wait in the snapshot at tick 240.
+    three = continued(two, 0.6, tmp_path / "three")
+    assert three.signal("upper.operator", "tick").tolist() == [260]
+    assert first_difference(two, three) is None
+    assert by_hand.ended["outcome"]["digest"] == three.ended["outcome"]["digest"]
+
+
+@pytest.mark.slow
+def test_a_branch_has_its_own_commands_besides_those_repeated(
+    by_hand: Recording, tmp_path: Path
+) -> None:
+    earlier = "level = 'upper', what = 'hold', tick = 200"
+    two = continued(by_hand, 0.25, tmp_path / "two", commands(HOLD, earlier))
+    assert two.signal("upper.operator", "tick").tolist() == [140, 200, 260]
+
+
+@pytest.mark.slow
+def test_of_a_flight_recorder_commands_are_repeated_to_the_end_of_a_stretch(
+    by_hand: Recording,
+) -> None:
+    flight = Recording(by_hand.folder)
+    flight.kept = [(0, 200), (240, 800)]
+    found = [[one.tick for one in commands_from(flight, tick)] for tick in (0, 100, 250)]
+    assert found == [[40, 140], [140], [260]]
+
+
+@pytest.mark.slow
+def test_levels_that_write_the_name_of_their_rack_write_that_of_the_run(
+    rack_name: str, tmp_path: Path
+) -> None:
+    # A servo level that waits to be enabled says by which command, with the rack's name.
+    settings = ("--set", f"name={rack_name}", "--set", "robot.enable=by-command")
+    run = tmp_path / "run"
+    words = ("--lockstep", "--seconds", "0.5", "--json", "--out", run)
+    done = rack("run", "nasrem", *words, *settings)
+    again = rack("run", "--from", f"{run}@0.3", "--seconds", "0.5", "--no-record", "--json")
+    assert "are not as recorded" not in again.stderr
+    assert json.loads(again.stdout)["digest"] == json.loads(done.stdout)["digest"]

@@ -1,0 +1,275 @@
+"""`rack command` on running racks: giving a command, waiting for the reply, and refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.operator_table import OperatorTable
+from rack.backplane.segment import Segment, racks
+from rack.backplane.words import System
+from rack.tools.monitor.desk import LiveDesk
+from rack.tools.scripting.attached import AttachedRack
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.processes import RACK, wait_until
+from tests.tools.command_line import BOUND_S, ROOT, rack
+
+
+def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
+    """Start a rack that runs until it is stopped; return when it does."""
+    path.write_text(COMMANDED.replace("commanded_levels:Lower", "commanded_levels:Homing"))
+    given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
+    command = [*RACK, "run", str(path), "--no-record", *given]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(name) and "tick 0 " not in line:
+            break
+    return process
+
+
+def end(process: subprocess.Popen[str], name: str) -> None:
+    rack("stop", name)
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture(scope="module", params=["realtime", "lockstep"])
+def running(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[str]:
+    """The name of a rack that runs until it is stopped."""
+    name = f"test-command-{request.param}-{os.getpid()}"
+    process = start(
+        tmp_path_factory.mktemp("rack") / "told.toml", name, f"clock.mode={request.param}"
+    )
+    yield name
+    end(process, name)
+
+
+@pytest.mark.slow
+def test_a_command_is_given_and_taken_up(running: str) -> None:
+    done = rack("command", running, "upper", "hold", "--json")
+    answer = json.loads(done.stdout)
+    assert done.returncode == 0, done.stderr
+    assert (answer["level"], answer["text"], answer["worked"]) == ("upper", "hold", True)
+    assert answer["fate"] in ("taken", "done")
+    # Read at the first release after its tick, if none was skipped.
+    assert answer["given"] < answer["taken_up"]
+    assert answer["taken_up"] % 8 == 0
+    again = rack("command", running, "upper", "resume")
+    assert again.returncode == 0
+    (line,) = again.stdout.splitlines()
+    assert line.startswith(f"command {answer['serial'] + 1} to 'upper', resume: given at tick ")
+
+
+@pytest.mark.slow
+def test_waiting_is_for_the_end_of_a_command_which_says_how_to_end_it(running: str) -> None:
+    answer = json.loads(rack("command", running, "upper", "hold", "--wait", "--json").stdout)
+    assert answer["fate"] == "done"
+    # The level below has answered: two cycles later.
+    assert answer["given"] < answer["taken_up"] < answer["done"]
+    held = rack("command", running, "upper", "hold").stdout.splitlines()
+    assert held[1:] == [f"in force until: rack command {running} upper resume"]
+    refused = rack("command", running, "upper", "goto", "home")
+    assert refused.returncode == 1
+    assert refused.stdout.rstrip().endswith(": the way home is closed")
+    assert rack("command", running, "upper", "resume").returncode == 0
+    listed = json.loads(rack("command", running, "--list", "--json").stdout)
+    rows = {row["level"]: row for row in listed}
+    assert rows["upper"] == {"level": "upper", "in_force": "", "takes": "hold, resume, goto home"}
+    assert rows["lower"]["takes"] == "hold, resume, modify twice on|off, set by, goto home"
+
+
+@contextmanager
+def waiting(name: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """A process that waits for the end of its command, whose serial is given, too: until the level
+    counts by nine."""
+    words = Segment.attach(name).words
+    given = words[System.COMMANDED]
+    command = [*RACK, "command", name, "lower", "goto", "home", "--wait", "--json"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            wait_until(lambda: words[System.COMMANDED] > given)
+            yield process, given + 1
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_a_wait_goes_on_while_another_operator_sets_something(running: str) -> None:
+    with waiting(running) as (process, serial):
+        assert rack("set", running, "board.lower.params.by=2").returncode == 0
+        assert rack("command", running, "lower", "modify", "twice", "off").returncode == 0
+        assert process.poll() is None
+        assert rack("set", running, "board.lower.params.by=9").returncode == 0
+        answer = json.loads(process.communicate(timeout=BOUND_S)[0])
+    assert (process.returncode, answer["serial"], answer["fate"]) == (0, serial, "done")
+    assert rack("set", running, "board.lower.params.by=1").returncode == 0
+    assert rack("command", running, "lower", "resume").returncode == 0
+
+
+@pytest.mark.slow
+def test_a_wait_ends_when_another_command_takes_its_place(running: str) -> None:
+    with waiting(running) as (process, serial):
+        assert rack("command", running, "lower", "resume").returncode == 0
+        answer = json.loads(process.communicate(timeout=BOUND_S)[0])
+    assert (answer["serial"], answer["fate"]) == (serial, "superseded")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gone", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_level_holds_whose_operator_has_gone_within_a_lease(
+    running: str, gone: signal.Signals
+) -> None:
+    segment = Segment.attach(running)
+    hold = [*RACK, "command", running, "upper", "hold", "--lease"]
+    with AttachedRack(running) as live:
+        with subprocess.Popen(hold, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            modes = {row.task: row.mode for row in live.status().tasks}
+            given = segment.words[System.COMMANDED]
+            process.send_signal(gone)
+            if gone == signal.SIGSTOP and segment.words[System.LOCKSTEP]:
+                # A tick of lockstep has no length: silence means nothing there.
+                until = segment.words[System.TICK] + 1000
+                wait_until(lambda: segment.words[System.TICK] > until)
+                assert OperatorTable(segment).leased()
+                process.kill()
+            event = live.wait_for("operator_gone", BOUND_S)
+            process.kill()
+        assert line.startswith("command ")
+        assert modes == {"upper": "operator", "lower": "automatic"}
+        text = f"hold: its operator is gone: hold (command {given + 1})"
+        assert (event.board, event.text) == ("upper", text)
+        assert segment.words[System.COMMANDED] == given + 1
+    assert rack("command", running, "upper", "resume").returncode == 0
+
+
+@pytest.mark.slow
+def test_a_lease_ends_when_another_command_takes_its_place(running: str) -> None:
+    segment = Segment.attach(running)
+    upper = [*RACK, "command", running, "upper", "hold", "--lease"]
+    with subprocess.Popen(upper, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("command ")
+        # Refused, so the hold is still in force; then taken.
+        assert rack("command", running, "upper", "goto", "home").returncode == 1
+        assert process.poll() is None
+        assert rack("command", running, "upper", "resume").returncode == 0
+        assert process.wait(BOUND_S) == 0
+    assert not OperatorTable(segment).leased()
+    assert LiveDesk(Segment.attach(running)).highest("hold") == []
+
+
+@pytest.mark.slow
+def test_a_paused_rack_goes_on_from_there(running: str) -> None:
+    words = Segment.attach(running).words
+    done = rack("pause", running, "--json")
+    paused = json.loads(done.stdout)
+    assert (done.returncode, paused["paused"]) == (0, True)
+    if words[System.LOCKSTEP]:
+        assert (paused["levels"], words[System.HELD]) == ([], paused["tick"] + 1)
+        again = rack("pause", running).stdout
+        assert again.startswith(f"rack '{running}': held before tick {paused['tick']}; ")
+    else:
+        assert paused["levels"] == ["upper"]
+        assert LiveDesk(Segment.attach(running)).highest("hold") == ["upper"]
+        tick = words[System.TICK]
+        wait_until(lambda: words[System.TICK] > tick)
+    done = rack("resume", running)
+    assert (done.returncode, done.stdout) == (0, f"rack '{running}' goes on\n")
+    tick = words[System.TICK]
+    wait_until(lambda: words[System.TICK] > tick)
+    again = rack("resume", running)
+    assert (again.returncode, again.stderr) == (1, f"rack '{running}' is not paused\n")
+
+
+@pytest.mark.slow
+def test_a_live_parameter_is_set_and_others_are_refused(running: str) -> None:
+    done = rack("set", running, "board.lower.params.by=2", "--json")
+    answer = json.loads(done.stdout)
+    assert (done.returncode, answer["text"], answer["fate"]) == (0, "set by=2", "done")
+    params = "board.lower.params"
+    for setting, line in {
+        f"{params}.by=0": ".by = 0: should be greater than or equal to 1; counts in a cycle",
+        f"{params}.bye=1": f"{params}.bye = 1: unknown key; did you mean 'by'?",
+        f"{params}.label='x'": f'{params}.label = "x": read at the launch alone; live: by',
+        f"{params}.by": 'name = "by": must be key=value, as in bandwidth=80',
+        "clock.speed=2": f"clock.speed=2: no level reads it while it runs; live: {params}.by",
+    }.items():
+        done = rack("set", running, setting)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert done.stderr.rstrip().endswith(line)
+        assert len(done.stderr.splitlines()) == 1
+    assert rack("set", running, "board.lower.params.by=1").returncode == 0
+
+
+@pytest.mark.slow
+def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
+    rack_name: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "told.toml"
+    path.write_text(COMMANDED)
+    run = ("run", path, "--no-record", "--json", "--seconds", "1", "--set", f"name={rack_name}")
+    held = subprocess.Popen(
+        [*RACK, *map(str, run), "--step"], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    wait_until(lambda: rack_name in racks() and Segment.attach(rack_name).words[System.HELD])
+    given = rack("set", rack_name, "board.lower.params.by=3", "--tick", "101")
+    assert given.returncode == 0
+    assert " set by=3: waits: the rack is held before" in given.stdout
+    assert rack("resume", rack_name).returncode == 0
+    answer, _ = held.communicate(timeout=BOUND_S)
+    command = commands("level='lower', what='set', name='by=3', tick=101")
+    repeated = rack(*run, "--set", command).stdout
+    digests = [json.loads(text)["digest"] for text in (answer, repeated, rack(*run).stdout)]
+    assert digests[0] == digests[1] != digests[2]
+
+
+REFUSED = {
+    "upper resume --lease": "--lease: 'upper', resume: permitted: hold, ",
+    "upper hold --lease --wait": "--lease, --wait: a lease stays anyway",
+    "uper hold": 'level = "uper": no level of this name takes commands; levels that do: up',
+    "upper hold --timeout 1": "--timeout needs --wait; give both, or neither",
+    "upper": "LEVEL and WHAT are needed, as in: rack command ",
+    "upper halt": "'enable', 'disable', 'reset' or 'release'",
+    "lower setpoint joints=1": "'lower' does not take setpoint; it takes: hold, resume",
+    "upper goto": "goal: missing; goto of 'upper' takes one of: home",
+    "upper goto hom": "'hom': not a goal; permitted: home, joints=..., position=...",
+    "upper goto joints=1,x": "'joints=1,x': 'x' is not a number; permitted: numbers separated by",
+    "upper goto joints=1 joints=2": "'joints=2': joints is given twice",
+    "upper hold --tick 0": "tick = 0: has passed; the rack is at tick ",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("running", ["lockstep"], indirect=True)
+@pytest.mark.parametrize(("words", "reason"), REFUSED.items(), ids=REFUSED)
+def test_bad_usage_is_one_line_and_status_2(running: str, words: str, reason: str) -> None:
+    done = rack("command", running, *words.split())
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert reason in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(
+    running: str, end: signal.Signals
+) -> None:
+    table = OperatorTable(Segment.attach(running))
+    command = [*RACK, "command", running, "upper", "hold", "--tick", str(10**9)]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    wait_until(table.waiting)
+    process.send_signal(end)
+    process.communicate(timeout=BOUND_S)
+    assert process.returncode == (-end if end == signal.SIGKILL else 128 + end)
+    assert table.waiting() == []

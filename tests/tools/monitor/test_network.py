@@ -1,0 +1,120 @@
+"""What users see of the network: the other racks, and what passes, of a running rack and in its
+report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from io import StringIO
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.segment import Segment, unlink
+from rack.boards.config.loader import loads
+from rack.boards.config.resolved import wire
+from rack.levels.peer import Presence
+from rack.tools.launch.display import RackView
+from rack.tools.monitor.network import (
+    ExportRow,
+    ImportRow,
+    PeerRow,
+    exchanged,
+    export_rows,
+    import_rows,
+    peer_rows,
+)
+from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.snapshot import RackMonitor
+from rack.tools.report.report import network
+from rack.tools.report.report_markdown import _network
+from tests.boards.lan.racks import rack_text
+
+TEXT = rack_text(
+    "one", "tcp/127.0.0.1:7447", [], "other-one", peers=["third"], lan='on_peer_loss = "go on"'
+)
+COUNTS = {
+    "taken": 7,
+    "missing": 1,
+    "disordered": 1,
+    "repeated": 2,
+    "late": 3,
+    "refused": 4,
+    "unknown_launch": 5,
+    "superseded": 6,
+}
+
+
+@pytest.fixture
+def segment(rack_name: str) -> Iterator[Segment]:
+    """The segment of a rack whose adapter has exchanged for a while."""
+    config = loads(TEXT.replace('name = "one"', f'name = "{rack_name}"'))
+    made = Segment.create(wire(config), config.text())
+    status, peer = open_writer(made, "lan.status"), open_writer(made, "lan.peer_other_one")
+    status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04)
+    status.message.export_pulse[...] = (12, 24)
+    status.write(8)
+    found = peer.message
+    found.presence, found.launches, found.losses, found.since = Presence.LOST, 2, 1, 400
+    found.offset, found.uncertainty = -0.5, 0.0002
+    peer.write(8)
+    yield made
+    made.close()
+    unlink(rack_name)
+
+
+def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> None:
+    assert peer_rows(Newest(segment)) == (PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2),)
+    taken = ImportRow(
+        "lan.other", "other-one/pulse.status", *COUNTS.values(), age_ticks=16, age_s=0.04
+    )
+    assert import_rows(Newest(segment)) == (taken,)
+    assert export_rows(Newest(segment)) == (ExportRow("lan.pulse", "pulse.status", 12),)
+    terminal = Console(width=200, record=True, file=StringIO())
+    terminal.print(RackView(RackMonitor(segment).look()))
+    text = terminal.export_text()
+    shown = ("other-one  lost", "lan.other  other-one/pulse.status", "lan.pulse  pulse.status")
+    assert [part for part in (*shown, "16  0.040") if part not in text] == []
+    assert exchanged('name = "alone"') is None
+
+
+class Recorded:
+    """Stands in for a recording: three cycles of the adapter."""
+
+    mailboxes = ("lan.status",)
+
+    def __init__(self, segment: Segment) -> None:
+        self.config, self.layout = segment.config, segment.layout
+
+    def signal(self, mailbox: str, field: str) -> np.ndarray:
+        """Return a field of a mailbox."""
+        port, _, name = field.partition(".")
+        if mailbox == "lan.status":
+            values = {
+                "age_s": [-1.0, 0.02, 0.04],
+                "sent": [0, 1, 2],
+                **{key: [0, 0, n] for key, n in COUNTS.items()},
+            }
+            return np.array(values[name])
+        peer = {"presence": [1, 2, 2], "launches": [1, 1, 2], "losses": [0, 1, 1]}
+        return np.array(peer[port] if mailbox == "lan.peer_other_one" else [0, 0, 0])
+
+
+def test_a_report_has_counts_ages_and_losses(segment: Segment) -> None:
+    recording: Any = Recorded(segment)
+    found = network(recording)
+    assert found is not None
+    (entry,) = found["imports"]
+    assert {name: entry[name] for name in COUNTS} == COUNTS
+    assert (entry["age_ms"]["p50"], entry["age_ms"]["max"]) == (30.0, 40.0)
+    assert found["peers"] == [
+        {"peer": "other-one", "state": "lost", "losses": 1, "restarts": 1, "lost_s": 0.04},
+        {"peer": "third", "state": "awaited", "losses": 0, "restarts": 0, "lost_s": 0.0},
+    ]
+    lines = list(_network(found))
+    assert "- rack other-one: lost; lost 1 times, 0.04 s; restarted 1 times" in lines
+    assert list(_network(None)) == []
+    assert network(SimpleNamespace(config='name = "alone"', mailboxes=())) is None  # type: ignore[arg-type]

@@ -1,0 +1,49 @@
+"""Queues as users see them: in `rack status`, in the report of a run, in `rack check`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rack.boards import Rack
+from rack.boards.config import load, wire
+from rack.tools.console.tables import render_text
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.queues import queue_fills
+from rack.tools.report.report import write_report
+from rack.tools.timing.inventory import inventory, inventory_blocks
+from tests.boards.test_queues import QUEUES
+
+FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
+
+
+@pytest.mark.slow
+def test_status_check_and_report_show_how_full_a_queue_is_and_what_it_refused(
+    tmp_path: Path, rack_name: str
+) -> None:
+    path = tmp_path / "queues.toml"
+    path.write_text(QUEUES)
+    config = load(path, [f"name={rack_name}", *FULL])
+    (line,) = (
+        line
+        for line in render_text(inventory_blocks(inventory(config, wire(config), [])))
+        if "upper.requests " in line
+    )
+    assert "queue of 7" in line
+    with Rack(config) as rack:
+        (empty,) = queue_fills(Newest(rack.segment))
+        assert empty.line == "queue upper.requests: 0 of 7 unread"
+        rack.run(1.0)
+        (full,) = queue_fills(Newest(rack.segment))
+    assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
+    result = run_rack(config, 2.0, tmp_path / "run", Display())
+    report, text = write_report(tmp_path / "run")
+    (queue,) = report["queues"]
+    # Three requests every 40 ticks; two are taken every 100, first when six are visible.
+    assert queue["sent"] + queue["refused"] == 3 * 20
+    assert (queue["taken"], queue["waiting"], queue["capacity"]) == (2 * 7, 6, 7)
+    assert result.refused == {"upper.requests": queue["refused"]}
+    assert f"at most 6 waiting, room for 7, {queue['refused']} refused" in text

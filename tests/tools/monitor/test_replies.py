@@ -1,0 +1,32 @@
+"""The wait for the reply of a level to its operator's command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block
+from rack.boards.config import load, resolve
+from rack.tools.monitor.replies import REPLY_CYCLES, LastCycle
+from tests.boards.commanded_racks import COMMANDED
+
+
+def test_a_level_is_waited_for_by_its_cycles_and_not_for_ever(
+    tmp_path: Path, rack_name: str
+) -> None:
+    (tmp_path / "told.toml").write_text(COMMANDED)
+    layout = resolve(load(tmp_path / "told.toml", [f"name={rack_name}"])).layout
+    segment = Segment.create(layout, "")
+    try:
+        block = segment.block("lower")
+        last = LastCycle(segment, layout.mailbox("lower.status"))
+        # It skipped ticks, but did few cycles.
+        block[Block.CYCLES] = REPLY_CYCLES
+        assert last.passed(100) == ""
+        block[Block.CYCLES] += 1
+        assert last.passed(101) == f"has not answered in {REPLY_CYCLES} of its cycles"
+        stopped = LastCycle(segment, layout.mailbox("lower.status"))
+        assert stopped.passed(101) == stopped.passed(501) == ""
+        assert stopped.passed(502) == "has not answered, and done no cycle since tick 101"
+    finally:
+        unlink(rack_name)

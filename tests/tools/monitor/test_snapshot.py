@@ -1,0 +1,101 @@
+"""A look at a rack's memory: who is lost, who was restarted, what is demanded, which faults are
+active."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rack.backplane.fault_table import FaultTable, Stage
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.message import State
+from rack.backplane.segment import Segment, unlink
+from rack.backplane.words import Block, Demand, System, TaskState
+from rack.boards.config import load, wire
+from rack.boards.config.injections import injections
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.snapshot import RackMonitor, Snapshot, TaskRow
+from rack.tools.report.report import write_report
+
+FAULT = 'fault=[{ kind = "mute", board = "lower" }]'
+
+
+@pytest.fixture
+def segment(small: Path, rack_name: str) -> Iterator[Segment]:
+    config = load(small, [f"name={rack_name}", FAULT])
+    layout = wire(config)
+    made = Segment.create(layout, config.text())
+    FaultTable(made).add(injections(config, layout)[0])
+    yield made
+    made.close()
+    unlink(rack_name)
+
+
+class Seen(Display):
+    """Keeps the states that `upper` was shown with."""
+
+    period_s = 0.01
+
+    def __init__(self) -> None:
+        self.states: set[str] = set()
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Keep the state."""
+        self.states |= {row.state for row in snapshot.tasks if row.task == "upper"}
+
+
+def row(segment: Segment, task: str) -> TaskRow:
+    return next(row for row in RackMonitor(segment).look().tasks if row.task == task)
+
+
+def test_a_task_that_is_lost_says_so_whatever_its_status_says(segment: Segment) -> None:
+    segment.block("lower")[Block.LOST] = 41
+    assert [row(segment, name).state for name in ("lower", "upper")] == ["lost", "absent"]
+
+
+@pytest.mark.parametrize(("number", "shown"), [(State.HOLDING, "holding"), (9, "absent")])
+def test_a_state_that_no_level_has_by_that_number_is_that_of_the_process(
+    segment: Segment, number: int, shown: str
+) -> None:
+    writer = open_writer(segment, "upper.status")
+    writer.message.state = number
+    writer.write(0)
+    writer.close()
+    assert row(segment, "upper").state == shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("level", "own"), [("Stateless", set()), ("Reasonless", {"holding"})])
+def test_a_level_without_a_state_or_a_reason_in_its_status_runs_as_any_other(
+    small: Path, rack_name: str, tmp_path: Path, level: str, own: set[str]
+) -> None:
+    settings = ["board.upper.ends_run=false", f"board.upper.executor=two_levels:{level}"]
+    display = Seen()
+    config = load(small, [f"name={rack_name}", *settings])
+    assert run_rack(config, 2.0, tmp_path / "run", display).worked
+    assert display.states
+    assert display.states <= own | {state.name.lower() for state in TaskState}
+    write_report(tmp_path / "run")
+
+
+def test_restarts_are_the_writers_that_came_after_the_first(segment: Segment) -> None:
+    assert row(segment, "lower").restarts == 0
+    for _ in range(3):
+        open_writer(segment, "lower.status").close()
+    names = ("lower", "lower.planner", "upper")
+    assert [row(segment, name).restarts for name in names] == [2, 0, 0]
+
+
+def test_active_faults_and_what_is_demanded_of_the_arm_are_shown(segment: Segment) -> None:
+    entry = FaultTable(segment).entries[0]
+    seen = []
+    for stage in (Stage.WAITING, Stage.ACTIVE, Stage.OVER):
+        entry.stage = stage
+        seen.append(RackMonitor(segment).look().faults)
+    assert seen == [(), ("mute of lower",), ()]
+    for demand in Demand:
+        segment.words[System.DEMAND] = demand
+        assert RackMonitor(segment).look().demand == demand.name.lower()

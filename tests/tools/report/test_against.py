@@ -1,0 +1,247 @@
+"""Two runs compared: the message that differs, whether its inputs did, and the cause."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rack.boards.config import load
+from rack.tools.launch.continued import RunAgain, branched
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.recording.checksums import checked_line, read_line
+from rack.tools.recording.recording import Recording
+from rack.tools.report.against import compared
+from rack.tools.report.report import OtherRun
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.boards.remembering_racks import REMEMBERING
+from tests.tools.command_line import rack
+
+pytestmark = pytest.mark.slow
+SECONDS = 1.0
+OWN_LEVEL = """
+from time import monotonic_ns
+import numpy as np
+from rack.levels import Executor, Input, Message, Output, field
+
+
+class Sum(Message, version=1):
+    value: np.ndarray = field(unit="1", doc="sum", shape=2)
+
+
+class Summing(Executor):
+    sum = Output(Sum)
+
+    def __init__(self, context):
+        super().__init__(context)
+        self._sum = 0.0
+
+    def process(self, tick):
+        self._sum += 1.0
+        self.sum.value[1] = self._sum if tick < 250 else AFTER
+
+
+class Passing(Executor):
+    below = Input(Sum, "below.sum")
+    sum = Output(Sum, rests_on=below)
+
+    def process(self, tick):
+        self.sum.value[:] = self.below.message.value
+"""
+SUMMING = """
+format = 2
+name = "summing"
+python_path = ["{folder}"]
+
+[clock]
+period_ms = 2.5
+mode = "lockstep"
+
+[board.adding]
+slot = 2
+rate_hz = 400
+executor = "{module}:Summing"
+
+[board.passing]
+slot = 3
+rate_hz = 50
+below = "adding"
+executor = "{module}:Passing"
+"""
+Run = Callable[..., Recording]
+
+
+def run_in(folder: Path, rack_name: str) -> Run:
+    """Return a function that runs a rack for a second, and records it."""
+
+    def run(name: str, text: str, *settings: str, faults: str = "") -> Recording:
+        file = folder / f"{name}.toml"
+        file.write_text(text)
+        script = folder / f"{name}-faults.toml"
+        script.write_text(faults)
+        given = str(script) if faults else None
+        config = load(file, [f"name={rack_name}", *settings], given)
+        run_rack(config, SECONDS, folder / name, Display())
+        return Recording(folder / name)
+
+    return run
+
+
+@pytest.fixture
+def ran(rack_name: str, tmp_path: Path) -> Run:
+    return run_in(tmp_path, rack_name)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Recording, Recording]:
+    """What runs the same rack again, a run, and one with another parameter of its level."""
+    run = run_in(tmp_path_factory.mktemp("against"), f"test-against-{os.getpid()}")
+    return run, run("one", REMEMBERING), run("two", REMEMBERING, "board.wave.params.factor=2")
+
+
+def why(one: Recording, other: Recording, *, of: str = "", repeats: bool = True) -> dict[str, Any]:
+    """Return what the report says of two runs."""
+    return compared(one, OtherRun(other.folder, of, repeats))
+
+
+def _losing(run: Recording) -> Path:
+    """Return a copy of a recorded run whose recorder lost rows."""
+    folder = Path(shutil.copytree(run.folder, run.folder.with_name("losing")))
+    events = folder / "events.jsonl"
+    lines = [read_line(line) for line in events.read_text().splitlines()]
+    ends = [
+        line | {"rows_lost": {"wave": 3}} if line["kind"] == "outcome" else line for line in lines
+    ]
+    events.write_text("".join(map(checked_line, ends)))
+    return folder
+
+
+def test_equal_runs_have_no_chain(runs: tuple[Run, Recording, Recording], tmp_path: Path) -> None:
+    _, one, _ = runs
+    again = Recording(Path(shutil.copytree(one.folder, tmp_path / "again")))
+    found = why(one, again)
+    assert (found["first_difference"], found["chain"], found["repetition"]) == (None, [], None)
+    assert found["explained"]
+
+
+def test_a_parameter_is_named_with_the_attributes_that_it_changed(
+    runs: tuple[Run, Recording, Recording],
+) -> None:
+    _, one, two = runs
+    found = why(two, one)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (0, "wave.status", "wave")
+    assert (cycle["read"], cycle["unequal"]) == ((), "")
+    (clue,) = cycle["clues"]
+    assert clue["kind"] == "config"
+    assert clue["values"] == {"name": "board.wave.params.factor", "here": 2, "there": None}
+    repetition = found["repetition"]
+    assert (repetition["because"], repetition["runs"], repetition["strays"]) == ("state", (), {})
+    assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
+
+
+def test_of_a_branch_the_level_is_shown_at_the_tick_where_it_branches_off(
+    runs: tuple[Run, Recording, Recording], tmp_path: Path
+) -> None:
+    _, one, _ = runs
+    config = branched(one, ["board.wave.params.factor=2"], None)
+    with RunAgain(one) as again:
+        run_rack(config, SECONDS, tmp_path / "two", Display(), begins=again.beginning(150))
+    found = why(Recording(tmp_path / "two"), one)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["mailbox"]) == (150, "wave.status")
+    repetition = found["repetition"]
+    assert {"name": "_factor", "here": 2.0, "there": 1.0} in repetition["attributes"]
+    assert (repetition["because"], repetition["strays"]) == ("state", {})
+    # What it remembers is the first run's: only the parameter has changed it.
+    assert {one["name"] for one in repetition["attributes"]} == {"_factor", "_half"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "field", "kinds"),
+    [
+        ("kill", "", "tick", {"fault", "died", "skipped"}),
+        ("corrupt", "cycles = 4", "tick", {"fault"}),
+        ("delay", "cycles = 4", "visible_at", {"fault"}),
+    ],
+)
+def test_a_fault_is_the_cause_and_nothing_is_repeated(
+    runs: tuple[Run, Recording, Recording], kind: str, more: str, field: str, kinds: set[str]
+) -> None:
+    again, one, _ = runs
+    fault = f"[[fault]]\nkind = '{kind}'\nboard = 'wave'\ntick = 130\n{more}\n"
+    two = again(kind, REMEMBERING, faults=fault)
+    found = why(one, two)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["mailbox"]) == (130, "wave.status")
+    assert cycle["fields"][0]["name"] == field
+    assert {clue["kind"] for clue in cycle["clues"]} == kinds
+    assert {clue["run"] for clue in cycle["clues"]} == {str(two.folder)}
+    assert (found["repetition"], found["not_repeated"]) == (None, "")
+    # From the watching level, which takes note of a loss, back to the board that was killed.
+    if "died" in kinds:
+        away = why(one, two, of="watch.status")["chain"]
+        assert [cycle["mailbox"] for cycle in away] == ["watch.status", "wave.status"]
+        assert away[0]["unequal"] == "wave.status"
+
+
+def test_a_level_whose_code_has_changed_is_named(ran: Run, tmp_path: Path) -> None:
+    level = tmp_path / "summing_levels.py"
+    text = SUMMING.format(folder=tmp_path, module=level.stem)
+    level.write_text(OWN_LEVEL.replace("AFTER", "self._sum"))
+    one = ran("one", text)
+    level.write_text(OWN_LEVEL.replace("AFTER", "self._sum + 1.0"))
+    two = ran("two", text)
+    found = why(one, two)
+    (cycle,) = found["chain"]
+    assert (cycle["tick"], cycle["writer"]) == (250, "adding")
+    assert cycle["fields"] == ({"name": "adding.sum.value[1]", "here": 251.0, "there": 252.0},)
+    assert cycle["clues"] == ()
+    repetition = found["repetition"]
+    assert (repetition["because"], repetition["runs"]) == ("code", (str(one.folder),))
+    assert repetition["attributes"] == ()
+    # The other level only passes on what it has read.
+    chain = why(one, two, of="passing.sum", repeats=False)["chain"]
+    assert [(one["mailbox"], one["unequal"]) for one in chain] == [
+        ("passing.sum", "adding.sum"),
+        ("adding.sum", ""),
+    ]
+
+
+def test_an_operators_command_is_the_cause(ran: Run) -> None:
+    one = ran("one", COMMANDED)
+    two = ran("two", COMMANDED, commands("level = 'upper', what = 'hold', tick = 80"))
+    (cycle,) = why(one, two)["chain"]
+    assert (cycle["tick"], cycle["mailbox"], cycle["writer"]) == (80, "upper.operator", "clock")
+    (clue,) = cycle["clues"]
+    assert (clue["kind"], clue["run"]) == ("command", str(two.folder))
+    chain = why(one, two, of="lower.status", repeats=False)["chain"]
+    boxes = ["lower.status", "upper.command", "upper.operator"]
+    assert [cycle["mailbox"] for cycle in chain] == boxes
+
+
+def test_the_command_prints_the_chain_and_refuses_what_cannot_be_compared(
+    runs: tuple[Run, Recording, Recording], ran: Run, tmp_path: Path
+) -> None:
+    _, one, two = runs
+    done = rack("report", two.folder, "--against", one.folder)
+    assert done.returncode == 1
+    assert "  - not repeated: --repeat runs both racks again, to that cycle" in done.stdout
+    assert f"  - board.wave.params.factor is 2, in {one.folder} not set" in done.stdout.splitlines()
+    other = ran("other", COMMANDED)
+    against = (one.folder, "--against")
+    for arguments, said in (
+        ((*against, other.folder), "are of different racks: only the first has 'wave'"),
+        ((*against, tmp_path), "not a run"),
+        ((*against, _losing(two)), "lost 3 rows; the two runs cannot be compared"),
+        ((*against, two.folder, "--of", "wave.statu"), "nearest: wave.status"),
+        ((one.folder, "--of", "wave.status"), "permitted with --against"),
+    ):
+        refused = rack("report", *arguments)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
+        assert said in refused.stderr

@@ -1,0 +1,90 @@
+"""Objects and their goals: what ended elsewhere fails the run, and what fell is in the report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import load, resolve
+from rack.boards.errors import ConfigError
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.report.report import write_report
+from tests.tools.command_line import rack
+
+HOME = 'task.action=[{do="home"}]'
+GOAL = 'scene.goal=[{object="block1",position=[0.5,0.3,0.475]}]'
+PUSH = 'scene.push=[{body="block1",at=0.3,seconds=0.1,force=[0.0,1.5,0.0]}]'
+DROP = """
+line((0.0, 0.0, 0.15), body="block1")
+line((0.0, 0.0, 0.0), body="block1")
+grip()
+line((0.0, 0.0, 0.1), body="block1")
+release()
+stay(0.5)
+wait()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "words", "cause", "fails"),
+    [
+        ((GOAL, PUSH), (), "task done", True),
+        ((GOAL,), (), "task done", False),
+        # A run that ends before its task is not judged.
+        ((GOAL, PUSH), ("--seconds", "1"), "time over", False),
+    ],
+    ids=["off", "within", "before"],
+)
+def test_an_object_off_its_goal_fails_a_task_that_is_done(
+    rack_name: str, settings: tuple[str, ...], words: tuple[str, ...], cause: str, fails: bool
+) -> None:
+    given = [word for one in (f"name={rack_name}", HOME, *settings) for word in ("--set", one)]
+    done = rack("run", "nasrem", "--lockstep", "--no-record", "--json", *given, *words)
+    report = json.loads(done.stdout)
+    (end,) = report["objects"]
+    assert (end["object"], end["goal"], end["tolerance_mm"]) == ("block1", [0.5, 0.3, 0.475], 10.0)
+    assert end["off_mm"] > 20.0 if PUSH in settings else end["off_mm"] < 0.1
+    assert report["outcome"]["cause"] == cause
+    off = f"object 'block1' ended {end['off_mm']:.0f} mm from its goal (tolerance 10 mm)"
+    assert report["outcome"]["faults"] == [off] * fails
+    assert (done.returncode == 0) is not fails
+
+
+def test_a_task_of_transfers_states_the_last_place_of_each_object(rack_name: str) -> None:
+    moves = [(0.5, 0.1, 0.475), (0.5, 0.2, 0.475)]
+    actions = ",".join(f'{{do="transfer",object="block1",to={list(to)}}}' for to in moves)
+    other = 'scene.goal=[{object="peg",position=[0.5,-0.3,0.5],tolerance_mm=3.0}]'
+    goals = resolve(load("nasrem", [f"name={rack_name}", f"task.action=[{actions}]", other])).goals
+    found = {row: (goal.object, goal.position, goal.tolerance_mm) for row, goal in goals.items()}
+    assert found == {0: ("block1", moves[-1], 10.0), 2: ("peg", (0.5, -0.3, 0.5), 3.0)}
+
+
+def test_a_goal_of_what_is_not_in_the_scene_is_a_mistake() -> None:
+    with pytest.raises(
+        ConfigError,
+        match=r"scene.goal\[0\].object = \"block9\": no such object; scene.objects: block1",
+    ):
+        resolve(load("nasrem", [GOAL.replace("block1", "block9")]))
+
+
+@pytest.mark.slow
+def test_what_is_let_go_in_the_air_is_a_finding_with_its_fall(
+    rack_name: str, tmp_path: Path
+) -> None:
+    (tmp_path / "drop.py").write_text(DROP)
+    own = ["host.command.params.script=drop.py", f'python_path=["{tmp_path}"]', GOAL]
+    config = load("chimera", [f"name={rack_name}", "clock.mode=lockstep", *own])
+    # It lands where it stood: only the report tells.
+    assert run_rack(config, None, tmp_path / "run", Display()).worked
+    report, text = write_report(tmp_path / "run")
+    (end,) = report["objects"]
+    (drop,) = end["drops"]
+    assert drop["mm"] == pytest.approx(100.0, abs=5.0)
+    assert (
+        f"Object block1 was let go {drop['mm']:.0f} mm above what it landed on, at tick"
+        f" {drop['tick']}." in text
+    )

@@ -1,0 +1,264 @@
+"""Reports: the numbers of a run, from its recording alone."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from rack.backplane.layout import TaskSpec
+from rack.backplane.trace import RECORD
+from rack.boards.config import load
+from rack.levels.systems.force.messages import ForceStatus, Wrench
+from rack.levels.systems.hand.messages import HandStatus
+from rack.levels.systems.joint_boards.messages import DRIVING
+from rack.tools.console.tables import show_blocks
+from rack.tools.launch.display import Display
+from rack.tools.launch.launch import run_rack
+from rack.tools.launch.verdict import ACROSS_RACKS, judge_run
+from rack.tools.recording.recording import Recording
+from rack.tools.report import arm_outcome
+from rack.tools.report.report import report_of, write_report
+from rack.tools.report.report_markdown import markdown, terminal_blocks
+from rack.tools.report.task_times import task_times
+from rack.tools.timing.measured_response import system_response
+from tests.boards.commanded_racks import COMMANDED, commands
+from tests.shared_runs import slow_run
+
+PARTS = ("min", "p50", "p99", "p99_9", "max")
+
+TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 64)
+MS = 1_000_000
+
+
+def test_the_messages_of_other_systems_have_the_names_that_the_report_looks_for() -> None:
+    assert arm_outcome.DRIVING == DRIVING
+    for kind in (ForceStatus, Wrench, HandStatus):
+        assert getattr(arm_outcome, kind.message_type.name.upper()) == kind.message_type.name
+
+
+class Watchful(Display):
+    """Looks often: a run in lockstep is soon over."""
+
+    period_s = 0.02
+
+
+def cycle(tick: int, late: float, read: float, process: float, write: float) -> tuple[int, ...]:
+    """Return a trace record of a cycle of a 10 ms task, of times in ms."""
+    release = tick * 10 * MS
+    times = np.cumsum([release, late * MS, 0, read * MS, process * MS, write * MS]).astype(int)
+    return (tick, *times.tolist(), 0, 0, round((read + process + write) * MS), 0)
+
+
+def test_times_of_a_task_are_those_of_equation_3_5() -> None:
+    cycles = np.array(
+        [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD
+    )
+    times = task_times(TASK, cycles, 10 * MS, False, stretches=np.zeros(3))
+    assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
+    assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
+    assert times["communication_ms"]["max"] == 2.0
+    # 10 ms less lateness, execution and communication: the worst cycle is the second.
+    assert times["residual_ms"]["min"] == 2.0
+    assert times["largest_gap_ms"] == 11.0
+    assert times["alpha_ms"] == 4.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in lockstep of two levels, of 40 and 5 ticks."""
+    return slow_run(tmp_path_factory)
+
+
+@pytest.mark.slow
+def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:
+    report, text = write_report(folder)
+    response = report["system_response"]
+    assert response["levels"] == ["upper", "lower"]
+    # 40 and 5 ticks: a command takes both cycles, a status waits for up to 35 ticks more.
+    assert response["command"]["bound_ms"] == 45 * 2.5
+    assert response["command"]["measured_ms"]["max"] == 45 * 2.5
+    assert response["status"]["bound_ms"] == 80 * 2.5
+    assert response["status"]["measured_ms"]["max"] == 80 * 2.5
+    assert [response[way]["holds"] for way in ("command", "status")] == [True, True]
+    assert report["digest"] in text
+    assert report["tasks"]["lower"]["cycles"] == 400
+    assert json.loads((folder / "report.json").read_text()) == report
+
+
+class Cut(Recording):
+    """A recording without ten of the commands; `lost` says whether it is known to lack them."""
+
+    lost: ClassVar[dict[str, int]] = {"upper.command": 10}
+
+    def signal(self, mailbox: str, field: str) -> np.ndarray:
+        values = super().signal(mailbox, field)
+        return np.delete(values, slice(20, 30), axis=0) if mailbox == "upper.command" else values
+
+
+class Silent(Cut):
+    """A run in which those commands were never written."""
+
+    lost: ClassVar[dict[str, int]] = {}
+
+
+@pytest.mark.slow
+def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(folder: Path) -> None:
+    way = report_of(Cut(folder))["system_response"]["command"]
+    assert (way["holds"], way["beyond"], way["unseen"]) == (True, [], 1)
+    assert way["measured_ms"]["max"] == way["bound_ms"]
+
+
+@pytest.mark.slow
+def test_a_response_beyond_its_bound_fails_and_says_what_delayed_it(folder: Path) -> None:
+    recording = Silent(folder)
+    recording.ended["faults"] = [
+        {"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}
+    ]
+    response = system_response(recording)
+    assert response is not None
+    (beyond,) = response["command"]["beyond"]
+    assert response["command"]["holds"] is False
+    assert (beyond["tick"], beyond["ms"]) == (19 * 40, (45 + 10 * 40) * 2.5)
+    assert beyond["delayed_by"] == ["fault: mute of upper"]
+    lines = markdown(write_report(folder)[0] | {"system_response": response}).splitlines()
+    assert any(line.startswith("| command, down") and "beyond" in line for line in lines)
+    assert "- 1112.5 ms from tick 760: fault: mute of upper" in lines
+
+
+@pytest.mark.slow
+def test_a_response_beyond_its_bound_fails_the_run_unless_something_explains_it(
+    folder: Path,
+) -> None:
+    sound = report_of(Recording(folder))
+    assert (sound["worked"], sound["failures"], sound["unjudged"]) == (True, [], [])
+    report = report_of(Silent(folder))
+    (failure,) = report["failures"]
+    assert report["worked"] is False
+    assert failure == (
+        "the response of a command along upper > lower took up to 1112.5 ms; bound: 112.5 ms, 1"
+        " times exceeded without a lost cycle"
+    )
+    assert markdown(report).splitlines()[0] == f"# {report['rack']} failed: {failure}"
+    explained = Silent(folder)
+    mute = {"kind": "mute", "board": "upper", "began": 760, "ends": 1200, "tick": 760}
+    explained.ended["faults"] = [mute | {"fault": 0}]
+    assert report_of(explained)["worked"]
+
+
+@pytest.mark.slow
+def test_the_response_of_a_rack_that_imports_messages_is_not_judged(folder: Path) -> None:
+    response = system_response(Silent(folder))
+    assert response is not None
+    assert response["crosses_racks"] is False
+    ended = Recording(folder).ended
+    judged = judge_run(ended, response | {"crosses_racks": True})
+    assert judged == {"worked": True, "failures": [], "unjudged": [ACROSS_RACKS]}
+
+
+@pytest.mark.slow
+def test_lockstep_reports_no_time_that_is_held_against_the_clock(folder: Path) -> None:
+    report, text = write_report(folder)
+    for task in report["tasks"].values():
+        times = ("lateness_ms", "residual_ms", "alpha_ms", "deviation_ms", "largest_gap_ms")
+        assert {task[name] for name in times} == {None}
+        assert task["execution_ms"]["max"] > 0
+    assert "there are no deadlines" in text
+    assert not {"late", "alpha", "residual min"} & set(text.replace("|", " ").split())
+    realtime = markdown({**report, "mode": "realtime"})
+    assert "| residual min |" in realtime
+
+
+@pytest.mark.slow
+def test_the_section_of_misses_says_where_it_holds_fewer_than_the_headline(folder: Path) -> None:
+    late = {"task": "lower", "tick": 5, "what": "late", "count": 1} | {
+        "started_ms": 0.1,
+        "took_ms": 3.0,
+    }
+    skipped = {"task": "lower", "tick": 10, "what": "skipped", "count": 3}
+    report = write_report(folder)[0] | {"misses": [late, skipped], "missed": 1, "skipped": 3}
+    lines = markdown(report).splitlines()
+    assert "## Missed and skipped cycles: 1 and 3" in lines
+    assert "The tasks counted" not in markdown(report)
+    fewer = markdown({**report, "missed": 2, "skipped": 7})
+    assert "The tasks counted 2 and 7; the recording does not hold all of it." in fewer
+    lossy = markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
+    assert "The tasks counted 2 and 7; the recorder lost rows." in lossy
+    assert "- the recorder lost rows: lower 4" in lossy.splitlines()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [80, 120])
+def test_what_a_terminal_shows_of_a_report_fits_its_width(folder: Path, width: int) -> None:
+    report = {**write_report(folder)[0], "mode": "realtime"}
+    task = {
+        **report["tasks"]["lower"],
+        **dict.fromkeys(("lateness_ms", "residual_ms"), dict.fromkeys(PARTS, 1234.567)),
+    }
+    report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
+    terminal = Console(width=width, record=True, file=io.StringIO())
+    show_blocks(terminal_blocks(report), terminal)
+    lines = terminal.export_text().splitlines()
+    assert max(map(len, lines)) <= width
+    rows = [line.split() for line in lines if line.startswith("elemental_move.planner")]
+    head = next(line for line in lines if line.startswith("task ") and "missed" in line)
+    assert len(rows) == 1
+    assert "residual min" in head
+    assert lines[-1] == f"all columns: {folder}/report.md; all data: report.json" or width == 80
+    assert max(map(len, markdown(report).splitlines())) > 120
+
+
+@pytest.mark.slow
+def test_a_report_shows_who_held_a_level_and_what_is_still_held(
+    rack_name: str, tmp_path: Path
+) -> None:
+    (tmp_path / "commanded.toml").write_text(COMMANDED)
+    given = commands(
+        "level='upper', what='hold', tick=101",
+        "level='upper', what='resume', tick=203",
+        "level='lower', what='hold', tick=301",
+    )
+    config = load(tmp_path / "commanded.toml", [f"name={rack_name}", given])
+    run_rack(config, 48.0, tmp_path / "run", Watchful())
+    report, text = write_report(tmp_path / "run")
+    keys = ("level", "by", "why", "since_s", "until_s", "lasted_s")
+    assert [[hold[key] for key in keys] for hold in report["holds"]] == [
+        ["upper", "operator", "hold", 0.26, 0.52, 0.26],
+        ["lower", "operator", "hold", 0.755, None, 47.2425],
+    ]
+    assert "## Holds: 2" in text.splitlines()
+    release = f"rack command {rack_name} lower resume"
+    assert f"Still held at the end: lower; `{release}` releases it." in text.splitlines()
+    events = Recording(tmp_path / "run").events
+    (standstill,) = (one["text"] for one in events if one.get("code") == "standstill")
+    assert standstill.startswith("nothing has moved for ")
+    held = "lower held by the operator (hold), since 0.75 s"
+    assert standstill.endswith(f": {held}; to release: {release}")
+
+
+HELD = "nothing has moved for 30 s: elemental_move holds"
+TOUCHED = "level 'servo': unintended contact: 'post' touches 'link4' at 3.125 s"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("outcome", "headline"),
+    [
+        ({"cause": "task failed", "reason": HELD, "faults": []}, f" failed: task failed: {HELD}"),
+        ({"cause": "task done", "reason": "", "faults": [TOUCHED]}, f" failed: {TOUCHED}"),
+        ({"cause": "task done", "reason": "all done", "faults": []}, ": task done: all done"),
+    ],
+)
+def test_what_ended_a_run_or_is_latched_is_its_headline(
+    folder: Path, outcome: dict[str, object], headline: str
+) -> None:
+    recording = Recording(folder)
+    recording.ended["outcome"] |= outcome
+    report = report_of(recording)
+    assert report["worked"] is (not outcome["faults"] and outcome["cause"] == "task done")
+    assert markdown(report).splitlines()[0] == f"# {report['rack']}{headline}"

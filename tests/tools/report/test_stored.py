@@ -1,0 +1,100 @@
+"""The report in a run's folder: shown as it is while it is newer than the recording and the
+program."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rack.tools.recording.checksums import Checksums
+from rack.tools.report import stored
+from rack.tools.report.report import OtherRun, write_report
+from rack.tools.report.stored import RECORDED, stored_report
+from tests.shared_runs import small_run
+from tests.tools.command_line import rack
+
+
+@pytest.fixture
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with its report."""
+    run = small_run(tmp_path_factory)
+    write_report(run)
+    return run
+
+
+def make_newer(path: Path) -> None:
+    """Date a file after everything else."""
+    later_ns = time.time_ns() + 10**9
+    os.utime(path, ns=(later_ns, later_ns))
+
+
+def rename(path: Path) -> None:
+    path.rename(path.with_name("elsewhere"))
+
+
+def cut_off(path: Path) -> None:
+    path.write_text('{"rack": ')
+    path.with_suffix(".md").touch()
+
+
+CHANGES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
+    "newer": (make_newer, tuple(RECORDED)),
+    "missing": (rename, ("report.json", "report.md", *RECORDED)),
+    "there": (Path.touch, (stored.SPOOL,)),
+    "damaged": (cut_off, ("report.json",)),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        pytest.param(change, name, id=f"{name} {what}")
+        for what, (change, names) in CHANGES.items()
+        for name in names
+    ],
+)
+def test_it_is_shown_until_a_file_has_changed(
+    folder: Path, change: Callable[[Path], object], name: str
+) -> None:
+    assert stored_report(folder) == write_report(folder)
+    change(folder / name)
+    assert stored_report(folder) is None
+
+
+def test_it_is_made_anew_once_the_program_has_changed(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stored, "PROGRAM", tmp_path)
+    (tmp_path / "levels").mkdir()
+    changed = tmp_path / "levels" / "level.py"
+    changed.touch()
+    os.utime(changed, ns=(0, 0))
+    assert stored_report(folder) is not None
+    make_newer(changed)
+    assert stored_report(folder) is None
+
+
+def test_it_is_made_anew_in_another_folder_and_after_a_comparison(folder: Path) -> None:
+    write_report(folder, OtherRun(folder, "", True))
+    assert stored_report(folder) is None
+    write_report(folder)
+    moved = folder.with_name(f"{folder.name}-moved")
+    folder.rename(moved)
+    assert stored_report(moved) is None
+
+
+def test_the_command_shows_it_and_writes_it_anew_only_when_it_must(folder: Path) -> None:
+    report = json.loads((folder / "report.json").read_text())
+    (folder / "report.json").write_text(json.dumps(report | {"digest": "as stored"}))
+    (folder / "report.md").write_text("as stored\n")
+    Checksums(folder).store("report.*")
+    assert json.loads(rack("report", folder, "--json").stdout)["digest"] == "as stored"
+    assert rack("report", folder).stdout == "as stored\n\n"
+    make_newer(folder / "events.jsonl")
+    assert json.loads(rack("report", folder, "--json").stdout) == report
+    assert json.loads((folder / "report.json").read_text()) == report

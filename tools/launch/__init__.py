@@ -1,0 +1,1 @@
+"""Starting a rack, showing it while it runs, and ending it with a verdict."""

@@ -1,0 +1,276 @@
+"""A rack on the terminal: a live table while it runs; a line a second where there is no terminal;
+nothing with --json.
+
+The table has a line a task; below it are the active faults, what holds the rack, and the progress
+of its task.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.text import Text
+
+from rack.backplane.process import DEADLINE
+from rack.boards.events import NO_TORQUE, Event
+from rack.boards.exchange import PortAge
+from rack.tools.console.tables import console, decimal, grid
+from rack.tools.monitor.holds import is_news
+from rack.tools.monitor.snapshot import DEAD, LOST, Snapshot, TaskRow
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+SCHEDULING = {DEADLINE: "deadline", 0: "other"}
+
+COLUMNS: dict[str, Callable[[TaskRow], str]] = {
+    "slot": lambda row: str(row.slot),
+    "task": lambda row: row.task,
+    "core": lambda row: str(row.core),
+    "sched": lambda row: SCHEDULING.get(row.priority, f"FIFO {row.priority}"),
+    "Hz": lambda row: f"{row.rate_hz:g}",
+    "tick": lambda row: str(row.tick),
+    "cycles": lambda row: str(row.cycles),
+    "missed": lambda row: str(row.missed),
+    "skipped": lambda row: str(row.skipped),
+    "restarts": lambda row: str(row.restarts),
+    "exec ms": lambda row: decimal(row.exec_ms, 2),
+    "late ms": lambda row: decimal(row.lateness_ms, 2),
+    "state": lambda row: row.state + " (operator)" * (row.mode == "operator"),
+}
+"""Columns by heading."""
+DROPPED = (
+    "tick",
+    "sched",
+    "slot",
+    "cycles",
+    "Hz",
+    "restarts",
+    "core",
+    "exec ms",
+    "late ms",
+    "skipped",
+)
+"""Columns that a narrow terminal leaves out, in this order."""
+STATES = {
+    "error": "red",
+    "failed": "red",
+    LOST: "bold red",
+    "done": "green",
+    "holding": "yellow",
+    "awaited": "yellow",
+}
+LOSSES = ("missed", "skipped")
+TROUBLES = ("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses")
+COUNTED = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yellow")}
+"""Colours of counts above 0."""
+HELD = "bold yellow"
+NO_DEMAND = "none"
+"""The demand on an arm that is free to move."""
+EVENTS = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
+OTHER_EVENTS = "yellow"
+QUIET = ("launch", "start", "end", "miss")
+"""Events that the display shows already: the table counts the misses."""
+BRIEF_TICKS = 10
+"""Brakes that missed cycles engaged for fewer ticks than this are counted, not shown."""
+
+
+class Display:
+    """Shows a run; this one shows nothing, for --json. `period_s` is the time between looks."""
+
+    period_s = 0.5
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show the rack as it is now."""
+
+    def show_event(self, event: Event) -> None:
+        """Show an event, unless the table shows it already."""
+        if is_shown(event):
+            self.print_event(event_text(event))
+
+    def print_event(self, text: Text) -> None:
+        """Print an event."""
+
+
+class LiveDisplay(Display):
+    """A table that changes in place."""
+
+    period_s = 0.2
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Redraw the table."""
+        self._live.update(RackView(snapshot), refresh=True)
+
+    def print_event(self, text: Text) -> None:
+        """Print the event above the table."""
+        # The terminal wraps it, not rich: a command in it can still be copied.
+        self._live.console.print(text, soft_wrap=True)
+
+
+class PlainDisplay(Display):
+    """A line a second."""
+
+    period_s = 1.0
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Print the rack as one line, once a second and at the end."""
+        now = time.monotonic()
+        if now >= self._next or snapshot.run == "stopped":
+            self._next = now + self.period_s
+            print(line_of(snapshot), flush=True)
+
+    def print_event(self, text: Text) -> None:
+        """Print the event."""
+        print(text, flush=True)
+
+
+@contextmanager
+def display_for(silent: bool) -> Iterator[Display]:
+    """Give the display that suits stdout."""
+    terminal = console()
+    if silent:
+        yield Display()
+    elif terminal.is_terminal:
+        from rich.live import Live
+
+        with Live(console=terminal, auto_refresh=False) as live:
+            yield LiveDisplay(live)
+    else:
+        yield PlainDisplay()
+
+
+@dataclass(frozen=True)
+class RackView:
+    """A snapshot, for rich to draw: head line, tasks, rows of tables, complaints, queues, faults,
+    holds, progress."""
+
+    snapshot: Snapshot
+
+    def __rich_console__(
+        self, terminal: Console, options: ConsoleOptions
+    ) -> Iterator[RenderableType]:
+        """Yield what rich draws, as wide as the terminal permits."""
+        snapshot = self.snapshot
+        width = options.max_width
+        yield _head(snapshot)
+        cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
+        yield grid(list(COLUMNS), cells, width, DROPPED, _style)
+        yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
+        sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
+        for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
+            if found := [asdict(row) for row in rows]:
+                cells = [[_cell(*pair) for pair in row.items()] for row in found]
+                yield Text()
+                yield grid([key.replace("_", " ") for key in found[0]], cells, width, style=_style)
+        yield from (Text(line, style="red") for line in _reasons(snapshot))
+        yield from (Text(queue.line) for queue in snapshot.queues)
+        yield from (Text(inbox.line) for inbox in snapshot.inboxes)
+        yield from (Text(_exchange(*found)) for found in snapshot.exchanges.items())
+        yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
+        for hold in snapshot.holds:
+            # In two lines where it is long: a command must not be wrapped.
+            is_long = len(hold.line) > width
+            shown = hold.line.replace("; to release", "\n  to release") if is_long else hold.line
+            yield Text(shown, style=HELD)
+        if (at := snapshot.progress) is not None:
+            actions = f"{at.actions_done}/{at.actions}"
+            yield Text(f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}")
+
+
+def _cell(column: str, value: Any) -> str:
+    if not isinstance(value, float | None):
+        return str(value)
+    digits = {"s": 3, "ticks": 0}
+    return decimal(value, digits.get(column.rpartition("_")[2], 1))
+
+
+def line_of(snapshot: Snapshot) -> str:
+    """Return the rack as one short line, for where there is no terminal: what holds it and its
+    faults are counted."""
+    counts = {
+        "missed": sum(row.missed for row in snapshot.tasks),
+        "skipped": sum(row.skipped for row in snapshot.tasks),
+        "lost": sum(row.state == LOST for row in snapshot.tasks),
+        "holds": len(snapshot.holds),
+        "faults": len(snapshot.faults),
+    }
+    parts = [f"{snapshot.rack} {snapshot.time_s:.2f} s", f"tick {snapshot.tick}"]
+    parts += [snapshot.run] if snapshot.run == DEAD else []
+    parts += [f"{name} {n}" for name, n in counts.items() if n or name in LOSSES]
+    at = snapshot.progress
+    parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
+    # What follows a colon is in the table.
+    return "  ".join(
+        [*parts, *(line.partition(":")[0] for line in snapshot.lines), *_demanded(snapshot)]
+    )
+
+
+def _head(snapshot: Snapshot) -> Text:
+    line = Text(
+        f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}"
+    )
+    if snapshot.run == DEAD:
+        line.append("; its launcher is gone: 'rack clean' removes it", style="bold red")
+    if snapshot.clock_skipped:
+        line.append(f", clock skipped {snapshot.clock_skipped} ticks", style="yellow")
+    for name in [*snapshot.lines, *_demanded(snapshot)]:
+        line.append(f"  {name}", style="bold red")
+    return line
+
+
+def _demanded(snapshot: Snapshot) -> list[str]:
+    """Return the demand on the arm, if there is one."""
+    return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
+
+
+def _reasons(snapshot: Snapshot) -> list[str]:
+    """Return the reasons that tasks give, except those that a hold already shows."""
+    held = {hold.level for hold in snapshot.holds}
+    shown = [hold.why for hold in snapshot.holds]
+    return [
+        f"{row.task}: {row.reason}"
+        for row in snapshot.tasks
+        if row.reason
+        and not (row.state == "holding" and row.task in held)
+        and is_news(row.reason, shown)
+    ]
+
+
+def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:
+    """Return the ages of a board's messages, as one line."""
+    shown = [
+        f"{port} {found.age} ticks old, taken at tick {found.taken}"
+        for port, found in ports.items()
+    ]
+    return f"exchange of {board}: {'; '.join(shown) or 'no message yet'}"
+
+
+def _style(column: str, text: str) -> str:
+    if column == "state":
+        return STATES.get(text.partition(" (")[0], "")
+    return COUNTED.get(column, "") if text != "0" else ""
+
+
+def is_shown(event: Event) -> bool:
+    """Return whether an event is more than the table shows."""
+    is_brief = event.subject == NO_TORQUE and event.value < BRIEF_TICKS
+    return event.kind not in QUIET and not is_brief
+
+
+def event_text(event: Event) -> Text:
+    """Return an event as one line, in the colour of its kind."""
+    tick = f"tick {event.tick} " if event.code else ""
+    board = f"{event.board}: " if event.board else ""
+    style = EVENTS.get(event.kind, OTHER_EVENTS)
+    return Text(f"{tick}{event.kind}: {board}{event.text}", style)

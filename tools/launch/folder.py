@@ -1,0 +1,101 @@
+"""A run's folder, and the event log in it: events.jsonl, one JSON object a line, the outcome
+last."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import suppress
+from dataclasses import asdict
+from io import StringIO
+from pathlib import Path
+from typing import TextIO
+
+from rack.boards.events import Event, order_key
+from rack.tools.console.answer import Document, Failure
+from rack.tools.launch.display import Display
+from rack.tools.recording.checksums import checked_line
+
+RUNS = Path("runs")
+
+
+def folder_of(wanted: Path | None, rack: str) -> Path:
+    """Return the folder for a run that is about to start: `wanted`, or runs/<rack>-<time>. It is
+    created later.
+
+    Raises `Failure` when `wanted` holds files already.
+    """
+    if wanted is None:
+        name = f"{rack}-{time.strftime('%Y%m%d-%H%M%S')}"
+        if taken := len(list(RUNS.glob(f"{name}*"))):
+            name = f"{name}-{taken + 1}"
+        return RUNS / name
+    if wanted.exists() and (not wanted.is_dir() or any(wanted.iterdir())):
+        raise Failure(f"--out {wanted}: exists already and is not an empty folder", 2)
+    return wanted
+
+
+class EventLog:
+    """Shows every event and writes it to events.jsonl, which is opened only once the rack is
+    launched.
+
+    A write that fails, on a full disk, is reported once and does not end the run.
+
+    Attributes:
+        has_failed: Whether an event could not be written.
+    """
+
+    def __init__(self, display: Display) -> None:
+        self._display = display
+        self._earlier = StringIO()
+        self._file: TextIO = self._earlier
+        self.has_failed = False
+
+    def add(self, event: Event) -> None:
+        """Show and write an event."""
+        self._display.show_event(event)
+        self._write(asdict(event))
+
+    def open(self, path: Path) -> None:
+        """Write to a file from now on, earlier events first."""
+        # Line-buffered: the log of a killed run is complete up to its end.
+        self._file = path.open("w", buffering=1)
+        self._put(self._earlier.getvalue())
+
+    def end(self, outcome: Document) -> None:
+        """Write the outcome, close the file, and put its events in order: until now they are as
+        they became known."""
+        self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
+        self.close()
+        if self._file is not self._earlier and not self.has_failed:
+            self._put_in_order(Path(self._file.name))
+
+    def close(self) -> None:
+        """Close the file, with or without an outcome."""
+        # Closing retries what could not be written.
+        with suppress(OSError):
+            self._file.close()
+
+    def _put_in_order(self, path: Path) -> None:
+        """Sort the lines of the file; where there is no room for that, they stay as they are."""
+        lines = path.read_text().splitlines(keepends=True)
+        ordered = sorted(lines, key=lambda line: order_key(json.loads(line)))
+        if ordered == lines:
+            return
+        draft = path.with_suffix(".part")
+        with suppress(OSError):
+            draft.write_text("".join(ordered))
+            draft.replace(path)
+        draft.unlink(missing_ok=True)
+
+    def _write(self, entry: Document) -> None:
+        self._put(checked_line(entry))
+
+    def _put(self, text: str) -> None:
+        try:
+            if not self.has_failed:
+                self._file.write(text)
+        except OSError as error:
+            self.has_failed = True
+            lost = f"events.jsonl ends here: {error.strerror}"
+            self._display.show_event(Event(time.time_ns(), -1, "recorder", "", lost))

@@ -1,1 +1,0 @@
-"""A rack while it runs: launched, shown, watched."""

@@ -1,0 +1,1 @@
+"""Observation and control of a running rack: snapshot, holds, signals, operator commands."""

@@ -1,0 +1,250 @@
+"""The operator's desk of a running rack, from the host side: gives a command to a level and waits
+for its reply."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from rack.backplane.operator_table import (
+    Client,
+    OperatorTable,
+    Request,
+    RequestEntry,
+    RequestStage,
+)
+from rack.backplane.segment import Segment
+from rack.backplane.words import System
+from rack.boards.config import read_stored
+from rack.boards.config.commands import asked, request, takes
+from rack.boards.config.published import PublishedRack
+from rack.boards.config.schema import CommandConfig
+from rack.boards.errors import ConfigError, Mistake
+from rack.boards.operator import describe, message_of
+from rack.levels.operator import EFFECTS, Operation
+from rack.tools.console.answer import Document, Failure
+from rack.tools.console.held import waits
+from rack.tools.console.tables import fitted
+from rack.tools.monitor.holds import resume_command
+from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.replies import LastCycle, Replies, Reply, answering
+
+SILENT_S = 5.0
+"""Time without a tick after which a wait is given up."""
+NOTE_S = 1.5
+"""Time after which a wait is explained on stderr."""
+LOOK_S = 0.001
+"""Time between two looks at the rack."""
+GOAL_KEYS = ("joints", "position", "quaternion", "direction")
+
+
+class LiveDesk:
+    """The desk of one rack."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._config = read_stored(self._segment.config)
+        levels = PublishedRack.of_rack(self._segment).levels
+        self._levels = {name: one for name, one in levels.items() if one.commands}
+
+    def levels(self) -> list[dict[str, str]]:
+        """Return the commands that each level takes, and the one in force, as plain data."""
+        return [
+            {"level": name, "in_force": self._in_force(name), "takes": takes(level)}
+            for name, level in self._levels.items()
+        ]
+
+    def text(self) -> Iterator[str]:
+        """Yield the same as a table."""
+        return fitted(["level", "in force", "takes"], [list(row.values()) for row in self.levels()])
+
+    def highest(self, *in_force: str) -> list[str]:
+        """Return the levels that take a hold and have one of these commands in force ("": none),
+        without those below another one of them."""
+        found = [
+            name
+            for name in self._levels
+            if self._takes_hold(name) and self._in_force(name) in in_force
+        ]
+        lower = set[str]().union(*map(self._config.all_below, found))
+        return [name for name in found if name not in lower]
+
+    def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Reply:
+        """Give a command and wait until its level takes it up; with `wait`, until it is done.
+
+        `timeout_s` of wall-clock time bounds that wait; None: until the end of the run.
+
+        Raises `ConfigError` with every mistake, and `Failure` when it is not given or not answered
+        in time.
+        """
+        segment = self._segment
+        command, wanted = self._request(given)
+        if held := waits(segment):
+            # Without a client: the user steps the rack afterwards.
+            entry = OperatorTable(segment).add(wanted)
+            text = describe(message_of(entry, segment.layout))
+            return Reply(0, command.level, text, -1, "waiting", waits=held)
+        # However the wait ends, leaving the claim withdraws a request that has not been given.
+        with OperatorTable(segment).claim(wanted) as entry:
+            reply = self._await_giving(entry, command.level)
+        return self._await_reply(reply, wait, timeout_s)
+
+    def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
+        """Give a command under a lease, `tell` its reply, and stay until a newer one is in force or
+        the run is over: if this process ends or falls silent before, its level holds.
+
+        Raises as `give` does, and for a command that leaves none in force.
+        """
+        command, wanted = self._request(given)
+        segment = self._segment
+        if command.said not in EFFECTS or not self._takes_hold(command.level):
+            kept = ", ".join(what.name.lower() for what in EFFECTS)
+            why = f"permitted: {kept}, to levels that take a hold"
+            raise Failure(f"--lease: '{command.level}', {command.what}: {why}", 2)
+        if held := waits(segment):
+            raise Failure(f"--lease: the rack is held: {held}")
+        table = OperatorTable(segment)
+        with table.claim(wanted, Client.LEASES) as entry:
+            ticket = entry.ticket
+            reply = self._await_reply(self._await_giving(entry, command.level), False, None)
+            tell(reply)
+            while reply.worked and table.hear(entry, ticket) and not segment.run_is_over:
+                time.sleep(LOOK_S)
+
+    def _takes_hold(self, level: str) -> bool:
+        return Operation.HOLD in (self._levels[level].commands)
+
+    def _request(self, given: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
+        """Return a command and what asks the clock for it. Raises as `give` does."""
+        tick = self._segment.words[System.TICK]
+        command = asked({key: value for key, value in given.items() if value is not None})
+        wanted = request(command, self._config, self._levels, self._segment.layout)
+        if 0 <= wanted.tick <= tick:
+            key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
+            raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
+        if self._segment.run_is_over:
+            raise Failure(f"rack '{self._segment.rack}': its run is over")
+        return command, wanted
+
+    def set_param(self, setting: str, tick: int | None = None, at: float | None = None) -> Reply:
+        """Set a live parameter, as in `board.servo.params.bandwidth=80`; raises as `give` does."""
+        place, _, _ = setting.partition("=")[0].rpartition(".")
+        live = {
+            name: one.live for name, one in self._levels.items() if Operation.SET in one.commands
+        }
+        level = next((level for level in live if place == f"board.{level}.params"), None)
+        if level is None:
+            known = [f"board.{board}.params.{key}" for board, keys in live.items() for key in keys]
+            raise Failure(
+                f"{setting}: no level reads it while it runs; live: {', '.join(known) or 'none'}", 2
+            )
+        name = setting.removeprefix(f"{place}.")
+        given = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
+        return self.give(given, wait=False)
+
+    def _await_giving(self, entry: RequestEntry, level: str) -> Reply:
+        ticket = entry.ticket
+        text = describe(message_of(entry, self._segment.layout))
+        about = f"'{level}', {text}"
+        for is_over in self._looks(about, f"waiting for tick {max(0, entry.tick)}"):
+            if entry.ticket != ticket:
+                break
+            if entry.stage == RequestStage.GIVEN:
+                return Reply(entry.serial, level, text, entry.given_tick)
+            if is_over:
+                raise Failure(f"{about}: the run ended before it was given")
+        raise Failure(f"{about}: given, but its reply is lost: too many commands followed")
+
+    def _await_reply(self, reply: Reply, wait: bool, timeout_s: float | None) -> Reply:
+        deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        status = answering(self._segment, reply.level)
+        if status is None:
+            return reply
+        replies = Replies(self._segment, status, reply)
+        last = LastCycle(self._segment, status)
+        about = f"command {reply.serial}"
+        awaited = f"waiting for '{reply.level}', which runs every {status.every} ticks"
+        for is_over in self._looks(about, awaited):
+            late = last.passed(self._segment.words[System.TICK])
+            reply = replies.look()
+            if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
+                break
+            if is_over:
+                raise Failure(f"{reply.line}; the run ended")
+            if reply.fate == "given" and late:
+                raise Failure(f"{about}: '{reply.level}' {late}")
+            if time.monotonic() > deadline:
+                still = f"in force until: {resume_command(self._segment.rack, reply.level)}"
+                raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
+        return reply
+
+    def _looks(self, about: str, awaited: str) -> Iterator[bool]:
+        """Yield again and again whether the run is over, for as long as the clock ticks or the rack
+        is held; explain a long wait on stderr, once."""
+        words = self._segment.words
+        tick = words[System.TICK]
+        changed = time.monotonic()
+        note_at = changed + NOTE_S
+        while True:
+            # Asked before the look: a reply written just before the run ended still counts.
+            yield self._segment.run_is_over
+            time.sleep(LOOK_S)
+            now = time.monotonic()
+            if tick != words[System.TICK] or words[System.HELD]:
+                tick = words[System.TICK]
+                changed = now
+            if now > note_at:
+                note_at = math.inf
+                print(
+                    f"{about}: {awaited}; the rack is at tick {tick}", file=sys.stderr, flush=True
+                )
+            if now - changed >= SILENT_S:
+                raise Failure(f"{about}: not answered, the clock has not ticked for {SILENT_S:g} s")
+
+    def _in_force(self, level: str) -> str:
+        """Return the operator's command in force at a level; empty: none."""
+        status = Newest(self._segment).message(f"{level}.status")
+        standing = getattr(status, "standing", 0)
+        return Operation(standing).name.lower() if standing else ""
+
+
+def goal_of(what: str, words: Sequence[str]) -> Document:
+    """Return what follows the verb, as in a `[[command]]` table.
+
+    Typed as `home`, key=numbers, NAME on|off, or the name of a table or command. Raises `Failure`.
+    """
+    if what == "modify":
+        if len(words) != 2 or words[1] not in ("on", "off"):
+            raise Failure(
+                f"'modify {' '.join(words)}': permitted: modify NAME on, modify NAME off", 2
+            )
+        return {"name": words[0], "on": words[1] == "on"}
+    if what in ("table", "do", "set"):
+        return {"name": " ".join(words)}
+    goal: Document = {}
+    for word in words:
+        key, is_given, values = word.partition("=")
+        if key in goal:
+            raise Failure(f"'{word}': {key} is given twice", 2)
+        if word == "home":
+            goal["home"] = True
+        elif not is_given or key not in GOAL_KEYS:
+            permitted = ", ".join(f"{k}=..." for k in GOAL_KEYS)
+            raise Failure(f"'{word}': not a goal; permitted: home, {permitted}", 2)
+        else:
+            goal[key] = [_number(value, word) for value in values.split(",")]
+    return goal
+
+
+def _number(text: str, word: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        why = (
+            f"'{text}' is not a number; permitted: numbers separated by commas, as in"
+            " joints=0,0.5,1"
+        )
+        raise Failure(f"'{word}': {why}", 2) from None

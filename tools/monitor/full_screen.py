@@ -1,0 +1,244 @@
+"""The full screen of `rack top`: boards, mailboxes, events and lateness of a rack, and keys that
+command it. It needs textual.
+
+It reads rings and words, five times a second. Commands that wait for an answer run in a thread.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from rich.console import RenderableType
+from rich.text import Text
+from textual.app import App, ComposeResult
+from textual.binding import Binding
+from textual.containers import VerticalScroll
+from textual.widget import Widget
+from textual.widgets import Footer, Input, OptionList, Static, TabbedContent, TabPane
+from textual.widgets.option_list import Option
+
+from rack.backplane.lines import UtilityLines
+from rack.backplane.segment import Segment
+from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.faults import KINDS
+from rack.boards.timing.trace_times import lateness_ns
+from rack.tools.console.answer import Failure, as_failure
+from rack.tools.console.tables import GAP, grid
+from rack.tools.faults.live import LiveRack
+from rack.tools.launch import display
+from rack.tools.monitor.desk import LiveDesk, goal_of
+from rack.tools.monitor.message_text import DROPPED, list_mailboxes
+from rack.tools.monitor.snapshot import RackMonitor, Snapshot
+
+LOOK_S = 0.2
+LATE_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
+"""Borders of the classes in which cycles are counted by their lateness."""
+INJECT = "inject"
+"""First word of a fault on the command line; with any other it is a command to that level."""
+OWN_PROCESS = [kind.name for kind in KINDS if kind.where == "core"]
+"""Kinds whose process takes a core: it must not be this one."""
+
+
+class RackScreen(App[None]):
+    """Shows one rack until its run is over, or `has_ended`."""
+
+    CSS = """
+    Screen { overflow: hidden; }
+    #head, #levels { height: 1; }
+    TabbedContent { height: 1fr; }
+    TabPane { padding: 0; }
+    Input, OptionList { display: none; max-height: 50%; }
+    .open { display: block; }
+    .-low #head, .-low ContentTabs, .-low Footer { display: none; }
+    """
+    VERTICAL_BREAKPOINTS = [(0, "-low"), (10, "-high")]
+    ENABLE_COMMAND_PALETTE = False
+    BINDINGS = [
+        Binding("h", "give('hold')", "hold"),
+        Binding("r", "give('resume')", "resume"),
+        Binding("l", "level", "level"),
+        Binding("c", "write('')", "command"),
+        Binding("i", "kinds", INJECT),
+        Binding("e", "stop", "estop"),
+        Binding("E", "carry_out(['reset'])", "reset"),
+        Binding("w", "worst", "worst"),
+        Binding("q", "quit", "quit"),
+        Binding("escape", "close", show=False),
+        Binding("ctrl+c", "interrupt", show=False, priority=True),
+        *(Binding(str(number), f"pane({number})", show=False) for number in (1, 2, 3, 4)),
+    ]
+
+    def __init__(self, segment: Segment, has_ended: Callable[[], bool]) -> None:
+        super().__init__()
+        self._segment = segment
+        self._has_ended = has_ended
+        self._monitor = RackMonitor(segment, keeps_longest=True)
+        self._alarms = AlarmWatch(segment)
+        self._lines = UtilityLines(segment)
+        self._events: deque[Text] = deque(maxlen=500)  # newest first
+        tasks = sorted(segment.layout.tasks, key=lambda task: -task.every)
+        names = [task.name for task in tasks]
+        boxes = {box.name for box in segment.layout.mailboxes}
+        self._hierarchy = [name for name in names if f"{name}.operator" in boxes] or names
+        self._levels = deque(self._hierarchy)  # the first is the one that keys command
+        self._late: dict[str, np.ndarray] = {}
+        self._panes: dict[str, Callable[[Snapshot], RenderableType]] = {
+            "boards": display.RackView,
+            "mailboxes": self._mailboxes,
+            "events": lambda snapshot: Text("\n").join(list(self._events)),
+            "lateness": self._lateness,
+        }
+
+    def compose(self) -> ComposeResult:
+        """Yield the parts of the screen."""
+        yield Static(id="head")
+        yield Static(id="levels")
+        with TabbedContent():
+            for number, name in enumerate(self._panes, 1):
+                with TabPane(f"{number} {name}", id=name), VerticalScroll():
+                    yield Static()
+        yield OptionList()
+        yield Input(placeholder="LEVEL WHAT [GOAL], as in: task goto home", compact=True)
+        yield Footer(compact=True)
+
+    def on_mount(self) -> None:
+        """Look at once, and again and again."""
+        self._look()
+        self.set_interval(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        """Show the rack as it is now."""
+        if self._segment.run_is_over or self._has_ended():
+            self.exit()
+            return
+        snapshot = self._monitor.look()
+        for task, rows in self._monitor.cycles.items():
+            counts, _ = np.histogram(lateness_ns(rows) * 1e-3, LATE_US)
+            self._late[task] = self._late.get(task, 0) + counts
+        for event in (alarm.event for alarm in self._alarms.drain()):
+            if display.is_shown(event):
+                self._events.appendleft(display.event_text(event))
+        self.query_one("#head", Static).update(Text(display.line_of(snapshot)))
+        self.query_one("#levels", Static).update(self._chosen(snapshot))
+        pane = self.query_one(TabbedContent).active
+        self.query_one(f"#{pane} Static", Static).update(self._panes[pane](snapshot))
+
+    def _chosen(self, snapshot: Snapshot) -> Text:
+        """Return the levels coloured by state; the one that keys command is reversed."""
+        states = {row.task: row.state for row in snapshot.tasks}
+        chosen = {self._levels[0]: "reverse"}
+        levels = [
+            Text(name, f"{display.STATES.get(states[name], '')} {chosen.get(name, '')}")
+            for name in self._hierarchy
+        ]
+        return Text(" > ").join(levels)
+
+    def _mailboxes(self, snapshot: Snapshot) -> RenderableType:
+        rows = list_mailboxes(self._segment)
+        cells = [[*map(str, row.values())] for row in rows]
+        return grid([*rows[0]], cells, self.size.width - GAP, DROPPED)
+
+    def _lateness(self, snapshot: Snapshot) -> RenderableType:
+        level = self._levels[0]
+        classes = zip(LATE_US[1:], self._late[level].tolist(), strict=True)
+        rows = [[f"< {border:g}", str(count)] for border, count in classes]
+        return grid(("late us", level), rows, self.size.width)
+
+    def action_pane(self, number: int) -> None:
+        """Show one pane."""
+        self.query_one(TabbedContent).active = [*self._panes][number - 1]
+
+    def action_level(self) -> None:
+        """Let keys command the next level."""
+        self._levels.rotate(-1)
+
+    def action_worst(self) -> None:
+        """Forget the longest times and the lateness so far."""
+        self._monitor.forget_times()
+        self._late.clear()
+
+    def action_interrupt(self) -> None:
+        """End as Ctrl-C ends every command."""
+        signal.raise_signal(signal.SIGINT)
+
+    def action_stop(self) -> None:
+        """Set the emergency stop; the first line shows it."""
+        self._lines.latch_emergency_stop()
+
+    def action_give(self, what: str) -> None:
+        """Give a command without a goal to the level."""
+        self.action_carry_out([self._levels[0], what])
+
+    def action_kinds(self) -> None:
+        """Open the menu of faults."""
+        options = self.query_one(OptionList)
+        options.clear_options()
+        for kind in KINDS:
+            words = [INJECT, self._levels[0], kind.name]
+            words += [f"{p.name}=" for p in kind.parameters if p.default is None]
+            words += [] if kind.once else ["for=1s"]
+            options.add_option(Option(Text(f"{kind.name:18}{kind.means}"), " ".join(words)))
+        options.highlighted = 0
+        self._open(options)
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        """Write the fault on the command line, where it can be changed before it is sent."""
+        self.action_write(event.option_id or "")
+
+    def action_write(self, text: str) -> None:
+        """Open the command line."""
+        line = self.query_one(Input)
+        self._open(line)
+        line.value = text
+        line.action_end()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        """Carry out what is written."""
+        self.action_close()
+        self.action_carry_out(event.value.split())
+
+    def action_close(self) -> None:
+        """Close menu and command line."""
+        self.query(".open").remove_class("open")
+        self.set_focus(None)
+
+    def _open(self, widget: Widget) -> None:
+        self.action_close()
+        widget.add_class("open")
+        widget.focus()
+
+    def action_carry_out(self, words: Sequence[str]) -> None:
+        """Carry out a command, and show its answer when it has come."""
+        self.run_worker(partial(self._answer, words), thread=True)
+
+    def _answer(self, words: Sequence[str]) -> None:
+        """Carry out a command, in a thread: its level may take seconds to answer."""
+        try:
+            with as_failure():
+                answer = self._result(words)
+        except Failure as error:
+            answer = str(error)
+        self._events.appendleft(Text(answer))
+        self.notify(answer, markup=False)
+
+    def _result(self, words: Sequence[str]) -> str:
+        """Return the answer to a command."""
+        match words:
+            case ["reset"]:
+                self._lines.reset_emergency_stop()
+                return "the emergency stop is reset"
+            case [first, board, kind, *given] if first == INJECT:
+                if kind in OWN_PROCESS:
+                    raise Failure(f"{kind}: needs a process of its own: rack inject")
+                values = dict(word.partition("=")[::2] for word in given)
+                live = LiveRack(self._segment)
+                fault = {"board": board, "kind": kind, **values}
+                return str(live.inject(fault, wait=False)["message"])
+            case [level, what, *goal]:
+                command = {"level": level, "what": what, **goal_of(what, goal)}
+                return LiveDesk(self._segment).give(command, wait=False).line
+        raise Failure(f"'{' '.join(words)}': permitted: LEVEL WHAT [GOAL], {INJECT} BOARD KIND ...")

@@ -1,0 +1,130 @@
+"""What interrupted the boards of a rack, under protocol interrupt: now, and message by message in a
+run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from rack.backplane.layout import Layout
+from rack.backplane.mailbox.inbox import Inbox
+from rack.backplane.mailbox.interrupt import how_sent, sent_ns
+from rack.backplane.segment import Segment
+from rack.backplane.words import Block
+from rack.boards.timing.trace_times import distribution
+from rack.tools.console.answer import Document
+
+if TYPE_CHECKING:
+    from rack.tools.recording.recording import Recording
+
+LOST = np.iinfo(np.int64).max
+"""End of service of a message that was lost in the inbox."""
+
+
+@dataclass(frozen=True)
+class InboxFill:
+    """The inbox of a board, so far: messages `served` and `lost`, and the most that waited, of at
+    most `depth`."""
+
+    board: str
+    served: int
+    lost: int
+    waiting: int
+    depth: int
+
+    @property
+    def line(self) -> str:
+        """The inbox as one line."""
+        lost = f", {self.lost} lost" if self.lost else ""
+        return (
+            f"interrupts of {self.board}: {self.served} served, at most {self.waiting} of"
+            f" {self.depth} waited{lost}"
+        )
+
+
+def inbox_depths(layout: Layout) -> dict[int, int]:
+    """Return the depth of the inbox of every board that messages interrupt, by slot."""
+    slots = dict.fromkeys(task.slot for task in layout.tasks)
+    boxes = {slot: layout.interrupting(slot) for slot in slots}
+    return {slot: how_sent(found[0]).depth for slot, found in boxes.items() if found}
+
+
+def inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
+    """Return the inbox of every board that messages interrupt, as it is now."""
+    found = []
+    for slot, depth in inbox_depths(segment.layout).items():
+        board = segment.layout.handler(slot)
+        block = segment.block(board)
+        served, lost = block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST]
+        found.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
+    return tuple(found)
+
+
+class Arrivals(NamedTuple):
+    """The messages that interrupted a board, mailbox after mailbox; times in ns of simulated time
+    since tick 0. Arrays have shape (n,)."""
+
+    mailbox: np.ndarray  # number of the mailbox, as `Layout.interrupting` counts
+    sent_ns: np.ndarray
+    end_ns: np.ndarray  # of the service; `LOST` where the inbox was full
+    most_waiting: int
+
+
+def replay_inbox(recording: Recording, slot: int) -> Arrivals:
+    """Work the inbox of the board in a slot out again from the messages of a run, as the board
+    did."""
+    layout = recording.layout
+    boxes = layout.interrupting(slot)
+    sent = []
+    for box in boxes:
+        visible_at = recording.signal(box.name, "visible_at").astype(np.int64)
+        # A message that comes after a later one of its mailbox is sent with that.
+        newest = np.maximum.accumulate(visible_at * layout.clock_ns)
+        sent.append(newest + sent_ns(box, layout.clock_ns))
+    times = np.concatenate(sent)
+    numbers = np.repeat(np.arange(len(boxes)), [len(at) for at in sent])
+    ends = np.full(len(times), LOST)
+    inbox = Inbox(how_sent(boxes[0]).depth)
+    services = [how_sent(box).service_ns for box in boxes]
+    for at in np.lexsort((numbers, times)).tolist():
+        end_ns = inbox.arrive(int(times[at]), services[numbers[at]])
+        if end_ns is not None:
+            ends[at] = end_ns
+    return Arrivals(numbers, times, ends, inbox.most_waiting)
+
+
+def interrupts(recording: Recording) -> list[Document]:
+    """Return what interrupted every board in a run: messages served and lost, the most that waited,
+    latencies.
+
+    A latency, us, is the time from sending a message to the end of its service; then a level can
+    see it.
+    """
+    layout = recording.layout
+    found = []
+    for slot, depth in inbox_depths(layout).items():
+        arrivals = replay_inbox(recording, slot)
+        is_served = arrivals.end_ns != LOST
+        boxes = layout.interrupting(slot)
+        served, lost = (
+            np.bincount(arrivals.mailbox[part], minlength=len(boxes)).tolist()
+            for part in (is_served, ~is_served)
+        )
+        latency_ns = (arrivals.end_ns - arrivals.sent_ns)[is_served]
+        found.append(
+            {
+                "board": layout.handler(slot),
+                "depth": depth,
+                "served": sum(served),
+                "lost": sum(lost),
+                "waiting": arrivals.most_waiting,
+                "latency_us": distribution(latency_ns * 1e-3),
+                "mailboxes": [
+                    {"mailbox": box.name, "served": served[at], "lost": lost[at]}
+                    for at, box in enumerate(boxes)
+                ],
+            }
+        )
+    return found

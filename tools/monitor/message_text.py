@@ -1,0 +1,67 @@
+"""The mailboxes of a rack as rows, and a message as a document, and as lines for people, field by
+field with units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rack.backplane.layout import MailboxSpec
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box
+from rack.tools.console.answer import Document
+from rack.tools.console.tables import fitted
+from rack.tools.monitor.signals import cell
+from rack.tools.recording.parquet import HEAD
+from rack.tools.recording.signal import signals_of
+
+DROPPED = ("bytes", "message", "protocol", "readers")
+"""Columns of the list of mailboxes that a narrow terminal leaves out, in this order."""
+
+
+def list_mailboxes(segment: Segment) -> list[Document]:
+    """Return a row of each mailbox of a rack."""
+    return [
+        {
+            "mailbox": box.name,
+            "message": f"{box.message} {box.version}",
+            "writer": box.writer,
+            "readers": ", ".join(box.readers) or "-",
+            "protocol": box.protocol,
+            "period_ms": round(box.every * segment.layout.clock_ns * 1e-6, 6),
+            "bytes": box.size,
+            "written": segment.box(box.name)[Box.HEAD],
+        }
+        for box in segment.layout.mailboxes
+    ]
+
+
+class MessageText:
+    """Shows the messages of one mailbox of a rack whose ticks last `clock_ns`."""
+
+    def __init__(self, box: MailboxSpec, clock_ns: int) -> None:
+        self._box = box
+        self._clock_ns = clock_ns
+        self._signals = signals_of(box)
+
+    def document(self, row: np.ndarray, tick: int) -> Document:
+        """Return a message, a row of the mailbox's ring, as a document, as of `tick`."""
+        message = row["message"][None]
+        return {
+            "mailbox": self._box.name,
+            **{name: int(row[name]) for name in HEAD},
+            "age_ticks": tick - int(row["tick"]),
+            "fields": {".".join(signal.path): signal.plain(message)[0] for signal in self._signals},
+        }
+
+    def lines(self, document: Document) -> list[str]:
+        """Return a message as lines for people."""
+        age_ms = document["age_ticks"] * self._clock_ns * 1e-6
+        head = (
+            f"{self._box.name}: serial {document['serial']}, of tick {document['tick']},"
+            f" {document['age_ticks']} ticks ({age_ms:g} ms) old"
+        )
+        rows = [
+            [name, cell(value), signal.unit]
+            for (name, value), signal in zip(document["fields"].items(), self._signals, strict=True)
+        ]
+        return [head, *fitted(("field", "value", "unit"), rows)]

@@ -1,0 +1,141 @@
+"""A running rack's exchange with others over the network: which are there, and what passes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+
+from rack.backplane.bounded_toml import load_toml
+from rack.backplane.segment import Segment
+from rack.levels.peer import Presence, peer_port
+from rack.tools.monitor.newest_messages import Newest
+
+BOARD = "lan"
+STATUS = f"{BOARD}.status"
+COUNTS = (
+    "taken",
+    "missing",
+    "disordered",
+    "repeated",
+    "late",
+    "refused",
+    "unknown_launch",
+    "superseded",
+)
+"""What is counted of an import: see `rack.boards.lan.adapter.IMPORT`."""
+
+
+@dataclass(frozen=True)
+class PeerRow:
+    """Another rack now. `clock_ms` is its clock less ours, within `within_ms`, ms; None: not known,
+    or in lockstep."""
+
+    peer: str
+    state: str
+    since_tick: int
+    launches: int
+    losses: int
+    clock_ms: float | None
+    within_ms: float | None
+
+
+@dataclass(frozen=True)
+class ImportRow:
+    """One import now: its counts, and the age of its information in ticks here and in s of
+    simulated time."""
+
+    entry: str
+    source: str
+    taken: int
+    missing: int
+    disordered: int
+    repeated: int
+    late: int
+    refused: int
+    unknown_launch: int
+    superseded: int
+    age_ticks: int | None
+    age_s: float | None
+
+
+@dataclass(frozen=True)
+class ExportRow:
+    """One export now."""
+
+    entry: str
+    source: str
+    sent: int
+
+
+class Entries(NamedTuple):
+    """What a rack exchanges: the source of each export and import by port, and the racks with which
+    it works."""
+
+    exports: dict[str, str]
+    imports: dict[str, str]
+    peers: tuple[str, ...]
+
+
+@cache
+def exchanged(config: str) -> Entries | None:
+    """Return what a rack exchanges by its config, TOML text; None: it has no network adapter."""
+    table: dict[str, Any] | None = load_toml(config).get("adapter", {}).get(BOARD)
+    if table is None:
+        return None
+    exports, imports = (
+        {port: entry["from"] for port, entry in table.get(key, {}).items()}
+        for key in ("export", "import")
+    )
+    racks = [*(source.partition("/")[0] for source in imports.values()), *table.get("peers", ())]
+    return Entries(exports, imports, tuple(dict.fromkeys(racks)))
+
+
+def _entries(segment: Segment) -> Entries:
+    """Return what a rack exchanges; nothing in a rack without a network adapter."""
+    has_adapter = any(task.name == BOARD for task in segment.layout.tasks)
+    return (exchanged(segment.config) if has_adapter else None) or Entries({}, {}, ())
+
+
+def peer_rows(newest: Newest) -> tuple[PeerRow, ...]:
+    """Return the other racks."""
+    racks = _entries(newest.segment).peers
+    seen = ((rack, newest.message(f"{BOARD}.{peer_port(rack)}")) for rack in racks)
+    return tuple(_peer(rack, message) for rack, message in seen if message is not None)
+
+
+def import_rows(newest: Newest) -> tuple[ImportRow, ...]:
+    """Return the imports."""
+    found = []
+    for port, source, counts in _groups(newest, "import", _entries(newest.segment).imports):
+        age = int(counts["age"])
+        ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
+        numbers = {name: int(counts[name]) for name in COUNTS}
+        entry = f"{BOARD}.{port}"
+        found.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
+    return tuple(found)
+
+
+def export_rows(newest: Newest) -> tuple[ExportRow, ...]:
+    """Return the exports."""
+    return tuple(
+        ExportRow(f"{BOARD}.{port}", source, int(counts["sent"]))
+        for port, source, counts in _groups(newest, "export", _entries(newest.segment).exports)
+    )
+
+
+def _groups(
+    newest: Newest, kind: str, sources: Mapping[str, str]
+) -> Iterator[tuple[str, str, Any]]:
+    """Yield port, source and counts of all imports or exports, once the adapter has counted."""
+    if (status := newest.message(STATUS)) is not None:
+        for port, source in sources.items():
+            yield port, source, getattr(status, f"{kind}_{port}")
+
+
+def _peer(rack: str, at: Any) -> PeerRow:
+    is_known = at.uncertainty > 0.0
+    clock = (at.offset * 1e3, at.uncertainty * 1e3) if is_known else (None, None)
+    state = Presence(at.presence).name.lower()
+    return PeerRow(rack, state, at.since, at.launches, at.losses, *clock)

@@ -1,0 +1,341 @@
+"""A report as text: report.md with every column, and on a terminal as many as fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from rack.boards.events import Braking, braked_text
+from rack.tools.console.answer import Document
+from rack.tools.console.tables import (
+    Blocks,
+    Cell,
+    TextTable,
+    decimal,
+    figure,
+    render_markdown,
+)
+from rack.tools.launch.verdict import headline
+from rack.tools.monitor.holds import resume_command
+from rack.tools.recording.history import counted
+from rack.tools.recording.recording import Gap
+from rack.tools.report.arm_outcome import outcome_text
+from rack.tools.report.run_report import RunReport
+from rack.tools.report.task_times import times_text
+
+SHOWN = 10
+"""Most misses, holds and long responses in the text; report.json has them all."""
+JUDGED = {True: "ok", False: "beyond", None: "-"}
+CHANGED = 1.05
+"""Ratio of a core's highest to its lowest frequency from which the text mentions it."""
+
+
+def markdown(report: Document) -> str:
+    """Return report.md of a report."""
+    return render_markdown(report_blocks(report))
+
+
+def terminal_blocks(report: Document) -> Blocks:
+    """Yield a report for a terminal, with the files that hold the rest."""
+    yield from report_blocks(report)
+    yield ""
+    yield f"all columns: {report['folder']}/report.md; all data: report.json"
+
+
+def summary(document: Document) -> Iterator[str]:
+    """Yield the verdict, and what is known of a run that was not recorded, too."""
+    report = RunReport.of(document)
+    yield f"# {headline(report.rack, report.outcome, report.failures)}"
+    yield ""
+    yield (
+        f"{report.simulated_s:.2f} s simulated in {report.wall_s:.2f} s, {report.mode}, "
+        f"{report.missed} missed, {report.skipped} skipped cycles."
+        f"{f' Digest `{report.digest}`.' if report.digest else ''}"
+    )
+    yield from (f"- not judged: {line}" for line in report.unjudged)
+    if found := (report.outcome or {}).get("brakings"):
+        yield f"- {braked_text([Braking(**one) for one in found])}"
+
+
+def report_blocks(document: Document) -> Blocks:
+    """Yield a report as text for people."""
+    report = RunReport.of(document)
+    yield from summary(document)
+    yield from _notes(report)
+    yield from outcome_text(report)
+    yield from _queues(report.queues)
+    yield from _interrupts(report.interrupts)
+    if report.holds:
+        yield from _holds(report.rack, report.holds)
+    if report.state_tables:
+        yield from ("", "## State tables", "", _state_tables(report.state_tables))
+    yield from times_text(report)
+    yield from _faults(report)
+    if report.misses:
+        yield from _misses(report)
+    if (response := report.system_response) is not None:
+        yield from ("", "## System response, ms of simulated time")
+        for found in (response, *response["others"]):
+            yield from _response_along(found)
+    if report.entries:
+        yield from ("", "## Bus adapters, ages in ms of simulated time", "")
+        yield _passed(report.entries, ("superseded", "waiting", "source"))
+    yield from _network(report.network)
+
+
+def _notes(report: RunReport) -> Iterator[str]:
+    """Yield what the run began from and ran on, and what the recording lacks."""
+    if found := report.continues:
+        yield f"- continues {found['folder']} from {found['time_s']:g} s"
+    yield from (f"- {note}" for note in report.notes)
+    yield from _machine(report)
+    if report.recording != "complete":
+        yield f"- recording: {report.recording}"
+    if report.kept:
+        yield f"- {report.kept}"
+    if lost := ", ".join(f"{name} {count}" for name, count in report.rows_lost.items()):
+        yield f"- the recorder lost rows: {lost}"
+        yield from (f"- {Gap(**gap)}" for gap in report.gaps)
+    if report.against:
+        yield from _against(report.against)
+
+
+def _the_most(rows: Sequence[Any], which: str) -> str:
+    """Return, for a heading, which of the rows are shown; "" if all are."""
+    return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
+
+
+def _holds(rack: str, holds: Sequence[Document]) -> Blocks:
+    yield from ("", f"## Holds: {len(holds)}{_the_most(holds, 'longest')}", "")
+    rows = [
+        {
+            "level": hold["level"],
+            "by": f"{'operator: ' if hold['by'] == 'operator' else ''}{hold['why']}",
+            "since, s": decimal(hold["since_s"], 2),
+            "until, s": "the end" if hold["until_s"] is None else decimal(hold["until_s"], 2),
+            "lasted, s": decimal(hold["lasted_s"], 2),
+        }
+        for hold in sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
+    ]
+    yield TextTable(rows)
+    for hold in holds:
+        if hold["until_s"] is None and hold["by"] == "operator":
+            level = hold["level"]
+            yield from (
+                "",
+                f"Still held at the end: {level}; `{resume_command(rack, level)}` releases it.",
+            )
+
+
+def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
+    """Return one line a level: the table, how many rows fired, and those that fired first and
+    last."""
+    rows = []
+    for level, fired in levels.items():
+        most = max(fired, key=lambda row: row["cycles"])
+        often, newest = (
+            f"{row['row']} {row['name']}, {row['first_s']:.2f} s" for row in (most, fired[-1])
+        )
+        rows.append(
+            {
+                "level": level,
+                "table": ", then ".join(dict.fromkeys(row["table"] for row in fired)),
+                "rows fired": len(fired),
+                "cycles": sum(row["cycles"] for row in fired),
+                "most often, since": often,
+                "newest, since": newest,
+            }
+        )
+    return TextTable(rows)
+
+
+def _machine(report: RunReport) -> Iterator[str]:
+    """Yield what the machine did to its cores: when they were away, by whom if that is known;
+    changes of frequency."""
+    steal = report.steal
+    stalls = report.stalls
+    frequency = report.frequency_mhz or {}
+    lost = f"of {stalls['lost']} lost cycles were due meanwhile"
+    if steal["ms"]:
+        cores = ", ".join(f"core {core} for {steal['percent'][core]:.2f} %" for core in steal["ms"])
+        yield f"- the hypervisor took {cores} of the run (steal); {stalls['during_steal']} {lost}"
+    for away in stalls["absences"]:
+        times = f"stalls: {away['times']}, longest {away['longest_ms']:.3g} ms"
+        nothing = f"core {away['core']} ran nothing of the rack though it was due, without steal"
+        yield f"- {nothing} ({times}); {away['lost']} {lost}"
+    if quota := stalls["quota"]:
+        causes = [*(f"the cycle of {level}" for level in quota["levels"]), "a quota of the host"]
+        yield (
+            f"- {quota['together']} of {quota['stalls']} stalls end at one phase of 100 ms:"
+            f" {' or '.join(causes)}"
+        )
+    changed = {core: mhz for core, mhz in frequency.items() if mhz["max"] > CHANGED * mhz["min"]}
+    if changed:
+        cores = ", ".join(
+            f"core {core} {mhz['min']:.0f} to {mhz['max']:.0f} MHz" for core, mhz in changed.items()
+        )
+        yield f"- the processor changed its frequency: {cores}"
+
+
+def _against(against: Document) -> Iterator[str]:
+    difference = against["first_difference"]
+    if difference is None:
+        yield f"- every message equals that of {against['folder']}"
+        return
+    missed = against["first_miss_tick"]
+    why = f"the first miss is at tick {missed}" if missed is not None else "neither run has a miss"
+    yield (
+        f"- diverges from {against['folder']} at tick {difference['tick']}, first in"
+        f" {difference['mailbox']}; {why}"
+    )
+    yield from (f"  - {line}" for line in against["why"])
+
+
+def _faults(report: RunReport) -> Blocks:
+    if faults := report.faults:
+        yield from ("", f"## Faults: {len(faults)}", "")
+        yield TextTable([_fault_row(fault) for fault in faults])
+    if restarts := ", ".join(f"{task} {count}" for task, count in report.restarts.items()):
+        yield from ("", f"Restarts: {restarts}.")
+    if unexplained := report.unexplained:
+        yield from ("", f"## Unexplained detections: {len(unexplained)}", "")
+        columns = {"tick": "tick", "found by": "board", "as": "code", "what": "text"}
+        yield TextTable(
+            [{head: found[key] for head, key in columns.items()} for found in unexplained]
+        )
+
+
+def _fault_row(fault: Document) -> dict[str, Cell]:
+    unit = "cycles" if fault["bound_ms"] is None else "ms"
+    after, bound = (
+        "-" if fault[f"{key}_{unit}"] is None else f"{fault[f'{key}_{unit}']:.3g} {unit}"
+        for key in ("delay", "bound")
+    )
+    recovered = "-" if fault["recovery_ms"] is None else f"{fault['recovery_ms']:.1f} ms"
+    seen = fault["seen"]
+    return {
+        "fault": fault["kind"],
+        "target": f"{fault['board']} {fault['mailbox'] or fault['joint']}".strip(),
+        "at tick": None if seen == "not struck" else fault["struck"],
+        "found as": (f"{fault['found_as']} by {fault['found_by']}" if seen == "detected" else seen),
+        "after": after,
+        "bound": bound,
+        "reactions": ", ".join(fault["reactions"]) or None,
+        "recovered after": recovered if fault["is_recovered"] else "not recovered",
+    }
+
+
+def _misses(report: RunReport) -> Blocks:
+    """Yield the first missed and skipped cycles, and why they are fewer than tasks counted."""
+    misses = report.misses
+    late, skipped = counted(misses)
+    which = f"{late} and {skipped}{_the_most(misses, 'first')}"
+    yield from ("", f"## Missed and skipped cycles: {which}", "")
+    if (late, skipped) != (report.missed, report.skipped):
+        of_all = f"{report.missed} and {report.skipped}"
+        why = "the recording does not hold all of it"
+        if report.rows_lost:
+            why = "the recorder lost rows"
+        yield from (f"The tasks counted {of_all}; {why}.", "")
+    rows = [
+        {
+            "tick": miss["tick"],
+            "task": miss["task"],
+            "what": miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
+            "started late, ms": decimal(miss.get("started_ms")),
+            "took, ms": decimal(miss.get("took_ms")),
+        }
+        for miss in misses[:SHOWN]
+    ]
+    yield TextTable(rows)
+
+
+def _response_along(response: Document) -> Blocks:
+    yield ""
+    bounds = (
+        f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
+    )
+    yield (
+        f"{' > '.join(response['levels'])}: {bounds}; on a fixed grid each level also waits for its"
+        " cycle."
+    )
+    yield ""
+    ways = {"command, down": response["command"], "status, up": response["status"]}
+    rows = [
+        {
+            "way": (
+                way
+                if len(found["levels"]) == len(response["levels"])
+                else f"{way} from {found['levels'][0]}"
+            ),
+            "measured p50": figure(found["measured_ms"], "p50"),
+            "measured max": figure(found["measured_ms"], "max"),
+            "bound": found["bound_ms"],
+            "": JUDGED[found["holds"]],
+        }
+        for way, found in ways.items()
+        if found["levels"]
+    ]
+    yield TextTable(rows)
+    for way, found in ways.items():
+        if beyond := found["beyond"]:
+            most = _the_most(beyond, "longest")
+            yield from ("", f"{way}: {len(beyond)} beyond the bound{most}:")
+        for each in sorted(beyond, key=lambda each: -each["ms"])[:SHOWN]:
+            why = "; ".join(each["delayed_by"]) or "no cause is recorded"
+            yield f"- {each['ms']:g} ms from tick {each['tick']}: {why}"
+        if unseen := found["unseen"]:
+            yield from ("", f"{way}: {unseen} not measured: messages are missing in the recording.")
+
+
+def _queues(queues: Sequence[Document]) -> Iterator[str]:
+    for queue in queues:
+        refused = f", {queue['refused']} refused" if queue["refused"] else ""
+        yield (
+            f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at"
+            f" most {queue['waiting']} waiting, room for {queue['capacity']}{refused}."
+        )
+
+
+def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
+    for board in boards:
+        lost = f", {board['lost']} lost" if board["lost"] else ""
+        latency = board["latency_us"]
+        took = (
+            f"; {latency['p50']:g} us from sending to the end of service, at most"
+            f" {latency['max']:g}"
+            if latency
+            else ""
+        )
+        yield (
+            f"Interrupts of {board['board']}: {board['served']} messages served, at most"
+            f" {board['waiting']} waiting, room for {board['depth']}{lost}{took}."
+        )
+
+
+def _passed(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
+    """Return what passed from side to side, and its ages."""
+    cells = [
+        {
+            **{name: count for name, count in row.items() if name != "age_ms"},
+            **{f"age {key}": figure(row["age_ms"], key) for key in ("p50", "p99", "max")},
+        }
+        for row in rows
+    ]
+    return TextTable(cells, dropped)
+
+
+def _network(network: Document | None) -> Blocks:
+    """Yield what passed over the network, and how often other racks were lost."""
+    if network is None:
+        return
+    yield from ("", "## Network, ages in ms of simulated time", "")
+    if imports := network["imports"]:
+        yield _passed(imports, ("disordered", "repeated", "superseded", "source"))
+    for row in network["exports"]:
+        yield f"- {row['entry']}: {row['source']} sent {row['sent']} times"
+    for row in network["peers"]:
+        times = (
+            f"lost {row['losses']} times, {row['lost_s']:g} s; restarted {row['restarts']} times"
+        )
+        yield f"- rack {row['peer']}: {row['state']}; {times}"

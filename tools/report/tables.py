@@ -1,0 +1,235 @@
+"""An analysis as data, analysis.json, and as text: tables of levels, tasks and equations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rack.boards.timing.level import LevelTiming
+from rack.boards.timing.rack import RackTiming
+from rack.boards.timing.trace_times import counts, distribution
+from rack.boards.timing.verdicts import EquationVerdict, verdicts
+from rack.tools.console.answer import Document
+from rack.tools.console.tables import Blocks
+from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
+from rack.tools.report.analysis import MOSTLY, Analysis, Pair
+from rack.tools.report.task_times import MS, task_times, times_table
+from rack.tools.timing.summary import tightest
+from rack.tools.timing.tables import level_table, verdict_table
+
+_Side = LevelTiming | EquationVerdict | None
+
+
+def document(analysis: Analysis) -> Document:
+    """Return everything as plain data; infinite numbers are null. report.json has restarts and
+    the system's response."""
+    recording = analysis.recording
+    config = recording.rack_config
+    return {
+        "rack": config.name,
+        "folder": str(recording.folder),
+        "mode": config.clock.mode,
+        "speed": config.clock.speed,
+        "clock_ms": config.clock.period_ms,
+        "context_switch_ms": config.timing.context_switch_ms,
+        "percentile": analysis.percentile,
+        "start_up_s": START_UP_S,
+        "rows_lost": {name: count for name, count in recording.lost.items() if count},
+        "gaps": [gap._asdict() for gap in recording.gaps()],
+        "untraced": recording.untraced(),
+        "kept": recording.kept_text or None,
+        "holds": analysis.holds,
+        "levels": {
+            name: _sides(analysis.predicted.levels.get(name), analysis.measured.levels.get(name))
+            for name in config.board
+        },
+        "tasks": {
+            name: task_document(cycles, analysis.predicted)
+            for name, cycles in analysis.cycles.items()
+        },
+        "core_loads": {f"core {core}": load for core, load in analysis.loads.items()},
+        "equations": [
+            {
+                "equation": pair.equation,
+                "subject": pair.subject,
+                **_sides(pair.predicted, pair.measured),
+                "disagrees": pair.disagrees,
+            }
+            for pair in analysis.pairs
+        ],
+        "mostly": {
+            "percentile": MOSTLY,
+            "failed": [
+                {"equation": p.equation, "subject": p.subject} for p in analysis.mostly if p.fails
+            ],
+        },
+    }
+
+
+def _sides(predicted: _Side, measured: _Side) -> Document:
+    sides = {"predicted": predicted, "measured": measured}
+    return {side: None if found is None else found.document() for side, found in sides.items()}
+
+
+def task_document(cycles: Cycles, rack: RackTiming) -> Document:
+    """Return the times of the judged cycles of one task, ms, as `task_times` of their processor
+    times."""
+    judged = cycles.is_judged
+    rows = cycles.rows[judged]
+    missed, skipped = counts(rows)
+    return {
+        "role": cycles.task.role,
+        "core": cycles.core,
+        "priority": cycles.priority,
+        "cycles": len(rows),
+        "start_up": len(cycles.rows) - len(rows) - cycles.stalled,
+        "stalled": cycles.stalled,
+        "missed": missed,
+        "skipped": skipped,
+        "used_ms": distribution(cycles.used_ns[judged] * MS),
+        "beside_ms": round(cycles.overhead_ns * MS, 6),
+        **task_times(
+            cycles.task,
+            rows,
+            rack.tick_ns,
+            rack.is_lockstep,
+            stretches=cycles.stretches[judged],
+            parts_ns=(cycles.process_ns[judged], cycles.communication_ns[judged]),
+        ),
+    }
+
+
+def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
+    """Yield an analysis as text: how the run ended, what held, and what to do; if verbose, every
+    level, task and equation."""
+    yield from _head(analysis)
+    if not is_verbose:
+        yield "--verbose shows every level, task and equation"
+        return
+    yield ""
+    yield (
+        f"Levels: processor time in ms, {_worst_words(analysis.percentile)}; t_residual is alpha of"
+        " eq. 3.6."
+    )
+    sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
+    names = analysis.recording.rack_config.board
+    yield level_table(
+        ((side, of[name]) for name in names for side, of in sides.items() if name in of), "side"
+    )
+    yield ""
+    yield "Tasks, ms: exec and comm are processor time; R of a planner is its time slice."
+    tasks = {
+        name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()
+    }
+    yield times_table(tasks, analysis.predicted.is_lockstep)
+    yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
+    yield verdict_table(
+        (side, verdict)
+        for pair in analysis.pairs
+        for side, verdict in (("predicted", pair.predicted), ("measured", pair.measured))
+        if verdict is not None
+    )
+
+
+def _worst_words(percentile: float) -> str:
+    return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
+
+
+def _head(analysis: Analysis) -> Iterator[str]:
+    config = analysis.recording.rack_config
+    pairs = [pair for pair in analysis.pairs if pair.measured is not None]
+    failing = [pair for pair in pairs if pair.fails]
+    yield f"{config.name}: {_ended(analysis)}"
+    if not failing:
+        yield f"all {len(pairs)} equations held"
+    else:
+        yield f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
+        yield f"failed: {_named(failing)}"
+        if analysis.percentile > MOSTLY:
+            mostly = [pair for pair in analysis.mostly if pair.fails]
+            yield f"failed in more than 1 of 100 cycles: {_named(mostly) or 'none'}"
+    if differing := [pair for pair in pairs if pair.disagrees]:
+        yield f"not as predicted: {_named(differing)}"
+    yield from tightest([pair.measured for pair in pairs if pair.measured is not None])
+    yield _advice(analysis, failing)
+    if not analysis.predicted.levels:
+        yield "no prediction: the config has no budgets (board.<name>.budget)"
+    if analysis.predicted.is_lockstep:
+        yield "lockstep: no deadlines, no lateness; processor times are real"
+    if restarted := restarts(analysis.recording):
+        yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
+    yield from _left_out(analysis)
+
+
+def _left_out(analysis: Analysis) -> Iterator[str]:
+    """Yield whatever was not judged."""
+    config = analysis.recording.rack_config
+    measured = analysis.measured.levels
+    if silent := ", ".join(name for name in config.board if name not in measured):
+        yield f"never ran: {silent}"
+    if planless := ", ".join(
+        level.board
+        for level in measured.values()
+        if level.planning_ns is None and level.coupling != "none"
+    ):
+        yield f"made no plan: {planless}"
+    yield (
+        f"the first {START_UP_S:g} s of each process are not judged; t_cs is"
+        f" {config.timing.context_switch_ms:g} ms"
+    )
+    if stalled := ", ".join(
+        f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled
+    ):
+        yield f"cycles with a stall in them are not judged: {stalled}"
+    for name, (traced, ran) in analysis.recording.untraced().items():
+        yield f"{name}: judged by {traced:,} of {ran:,} cycles"
+    yield from (
+        f"{count} rows of {name} were lost"
+        for name, count in analysis.recording.lost.items()
+        if count
+    )
+    yield from map(str, analysis.recording.gaps())
+    if kept := analysis.recording.kept_text:
+        yield kept
+
+
+def _ended(analysis: Analysis) -> str:
+    """Return how the run ended, and the cycles that it missed."""
+    ended = analysis.recording.ended
+    cause = ended.get("outcome", {}).get("cause", "no end recorded")
+    counts = ended.get("tasks", {}).values()
+    missed = sum(count["missed"] for count in counts)
+    skipped = sum(count["skipped"] for count in counts)
+    if not missed + skipped:
+        return f"{cause}, no cycle missed or skipped"
+    return f"{cause}, {missed} cycles missed, {skipped} skipped"
+
+
+def _advice(analysis: Analysis, failing: list[Pair]) -> str:
+    """Return what to do about equations that failed, or about a run that failed without them."""
+    folder = analysis.recording.folder
+    if not failing:
+        outcome = analysis.recording.ended.get("outcome", {"cause": "time over"})
+        if outcome.get("faults") or outcome["cause"] not in ("task done", "time over"):
+            return f"to do: rack report {folder} says why the run failed; its timing held"
+        return "to do: nothing"
+    if any(pair.fails for pair in analysis.mostly):
+        if all(verdict.holds for verdict in verdicts(analysis.measured)):
+            return "to do: nothing about the config: its levels' own times fit; see --verbose"
+        return (
+            f"to do: rack check CONFIG --from {folder} lists changes that make it fit, if there are"
+            " any"
+        )
+    return (
+        "to do: nothing about the config: it failed in single cycles; --percentile 99 leaves them"
+        " out"
+    )
+
+
+def _named(pairs: list[Pair]) -> str:
+    """Return equations by subject: "servo 3.1, 3.6; core 1 load"."""
+    subjects = dict.fromkeys(pair.subject for pair in pairs)
+    named = {
+        name: ", ".join(pair.equation for pair in pairs if pair.subject == name)
+        for name in subjects
+    }
+    return "; ".join(f"{name} {equations}" for name, equations in named.items())

@@ -1,0 +1,138 @@
+"""Times of the cycles of tasks: as data, and as the one table that `rack report` and `rack analyze`
+show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rack.backplane.layout import TaskSpec
+from rack.boards.timing.trace_times import (
+    communication_ns,
+    distribution,
+    execution_ns,
+    gaps_ns,
+    lateness_ns,
+    residual_ns,
+)
+from rack.tools.console.answer import Document
+from rack.tools.console.tables import Blocks, TextTable, decimal, figure
+from rack.tools.report.run_report import RunReport
+
+MS = 1e-6
+BY_THE_CLOCK = {
+    "late p50": ("lateness_ms", "p50"),
+    "late p99": ("lateness_ms", "p99"),
+    "late max": ("lateness_ms", "max"),
+    "residual min": ("residual_ms", "min"),
+    "deviation": ("deviation_ms", ""),
+    "alpha": ("alpha_ms", ""),
+}
+"""Columns of times relative to a release or a time slice, which mean nothing in lockstep: the entry
+of a task, and the figure of its distribution."""
+USED = {
+    "exec p50": ("execution_ms", "p50"),
+    "exec p99": ("execution_ms", "p99"),
+    "exec max": ("execution_ms", "max"),
+    "comm p99": ("communication_ms", "p99"),
+    "proc p99": ("processor_ms", "p99"),
+    "plan age max": ("plan_age_ms", "max"),
+}
+DROPPED = (
+    "deviation",
+    "comm p99",
+    "proc p99",
+    "late p50",
+    "exec p50",
+    "alpha",
+    "late p99",
+    "exec p99",
+    "plan age max",
+    "R",
+    "cycles",
+)
+"""Columns that a narrow terminal leaves out, the first of them first."""
+
+
+def task_times(
+    task: TaskSpec,
+    cycles: np.ndarray,
+    period_ns: int,
+    is_lockstep: bool,
+    *,
+    stretches: np.ndarray,
+    parts_ns: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Document:
+    """Return the times of a task's traced cycles, ms (eq. 3.5: R = t_exec + t_comm + t_residual).
+
+    `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and
+    preemption. A planner's cycles are its plans, and its R is their time slice. In lockstep a tick
+    lasts as long as its tasks take: everything relative to a release or a time slice is None.
+
+    Args:
+        task: The task.
+        cycles: Its trace records, shape (n,).
+        period_ns: One tick of the wall clock.
+        is_lockstep: Whether the run was in lockstep.
+        stretches: As in `gaps_ns`, shape (n,).
+        parts_ns: t_exec and t_comm of each cycle; None: as traced, by the wall clock.
+    """
+    slice_ns = task.slice * period_ns
+    gaps = gaps_ns(cycles, stretches)
+    execution, communication = parts_ns or (execution_ns(cycles), communication_ns(cycles))
+    by_the_clock: Document = {
+        "lateness_ms": distribution(lateness_ns(cycles) * MS),
+        "residual_ms": distribution(residual_ns(cycles, slice_ns) * MS),
+        "largest_gap_ms": round(float(gaps.max()) * MS, 6) if len(gaps) else None,
+        "alpha_ms": None,
+        "deviation_ms": None,
+    }
+    if len(cycles):
+        # Eq. 3.6: alpha is the residual guaranteed in the worst cycle, though the longest execution
+        # and the longest communication may fall into different ones; smooth motion needs a small
+        # deviation.
+        alpha_ns = slice_ns - int(execution.max()) - int(communication.max())
+        by_the_clock["alpha_ms"] = round(alpha_ns * MS, 6)
+        by_the_clock["deviation_ms"] = round(float((execution + communication).std()) * MS, 6)
+    return {
+        "traced": len(cycles),
+        "slice_ms": slice_ns * MS,
+        "execution_ms": distribution(execution * MS),
+        "communication_ms": distribution(communication * MS),
+        "processor_ms": distribution(cycles["processor_ns"] * MS),
+        **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
+    }
+
+
+def times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
+    """Return a line per task, without what means nothing in lockstep."""
+    columns = USED if is_lockstep else BY_THE_CLOCK | USED
+    rows = [
+        {
+            "task": name,
+            "R": task["slice_ms"],
+            **{key: task.get(key) for key in ("cycles", "missed", "skipped")},
+            **{
+                column: figure(task.get(key), part) if part else decimal(task[key])
+                for column, (key, part) in columns.items()
+            },
+        }
+        for name, task in tasks.items()
+    ]
+    return TextTable(rows, DROPPED)
+
+
+def times_text(report: RunReport) -> Blocks:
+    """Yield the table of cycles."""
+    is_lockstep = report.mode == "lockstep"
+    yield from ("", "## Cycles, ms", "")
+    if is_lockstep:
+        yield (
+            "In lockstep a tick lasts as long as its tasks take: there are no deadlines, no"
+            " lateness, no residuals."
+        )
+        yield ""
+    for name, (traced, ran) in report.untraced.items():
+        yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
+    yield times_table(report.tasks, is_lockstep)
