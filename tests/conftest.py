@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rack.boards.crate import line
-from rack.tools.recording import recorder_process
+from rack.tools.recording.recorder import process as recorder_process
 from tests import warm
 from tests.machine import stolen, turn
 

@@ -19,17 +19,9 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, View, named_here, option
 from rack.tools.launch.folder import folder_of
 from rack.tools.recording.checksums import CHECKSUMS
-from rack.tools.recording.parquet import CONFIG, PUBLISHED
-from rack.tools.recording.recorder_process import (
-    CODE,
-    ORIGIN,
-    SPOOL,
-    RecorderProcess,
-    recorded_line,
-    size_of,
-    size_text,
-    sizes,
-)
+from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, PUBLISHED, SPOOL
+from rack.tools.recording.folder_size import recorded_line, size_of, size_text, sizes
+from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import EVENTS, mend
 from rack.tools.recording.spool import STRETCHES, stretch_files

@@ -13,7 +13,7 @@ from rack.tools.console.parameters import argument, option
 from rack.tools.console.progress import reading_progress
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.divergence import other_run
-from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackPlace, on_one_time_line, side_by_side
 from rack.tools.viewer.parts import FILE, parts_of

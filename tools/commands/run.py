@@ -177,7 +177,7 @@ def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
 def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> Document:
     """Make the report, print it and return it. A run that has no report where one is wanted has
     failed."""
-    from rack.tools.recording.recorder_process import recorded_line
+    from rack.tools.recording.folder_size import recorded_line
     from rack.tools.report.report import unrecorded, write_report
     from rack.tools.report.report_markdown import summary
     from rack.tools.report.stored import print_report

@@ -16,7 +16,8 @@ from rack.tools.console.parameters import Json, named_here, rack_names
 from rack.tools.console.tables import console
 from rack.tools.launch.display import RackView
 from rack.tools.monitor.snapshot import RackMonitor
-from rack.tools.recording.recorder_process import SPOOL, recorded_line, size_of
+from rack.tools.recording.file_names import SPOOL
+from rack.tools.recording.folder_size import recorded_line, size_of
 
 OnlyRack = Annotated[
     str | None,

@@ -39,8 +39,8 @@ from rack.tools.launch.display import Display
 from rack.tools.launch.launch import Beginning, run_rack
 from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
 from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
+from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.origin import Origin, check_code, continued_at
-from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
 WHY_NOT = (

@@ -29,7 +29,7 @@ from rack.tools.monitor.newest_messages import Newest
 from rack.tools.monitor.queues import queue_fills
 from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.recording.origin import Origin, write_code
-from rack.tools.recording.recorder_process import RecorderProcess
+from rack.tools.recording.recorder.process import RecorderProcess
 
 COUNTED = (
     "CYCLES",

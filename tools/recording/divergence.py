@@ -11,8 +11,8 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.tools.console.answer import Failure
+from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.origin import Origin
-from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recording import Recording
 
 HEADS = ("serial", "tick", "visible_at", "chain")

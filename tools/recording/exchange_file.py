@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from rack.backplane.json_text import encode_json
 from rack.backplane.layout import MailboxSpec
 from rack.tools.console.answer import Document
-from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import signals_of
 

@@ -23,7 +23,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.events import CONTINUES
 from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.checksums import read_file
-from rack.tools.recording.recorder_process import CODE, ORIGIN
+from rack.tools.recording.file_names import CODE, ORIGIN
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording

@@ -26,9 +26,6 @@ from rack.backplane.trace import FIELDS
 from rack.tools.recording.cores import CoreRecord
 
 TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
-CONFIG = "config.toml"
-PUBLISHED = "published.json"
-"""Facts about the rack's levels: see `rack.boards.config.published`."""
 HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
 """Columns that the messages of all mailboxes have; the first of a table, after `TIME`."""
 TIME = "time_s"

@@ -33,15 +33,8 @@ from rack.tools.recording.checksums import (
     read_line,
 )
 from rack.tools.recording.cores import CoreRecord
-from rack.tools.recording.parquet import (
-    CONFIG,
-    HEAD,
-    PART,
-    PUBLISHED,
-    SIGNALS,
-    TABLE,
-    columns_of,
-)
+from rack.tools.recording.file_names import CONFIG, PUBLISHED
+from rack.tools.recording.parquet import HEAD, PART, SIGNALS, TABLE, columns_of
 from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, find_missing, mend
 from rack.tools.recording.spool import STRETCHES, rings
 

@@ -18,8 +18,8 @@ from rack.backplane.segment import Launch, Segment
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
+from rack.tools.recording.file_names import SPOOL
 from rack.tools.recording.parquet import SIGNALS, CyclesFile, signal_tables
-from rack.tools.recording.recorder_process import LOOK_S, SPOOL
 from rack.tools.recording.spool import (
     OPEN,
     STRETCHES,
@@ -39,6 +39,8 @@ TABLES = (CYCLES, f"{SIGNALS}/*/*")
 """Patterns of the files that hold rows."""
 EVENTS = "events.jsonl"
 MENDED = "-mended"
+POLL_S = 0.2
+"""Time between two attempts to lock the spool of a recorder that finishes."""
 FINISH_S = 20.0
 """Longest wait for a recorder that finishes without its launcher."""
 
@@ -245,7 +247,7 @@ def _lock(file: IO[bytes], path: Path) -> None:
             raise Failure(f"{path}: another recorder is running there")
         if time.monotonic() > deadline:
             raise Failure(f"{path}: its recorder has not finished within {FINISH_S:g} s")
-        time.sleep(LOOK_S)
+        time.sleep(POLL_S)
 
 
 def _is_running(layout: Layout, launch: Launch) -> bool:

@@ -42,8 +42,7 @@ from rack.tools.recording.checksums import (
     is_cut_off,
     read_line,
 )
-from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder_process import CODE, ORIGIN, SPOOL
+from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, SPOOL
 
 FLUSH_S = 0.1
 """SIGKILL of all processes loses what boards wrote in this time, between two drains, and in one or

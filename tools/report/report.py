@@ -22,6 +22,7 @@ from rack.tools.monitor.interrupts import interrupts
 from rack.tools.monitor.network import BOARD, COUNTS, STATUS, exchanged
 from rack.tools.monitor.queues import queues
 from rack.tools.recording.checksums import Checksums
+from rack.tools.recording.folder_size import sizes
 from rack.tools.recording.history import (
     counted,
     fired_rows,
@@ -31,7 +32,6 @@ from rack.tools.recording.history import (
     steal,
 )
 from rack.tools.recording.origin import Origin
-from rack.tools.recording.recorder_process import sizes
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import stalls_of
 from rack.tools.report import arm_outcome

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rack.tools.console.answer import Document, Failure, print_json
 from rack.tools.recording.checksums import Checksums, read_file
-from rack.tools.recording.recorder_process import SPOOL
+from rack.tools.recording.file_names import SPOOL
 
 FILES = ("report.json", "report.md")
 RECORDED = ("config.toml", "cycles.parquet", "signals", "events.jsonl")

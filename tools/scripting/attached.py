@@ -28,8 +28,8 @@ from rack.tools.monitor.desk import LiveDesk
 from rack.tools.monitor.replies import Reply
 from rack.tools.monitor.signals import SignalTap
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot
-from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder_process import RecorderProcess
+from rack.tools.recording.file_names import CONFIG
+from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.signal import Signal, Trigger, mailbox_of
 
 LOOK_S = 0.001

@@ -13,7 +13,7 @@ import pytest
 
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import Checksums
-from rack.tools.recording.recorder_process import ORIGIN
+from rack.tools.recording.file_names import ORIGIN
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
 from tests.conftest import SMALL

@@ -20,9 +20,9 @@ from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS, checked_line, read_line
-from rack.tools.recording.parquet import CONFIG, HEAD
+from rack.tools.recording.file_names import CONFIG, SPOOL
+from rack.tools.recording.parquet import HEAD
 from rack.tools.recording.recorder.recorder import Recorder
-from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
 from tests.shared_runs import small_run

@@ -22,10 +22,9 @@ from rack.tools.launch.display import Display
 from rack.tools.launch.launch import RunResult, run_rack
 from rack.tools.monitor.snapshot import Snapshot
 from rack.tools.recording.divergence import first_difference
+from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.occasions import Retention
-from rack.tools.recording.parquet import CONFIG
 from rack.tools.recording.recorder.recorder import Recorder
-from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import find_missing, tally
 from rack.tools.recording.spool import STRETCHES

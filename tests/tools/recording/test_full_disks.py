@@ -18,8 +18,7 @@ from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
-from rack.tools.recording.parquet import CONFIG
-from rack.tools.recording.recorder_process import SPOOL
+from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.recording import Recording
 from tests.processes import children_of
 from tests.tools.command_line import rack

@@ -18,11 +18,10 @@ from rack.boards.config import RackConfig, load, wire
 from rack.tools.console.answer import Failure
 from rack.tools.launch.display import Display
 from rack.tools.launch.launch import NO_RECORDER, run_rack
-from rack.tools.recording import recorder_process
 from rack.tools.recording.checksums import Checksums
-from rack.tools.recording.parquet import CONFIG
+from rack.tools.recording.file_names import CONFIG, SPOOL
+from rack.tools.recording.recorder import process as recorder_process
 from rack.tools.recording.recorder.recorder import Recorder
-from rack.tools.recording.recorder_process import SPOOL
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.run_files import mend
 from rack.tools.recording.spool import Spool, locked

@@ -20,8 +20,8 @@ from rack.backplane.segment import Segment
 from rack.boards.config import load
 from rack.boards.config.toml import override
 from rack.boards.events import Event
-from rack.tools.recording import recorder_process
-from rack.tools.recording.recorder_process import RecorderProcess
+from rack.tools.recording.recorder import process as recorder_process
+from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.recording import Recording
 from rack.tools.scripting.settings import settings_of
 from tests.boards.commanded_racks import COMMANDED

@@ -39,8 +39,8 @@ def main() -> None:
     launcher = os.getppid()
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
+    from rack.tools.recording.recorder.process import UNWRITABLE, unwritable
     from rack.tools.recording.recorder.recorder import Recorder, SafeSink
-    from rack.tools.recording.recorder_process import UNWRITABLE, unwritable
 
     # It takes half a second. A thread begins with it while the rack is being launched.
     Thread(target=_import_view, daemon=True).start()

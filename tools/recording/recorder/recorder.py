@@ -21,10 +21,10 @@ from rack.boards.config.layout import KEPT_S
 from rack.tools.console.answer import write_file
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
+from rack.tools.recording.file_names import PUBLISHED
 from rack.tools.recording.occasions import Retention
-from rack.tools.recording.parquet import PUBLISHED
 from rack.tools.recording.recorder.flight import FlightRecorder
-from rack.tools.recording.recorder_process import LOOK_S, IdleLooks
+from rack.tools.recording.recorder.process import LOOK_S, IdleLooks
 from rack.tools.recording.run_files import TABLES, RunFiles, Tally
 from rack.tools.recording.spool import Spool, rings
 

@@ -18,12 +18,6 @@ from rack.tools.console.answer import Failure
 
 VIEW = "rack.tools.viewer.sink:ViewSink"
 """What shows a recording, by name: recording itself needs none of it."""
-SPOOL = "recorder.spool"
-"""Name of the file that a recorder has open in the folder of its run."""
-ORIGIN = "origin.json"
-"""Name of the file, there, that says which run this one goes on from."""
-CODE = "code.json"
-"""Name of the file, there, that says with which code and files it was made."""
 BEGUN = "recording"
 """Printed by the recorder when it has attached."""
 ATTACH_S = 30.0
@@ -35,8 +29,7 @@ on a loaded machine it is slow, but never idle. Fewer for one that a signal has 
 seconds: Ctrl-Z stops both processes.
 """
 LOOK_S = 0.2
-RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json", CODE)
-"""Endings of the names of a recording's files, whose number and size no report changes."""
+"""Shortest time between two such looks."""
 RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
 """Exit status of a recorder whose files cannot be written, as on a full disk: another one could not
@@ -228,31 +221,3 @@ class RecorderProcess:
         self._has_begun |= BEGUN in texts
         self._lines += [line for line in texts if line != BEGUN]
         return bool(block)
-
-
-def size_of(folder: Path) -> int:
-    """Return the bytes of what is recorded of a run, without reports and pictures."""
-    size = 0
-    for file in folder.rglob("*"):
-        # A flight recorder removes some.
-        with suppress(FileNotFoundError):
-            if file.name.endswith(RECORDED) and file.is_file():
-                size += file.stat().st_size
-    return size
-
-
-def size_text(size: int, lasted_s: float) -> str:
-    """Return the bytes of a recording, and of a second of it, as text."""
-    rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
-    return f"{size * 1e-6:.1f} MB{rate}"
-
-
-def recorded_line(folder: Path, lasted_s: float) -> str:
-    """Return where a run is recorded, and how large that is, as text."""
-    return f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
-
-
-def sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
-    """Return the bytes of a recording, and of a second of it, for programs."""
-    size = size_of(folder)
-    return {"bytes": size, "bytes_per_s": round(size / lasted_s, 1) if lasted_s else None}

@@ -1,0 +1,39 @@
+"""The size of a recording."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+from rack.tools.recording.file_names import CODE
+
+RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json", CODE)
+"""Endings of the names of recorded files. Reports and pictures have other endings."""
+
+
+def size_of(folder: Path) -> int:
+    """Return the bytes of what is recorded of a run, without reports and pictures."""
+    size = 0
+    for file in folder.rglob("*"):
+        # A flight recorder removes some.
+        with suppress(FileNotFoundError):
+            if file.name.endswith(RECORDED) and file.is_file():
+                size += file.stat().st_size
+    return size
+
+
+def size_text(size: int, lasted_s: float) -> str:
+    """Return the bytes of a recording, and of a second of it, as text."""
+    rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
+    return f"{size * 1e-6:.1f} MB{rate}"
+
+
+def recorded_line(folder: Path, lasted_s: float) -> str:
+    """Return where a run is recorded, and how large that is, as text."""
+    return f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
+
+
+def sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
+    """Return the bytes of a recording, and of a second of it, for programs."""
+    size = size_of(folder)
+    return {"bytes": size, "bytes_per_s": round(size / lasted_s, 1) if lasted_s else None}
