@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from tests.conftest import SMALL
 
 SMALL_S = 4.0

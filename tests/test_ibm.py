@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
 

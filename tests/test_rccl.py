@@ -11,8 +11,8 @@ import pytest
 
 from rack.backplane.message import State
 from rack.boards.config import load
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 
 pytestmark = pytest.mark.thorough

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.report.report import write_report
 from tests.boards.commanded_racks import commands
 from tests.boards.vector_racks import JOINTED, NAMES

@@ -19,7 +19,7 @@ from rack.levels.tables import LAST_TICK
 from rack.tools.console.answer import MAX_LINE, Failure, as_failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Anyway, Json, RunFolder
-from rack.tools.launch.display import display_for
+from rack.tools.monitor.display import display_for
 from rack.tools.scripting.rewound import Glance, RewoundRun
 
 USAGE = {

@@ -127,10 +127,10 @@ def run(
     read = assembled(config, overrides, faults)
     crate = _informed(context.obj, read.tables)
     from rack.boards.config.loader import validated
-    from rack.tools.launch.display import display_for
     from rack.tools.launch.folder import folder_of
     from rack.tools.launch.launch import NO_TIME, Beginning, run_rack
     from rack.tools.launch.verdict import headline
+    from rack.tools.monitor.display import display_for
 
     if entries is not None:
         from rack.tools.recording.entries import recorded_entries

@@ -14,7 +14,7 @@ from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import Json, named_here, rack_names
 from rack.tools.console.tables import console
-from rack.tools.launch.display import RackView
+from rack.tools.monitor.display import RackView
 from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.recording.file_names import SPOOL
 from rack.tools.recording.folder_size import recorded_line, size_of

@@ -39,7 +39,7 @@ def top(rack: OnlyRack = None) -> None:
     """
     from rack.backplane.segment import Segment
     from rack.tools.console.tables import console
-    from rack.tools.launch.display import display_for
+    from rack.tools.monitor.display import display_for
     from rack.tools.monitor.snapshot import RackMonitor
 
     ended = threading.Event()

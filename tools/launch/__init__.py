@@ -1,1 +1,1 @@
-"""Starting a rack, showing it while it runs, and ending it with a verdict."""
+"""Starting a rack, and ending it with a verdict."""

@@ -35,8 +35,8 @@ from rack.boards.errors import UNKEPT
 from rack.boards.wiring import Continuation, Entries, SnapshotPolicy
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import Beginning, run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
 from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
 from rack.tools.recording.file_names import CONFIG

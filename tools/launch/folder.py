@@ -13,7 +13,7 @@ from typing import TextIO
 
 from rack.boards.events import Event, order_key
 from rack.tools.console.answer import Document, Failure
-from rack.tools.launch.display import Display
+from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import checked_line
 
 RUNS = Path("runs")

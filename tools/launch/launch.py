@@ -20,10 +20,10 @@ from rack.boards.wiring import Continuation, Entries
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, strikes
-from rack.tools.launch.display import Display
 from rack.tools.launch.folder import EventLog
 from rack.tools.launch.other_racks import OtherEnd, OtherRacks
 from rack.tools.launch.verdict import list_failures
+from rack.tools.monitor.display import Display
 from rack.tools.monitor.holds import Standstill
 from rack.tools.monitor.newest_messages import Newest
 from rack.tools.monitor.queues import queue_fills

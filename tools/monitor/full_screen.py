@@ -29,7 +29,7 @@ from rack.boards.timing.trace_times import lateness_ns
 from rack.tools.console.answer import Failure, as_failure
 from rack.tools.console.tables import GAP, grid
 from rack.tools.faults.live import LiveRack
-from rack.tools.launch import display
+from rack.tools.monitor import display
 from rack.tools.monitor.desk import LiveDesk, goal_of
 from rack.tools.monitor.message_text import DROPPED, list_mailboxes
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot

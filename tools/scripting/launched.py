@@ -14,9 +14,9 @@ from rack.boards import Rack as CrateRack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
-from rack.tools.launch.display import Display
 from rack.tools.launch.folder import EventLog, folder_of
 from rack.tools.launch.launch import NO_RECORDER, begin_folder, compare_recording, result_of
+from rack.tools.monitor.display import Display
 from rack.tools.monitor.holds import Standstill
 from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.scripting.settings import settings_of

@@ -18,9 +18,9 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure, as_failure
 from rack.tools.console.tables import fitted
 from rack.tools.launch.continued import RunAgain, branched, tick_in
-from rack.tools.launch.display import Display, event_text
 from rack.tools.launch.folder import folder_of
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display, event_text
 from rack.tools.monitor.message_text import MessageText
 from rack.tools.monitor.signals import cell
 from rack.tools.recording.divergence import first_difference, ticks_of

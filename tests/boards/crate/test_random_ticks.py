@@ -18,8 +18,8 @@ from rack.boards.events import Event
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.lab.benches.observed import record
 from rack.tools.launch.continued import RunAgain
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from tests import golden
 from tests.conftest import EXHAUSTIVE

@@ -10,8 +10,8 @@ import pytest
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config import load
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.report.analysis import Analysis
 from tests.tools.analysis_text import brief, text
 from tests.tools.command_line import rack

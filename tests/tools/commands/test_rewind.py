@@ -16,8 +16,8 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.events import CONTINUES, Event
 from rack.tools.launch.continued import RunAgain
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from tests.boards.remembering_racks import REMEMBERING
 from tests.processes import descriptors

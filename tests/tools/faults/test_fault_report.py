@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.report.report import write_report
 from rack.tools.report.report_markdown import markdown
 from rack.tools.viewer.reading import read

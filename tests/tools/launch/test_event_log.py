@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from rack.boards.events import Event
-from rack.tools.launch.display import Display
 from rack.tools.launch.folder import EventLog
+from rack.tools.monitor.display import Display
 
 KNOWN = (("launch", -1), ("died", 2800), ("rejoined", 3000), ("brakes", 2801), ("opened", 3000))
 """Codes and ticks, as they become known."""

@@ -17,8 +17,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, load, resolve
 from rack.boards.config.commands import asked, request
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import Beginning, run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import Snapshot
 from rack.tools.recording.divergence import first_difference
 from rack.tools.recording.entries import commands_from, recorded_commands

@@ -17,7 +17,7 @@ from rack.backplane.segment import Segment, unlink
 from rack.boards.config.loader import loads
 from rack.boards.config.resolved import wire
 from rack.levels.peer import Presence
-from rack.tools.launch.display import RackView
+from rack.tools.monitor.display import RackView
 from rack.tools.monitor.network import (
     ExportRow,
     ImportRow,

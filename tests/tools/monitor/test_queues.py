@@ -9,8 +9,8 @@ import pytest
 from rack.boards import Rack
 from rack.boards.config import load, wire
 from rack.tools.console.tables import render_text
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.monitor.newest_messages import Newest
 from rack.tools.monitor.queues import queue_fills
 from rack.tools.report.report import write_report

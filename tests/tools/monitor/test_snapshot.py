@@ -15,8 +15,8 @@ from rack.backplane.segment import Segment, unlink
 from rack.backplane.words import Block, Demand, System, TaskState
 from rack.boards.config import load, wire
 from rack.boards.config.injections import injections
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot, TaskRow
 from rack.tools.report.report import write_report
 

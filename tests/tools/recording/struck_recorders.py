@@ -16,7 +16,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig
 from rack.boards.events import Event
-from rack.tools.launch.display import Display
+from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import Snapshot
 from rack.tools.recording.recording import Recording
 from tests.warm import programs

@@ -10,8 +10,8 @@ import pytest
 
 from rack.backplane.trace import Flag
 from rack.boards.config import load
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording import cores
 from rack.tools.recording.cores import UNMEASURED, CoreMeter, CoreRecord, Stolen
 from rack.tools.recording.recording import Recording

@@ -13,8 +13,8 @@ from rack.backplane.trace import Flag
 from rack.boards.config import RackConfig, load
 from rack.boards.timing.tasks import Budget
 from rack.tools.console.answer import Failure
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cycles import measured_budgets
 from rack.tools.recording.recording import Recording

@@ -18,8 +18,8 @@ from rack.boards.config import RackConfig, load
 from rack.tools.commands.record import save_run
 from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import RunResult, run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import Snapshot
 from rack.tools.recording.divergence import first_difference
 from rack.tools.recording.file_names import CONFIG, SPOOL

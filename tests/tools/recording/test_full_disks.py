@@ -16,8 +16,8 @@ import pytest
 from rack.backplane.segment import racks
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.recording import Recording
 from tests.processes import children_of

@@ -14,8 +14,8 @@ from rack.boards import Rack
 from rack.boards.config import load
 from rack.tools.commands.status import recorded_by
 from rack.tools.console.answer import Failure
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import report_of

@@ -16,8 +16,8 @@ from rack.backplane.trace import RECORD
 from rack.boards import Rack
 from rack.boards.config import RackConfig, load, wire
 from rack.tools.console.answer import Failure
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import NO_RECORDER, run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.recorder import process as recorder_process

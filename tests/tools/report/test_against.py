@@ -12,8 +12,8 @@ import pytest
 
 from rack.boards.config import load
 from rack.tools.launch.continued import RunAgain, branched
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import checked_line, read_line
 from rack.tools.recording.recording import Recording
 from rack.tools.report.against import compared

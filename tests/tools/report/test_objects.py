@@ -9,8 +9,8 @@ import pytest
 
 from rack.boards.config import load, resolve
 from rack.boards.errors import ConfigError
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.report.report import write_report
 from tests.tools.command_line import rack
 

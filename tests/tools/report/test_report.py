@@ -18,9 +18,9 @@ from rack.levels.systems.force.messages import ForceStatus, Wrench
 from rack.levels.systems.hand.messages import HandStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.console.tables import show_blocks
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
 from rack.tools.launch.verdict import ACROSS_RACKS, judge_run
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from rack.tools.report import arm_outcome
 from rack.tools.report.report import report_of, write_report

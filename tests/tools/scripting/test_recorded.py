@@ -14,8 +14,8 @@ import rack
 from rack.boards import Rack
 from rack.boards.config import load
 from rack.boards.events import Event
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import checked_line
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED

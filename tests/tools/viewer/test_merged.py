@@ -12,8 +12,8 @@ from rerun.chunk import RrdReader
 
 from rack.boards.config import load
 from rack.tools.launch.continued import RunAgain, branched
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import on_one_time_line
 from rack.tools.viewer.merged import write_merged

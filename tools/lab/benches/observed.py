@@ -10,8 +10,8 @@ import numpy as np
 
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.boards.timing.trace_times import lateness_ns, skipped
-from rack.tools.launch.display import Display
 from rack.tools.launch.launch import RunResult, run_rack
+from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 
 SETTLE_NS = 250_000_000

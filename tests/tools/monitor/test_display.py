@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from rack.boards.events import Event
-from rack.tools.launch.display import COLUMNS, PlainDisplay, RackView, line_of
+from rack.tools.monitor.display import COLUMNS, PlainDisplay, RackView, line_of
 from rack.tools.monitor.holds import Hold
 from rack.tools.monitor.snapshot import Snapshot, TaskProgress, TaskRow
 
