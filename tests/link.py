@@ -40,12 +40,14 @@ class Seen(NamedTuple):
 class WritingTask:
     """The task `writer`: each of its messages holds its release tick in every place."""
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, is_compiled: bool = True) -> None:
         self.every = segment.layout.task("writer").every
         alarms = AlarmWriter(segment, "writer")
         self.level = BareLevel()
         inputs = InputPorts(segment, self.level, {}, alarms)
-        self.ports = OutputPorts(segment, self.level, {"point": NAME}, alarms, inputs)
+        self.ports = OutputPorts(
+            segment, self.level, {"point": NAME}, alarms, inputs, is_compiled=is_compiled
+        )
         self._block, self._trace = segment.block("writer"), TraceWriter(segment, "writer")
 
     def cycle(self, tick: int, now: int | None = None) -> bool:
@@ -72,7 +74,7 @@ class WritingTask:
 class ReadingTask:
     """The task `reader`; `seen` is what its reads gave."""
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, is_compiled: bool = True) -> None:
         self.every = segment.layout.task("reader").every
         self.level = BareLevel()
         self.ports = InputPorts(
@@ -81,6 +83,7 @@ class ReadingTask:
             {"point": NAME},
             AlarmWriter(segment, "reader"),
             inbox=open_inbox(segment, "reader"),
+            is_compiled=is_compiled,
         )
         self.seen: list[Seen] = []
 
@@ -99,9 +102,12 @@ class Link:
     """Both tasks. When both are due the reader comes first, or the writer, as their processors have
     it."""
 
-    def __init__(self, segment: Segment, reader_first: bool = False) -> None:
+    def __init__(
+        self, segment: Segment, reader_first: bool = False, is_compiled: bool = True
+    ) -> None:
         self.segment = segment
-        self.writer, self.reader = WritingTask(segment), ReadingTask(segment)
+        self.writer = WritingTask(segment, is_compiled)
+        self.reader = ReadingTask(segment, is_compiled)
         self.active: list[FaultEntry] = []
         self._reader_first = reader_first
         self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
@@ -211,11 +217,12 @@ def links(rack: str) -> Iterator[MakeLink]:
         reader_first: bool = False,
         depth: int = 1024,
         cycles: int = 1,
+        is_compiled: bool = True,
     ) -> Link:
         box = mailbox(protocol, every=cycles * rates[0], delay=rates[0], depth=depth)
         tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
         segment = Segment.create(layout(f"{rack}-{len(made)}", [box], tasks), "")
-        made.append(Link(segment, reader_first))
+        made.append(Link(segment, reader_first, is_compiled))
         return made[-1]
 
     yield make

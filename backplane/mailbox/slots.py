@@ -5,10 +5,15 @@ one store of its serial in the mailbox's head. A writer killed at any instructio
 published message intact. A reader checks serial and checksum of its copy, so it never returns half
 a message.
 
-Memory order: the one writer fills the slot before it stores the head's serial. On x86-64 other
-cores see stores in that order. On weaker machines a reader may see the serial first: its copy then
-fails the check, or holds another serial, and the read steps back to the message before. Words are
-aligned to 8 bytes, so they are never torn.
+Memory order: the one writer fills a slot, then stores the head's serial with release; a reader
+loads the serial with acquire before it copies the slot, so it sees all of it. A copy may still be
+torn by a writer that laps the reader: the checksum shows that. Before a reader concludes from a
+head that a slot has not been reused (`keeps`), its copy is complete; in turn the writer fills no
+slot before the previous head is stored. Words are aligned to 8 bytes, so they are never torn.
+
+On x86-64 plain loads and stores of aligned words have this order, and Python's are such. Boards
+have it from machine code (`rack.boards.run.compiled_mailbox`), which also gives the rare paths in
+this folder a `fence`. tests/backplane/mailbox/model.py checks the protocol exhaustively.
 
 The checksum is XXH3, 64 bits, seeded with the checksum of the message before. So one pass over a
 message tells a reader whether its copy is whole and undamaged; and the newest checksum stands for
@@ -119,6 +124,11 @@ class Slots:
         self.words = self.record[:SLOT_HEAD_SIZE].cast("Q")
         self.covered = self.record[CHECKED_FROM:]
 
+    @staticmethod
+    def fence() -> None:
+        """Keep accesses to memory before and after it apart: nothing on x86-64, where a board puts
+        an instruction in its place all the same."""
+
     def resume(self, signature: int) -> None:
         """Continue after the newest published message, as a writer."""
         # Without the sign: a flipped one is no reason to fail.
@@ -132,6 +142,14 @@ class Slots:
         self.chain = (
             self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
         )
+
+    def clear_unpublished(self) -> None:
+        """Empty the slots that a dead writer has filled and not published: no reader may take
+        them for messages of this writer's that are lost."""
+        head = self.box[Box.HEAD] & (UNSIGNED >> 1)
+        for words in self.heads:
+            if words[_SERIAL] > head:
+                words[_SERIAL] = 0
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an
@@ -150,17 +168,21 @@ class Slots:
         words[_CHAIN] = chain = words[_CHECK]
         words[_CHECK] = xxh3(self.covered, chain)
         words[_STAMP] = monotonic_ns()
+        # The previous head is stored before the slot is filled, the slot before this head.
+        self.fence()
         self.places[at][:] = self.record
         if damage:
             message = self.places[at][SLOT_HEAD_SIZE:]
             for bit in damage:
                 message[bit >> 3] ^= 1 << (bit & 7)
+        self.fence()
         box[0] = serial
         return intruder
 
     def lose(self) -> None:
         """Publish a serial without filling its slot."""
         self.serial += 1
+        self.fence()
         self.box[0] = self.serial
 
     def holds(self, serial: int) -> bool:
@@ -170,6 +192,7 @@ class Slots:
     def keeps(self, serial: int) -> bool:
         """Say whether that serial's slot has not been reused: a copy made before this call is then
         of that message."""
+        self.fence()
         return serial >= oldest_kept(self.box[0], self.depth)
 
     def visible_at(self, serial: int) -> int:

@@ -83,9 +83,10 @@ class WatchedReader(Watched):
         episodes = Episodes(segment, reader.spec.name, alarms)
         super().__init__(reader, MessageWatch(segment, reader, episodes), task)
         self._silence = SilenceWatch(segment, reader, episodes, task)
-        self._late_from = self._messages.late_from
-        self._quiet = self._silence.quiet
-        self._writer = segment.block(reader.spec.writer)
+        self.late_from = self._messages.late_from
+        self.quiet = self._silence.quiet
+        self.writer = segment.block(reader.spec.writer)
+        """Control block of the mailbox's writer."""
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading[AnyMessage]:
@@ -102,15 +103,33 @@ class WatchedReader(Watched):
             # The usual case of `judge`: the next message, good and in time.
             if (
                 0 < found == messages.seen + 1
-                and messages.newest < newest > reader.visible - self._late_from
+                and messages.newest < newest > reader.visible - self.late_from
             ):
                 messages.seen = found
                 messages.newest = newest
             else:
                 messages.judge(tick)
         if (
-            tick - reader.newest >= self._quiet or self._writer[Block.LOST]
+            tick - reader.newest >= self.quiet or self.writer[Block.LOST]
         ) and self._silence.is_lost(tick):
+            return self._lost[reading.verdict]
+        return reading
+
+    def conclude(
+        self, tick: int, *, is_new: bool, is_odd: bool, is_silent: bool
+    ) -> Reading[AnyMessage]:
+        """Return the reading of a good read that machine code has made.
+
+        Args:
+            tick: Release tick of the reading cycle.
+            is_new: Whether it has taken a message.
+            is_odd: Whether messages are to be judged.
+            is_silent: Whether the writer's silence is.
+        """
+        if is_odd:
+            self._messages.judge(tick)
+        reading = self.reader.reading(is_new)
+        if is_silent and self._silence.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 from rack.backplane.fault_table import FaultEntry
@@ -19,12 +19,10 @@ from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
 from rack.boards.faults.messages import FaultyWriter
+from rack.boards.run.port_tables import Line, ReadTable, WriteTable, can_write
 from rack.boards.wiring import Source
 from rack.levels.level import LevelSection, Reading, Verdict
 from rack.levels.ports import Sender
-
-Line = tuple[dict[str, Reading[AnyMessage]], str, Callable[[int], Reading[AnyMessage]]]
-"""One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
 
 
 class InputPorts:
@@ -43,6 +41,7 @@ class InputPorts:
         *,
         exchange: Mapping[str, ExchangeSpec] | None = None,
         inbox: BoardInbox | None = None,
+        is_compiled: bool = True,
     ) -> None:
         """Open the mailboxes.
 
@@ -54,14 +53,17 @@ class InputPorts:
             plan: The mailbox that holds the task's own plan.
             exchange: The ports that are not simply read in every cycle.
             inbox: The inbox of the task's board.
+            is_compiled: Whether machine code makes the accesses that it can; otherwise Python
+                makes all.
         """
         self.task = ReadingTask(inbox)
         self.taken: list[Taken] = []
         self.readers: dict[str, Reader] = {}
         # Where each reading goes: the ports themselves, or the dict of a port that reads many
         # mailboxes.
-        self._plan: list[Line] = []
+        plans: list[Line] = []
         self._rest: list[Line] = []
+        self._is_compiled = is_compiled
         for port, source in sources.items():
             boxes = {port: source} if isinstance(source, str) else source
             values = level.input_table(port)
@@ -77,10 +79,13 @@ class InputPorts:
                 found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
                 read = found.read if how is None else GridReader(found, how.grid).read
                 values[key] = Reading(found.reader.message, Verdict.NONE)
-                (self._plan if mailbox == plan else self._rest).append((values, key, read))
+                line = Line(values, key, read, found)
+                (plans if mailbox == plan else self._rest).append(line)
                 self.taken.append(Taken(values, key, found.reader))
                 self.readers[mailbox] = found.reader
-        self.reads_plan = bool(self._plan)
+        self.reads_plan = bool(plans)
+        self._plan_table = ReadTable(plans, is_compiled)
+        self._table = ReadTable(self._rest, is_compiled)
         self._readers = [entry.reader for entry in self.taken]
 
     def follow(self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter) -> None:
@@ -93,7 +98,8 @@ class InputPorts:
             queue.taken = reading.message.taken
             return reading
 
-        self._rest.append(({}, "", read_and_note))
+        self._rest.append(Line({}, "", read_and_note, found))
+        self._table = ReadTable(self._rest, self._is_compiled)
         self._readers.append(found.reader)
 
     def read(self, tick: int) -> None:
@@ -104,13 +110,11 @@ class InputPorts:
 
     def exchange(self, tick: int) -> None:
         """Transfer the plan over the bus, as of `tick`."""
-        for values, key, read in self._plan:
-            values[key] = read(tick)
+        self._plan_table.read(tick)
 
     def read_command_and_status(self, tick: int) -> None:
         """Read every other mailbox as of `tick`: commands, statuses, world model."""
-        for values, key, read in self._rest:
-            values[key] = read(tick)
+        self._table.read(tick)
 
     @property
     def bus_errors(self) -> int:
@@ -149,7 +153,7 @@ class OutputPort:
     ) -> None:
         spec = writer.spec
         self.writer = writer
-        self._sources = sources
+        self.sources = sources
         self._is_on_demand = spec.max_age > 0
         self._is_sent = not self._is_on_demand
         self._basis: int | None = None
@@ -189,6 +193,16 @@ class OutputPort:
         if self._faulty is not None:
             self._faulty.apply(chosen)
 
+    @property
+    def is_faulty(self) -> bool:
+        """Whether faults act on it, or have delayed messages."""
+        return self._faulty is not None
+
+    def note_intruder(self, tick: int, process: int) -> None:
+        """Report a process that has published in the writer's place."""
+        self.writer.intruder = process
+        self._report(tick)
+
     def write(self, tick: int, now: int | None) -> bool:
         """Write the message if that is due; return False if it was too late."""
         writer = self.writer
@@ -198,7 +212,7 @@ class OutputPort:
         if (tick + self._ahead) % self._every or not self._is_sent:
             self.flush(tick, now)
         else:
-            basis = min([source.basis for source in self._sources if source.serial], default=tick)
+            basis = min([source.basis for source in self.sources if source.serial], default=tick)
             if self._is_on_demand:
                 self._is_sent = False
                 basis = basis if self._basis is None else self._basis
@@ -245,6 +259,7 @@ class OutputPorts:
         alarms: AlarmWriter,
         inputs: InputPorts,
         sent: Collection[str] = (),
+        is_compiled: bool = True,
     ) -> None:
         """Open the mailboxes.
 
@@ -255,6 +270,7 @@ class OutputPorts:
             alarms: Where faults of mailboxes are reported.
             inputs: What the task reads.
             sent: The ports whose messages the level sends itself.
+            is_compiled: As in `InputPorts`.
         """
         segment.message_classes |= {
             name: level.outputs[port].message
@@ -270,11 +286,23 @@ class OutputPorts:
             level.place_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.follow(segment, writer, alarms)
+        self._compiled = [port for port in self._ports if is_compiled and can_write(port.writer)]
+        self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
+        self._by_hand = [port for port in self._ports if port not in self._compiled]
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Apply these faults from now on."""
         for port in self._ports:
             port.apply(faults)
+        self._divide()
+
+    def _divide(self) -> None:
+        """Leave the ports on which faults act to Python, and no others that machine code writes."""
+        for at, port in enumerate(self._compiled):
+            self._table.enable(at, not port.is_faulty)
+        self._by_hand = [
+            port for port in self._ports if port.is_faulty or port not in self._compiled
+        ]
 
     @property
     def bus_errors(self) -> int:
@@ -286,15 +314,24 @@ class OutputPorts:
 
         `now`: the clock's tick, if the cycle's end may have passed.
         """
-        in_time = True
-        for port in self._ports:
+        in_time, intruded = self._table.write(tick, now)
+        if intruded:
+            for at, port in enumerate(self._compiled):
+                if process := self._table.intruder(at):
+                    port.note_intruder(tick, process)
+        is_healed = False
+        for port in self._by_hand:
+            was_faulty = port.is_faulty
             if not port.write(tick, now):
                 in_time = False
+            is_healed |= was_faulty and not port.is_faulty
+        if is_healed:
+            self._divide()
         return in_time
 
     def flush(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due, in a cycle that writes nothing."""
-        for port in self._ports:
+        for port in self._by_hand:
             port.flush(tick, now)
 
     @property
