@@ -8,6 +8,10 @@ FLOORS := backplane levels boards tools configs
 CONFIG ?= nasrem
 # Where it is set, each start would compile all our modules anew, and pytest all tests.
 unexport PYTHONDONTWRITEBYTECODE
+# Set, tests try all values of which they take samples otherwise.
+ifdef EXHAUSTIVE
+export EXHAUSTIVE
+endif
 .DEFAULT_GOAL := help
 .PHONY: help run test thorough quick mutants golden reference lint dist lock clean
 
@@ -20,7 +24,7 @@ run: $(STAMP) ## run the rack CONFIG (default: nasrem); ARGS="--lockstep" and th
 test: $(STAMP) ## run the tests, about five minutes; ARGS="-k segment" and the like are passed on
 	$(BIN)/python -m pytest -m "not thorough" $(ARGS)
 
-thorough: $(STAMP) ## run the tests that `make test` leaves out: whole tasks, all examples, the lab; ARGS as above
+thorough: $(STAMP) ## run the tests that `make test` leaves out: whole tasks, all examples, the lab; ARGS as above; EXHAUSTIVE=1 leaves no samples
 	$(BIN)/python -m pytest -m thorough $(ARGS)
 
 quick: $(STAMP) ## run the quick tests, under a minute: those not marked slow, alone or thorough, of every room; ARGS as above

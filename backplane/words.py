@@ -83,7 +83,7 @@ class System:
     DEMAND = 44  # Demand of the utility lines on the arm; written by the clock
     CLOCK_PID = 45
     INJECTED = 46  # faults put into the fault table so far
-    LOSSES = 47  # rises when a board is found dead; written by the crate
+    LOSSES = 47  # rises by 2 for each board found dead; odd while the crate records it
     SYSRESET = 48
     ACFAIL = 49
     EMERGENCY_STOP = 50

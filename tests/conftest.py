@@ -50,6 +50,9 @@ within_cycles = 4
 """
 
 
+EXHAUSTIVE = "EXHAUSTIVE" in os.environ
+"""Whether tests try all values of which they try a sample otherwise: `make thorough EXHAUSTIVE=1`,
+by hand, takes hours."""
 _NUMBERS = count()
 
 

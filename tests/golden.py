@@ -70,6 +70,9 @@ RUNS = (
     "configs/examples/own-arm/desk-arm.toml --seconds 2",
 )
 """As one would call `rack run`, but for --lockstep. The script `overload` needs real time."""
+HOSTED = ("chimera", "condor", "ibm", "penn")
+"""Racks with programs on the host side, whose state cannot be copied: these are repeated with the
+messages that the programs sent."""
 LIBRARIES = ("daqp", "mujoco", "numpy", "ompl", "ruckig")
 PROBE = """
 import hashlib, math

@@ -40,6 +40,8 @@ PACKAGES = ("backplane", "boards", "levels", "tools")
 TESTS = sorted((ROOT / "tests").rglob("test_*.py"))
 FEW = 8
 """Files of tests for one mutant, at most, besides its mirrored folder."""
+QUICK = "not alone and not slow and not thorough"
+SLOW = "not alone and (slow or thorough)"
 BOUND_S, TEST_BOUND_S = 900, 60
 """Time for the tests of one mutant, and for each of them: a test beyond has timed out."""
 PAIRS = (("==", "!="), ("is", "is not"), ("in", "not in"), ("and", "or"), ("+", "-"))
@@ -289,10 +291,10 @@ class Verdict:
     failed: tuple[str, ...] = ()
 
 
-def tested(folder: Path, options: Sequence[str]) -> Verdict:
+def tested(folder: Path, options: Sequence[str], marks: str = "not alone") -> Verdict:
     """Run tests on the copy in a folder, in a session of their own; nothing of it stays."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider"]
-    command += ["-m", "not alone", f"--timeout={TEST_BOUND_S}"]
+    command += ["-m", marks, f"--timeout={TEST_BOUND_S}"]
     command += [f"--basetemp={folder / 'files'}", *options]
     output = folder / "output"
     with output.open("w") as out:
@@ -363,12 +365,20 @@ class Bench:
     """Whether a test passes on the unchanged tree."""
 
     def examined(self, mutation: Mutation) -> str:
-        """Return what became of a mutant: killed, survived, timed out, undecided."""
+        """Return what became of a mutant: killed, survived, timed out, undecided.
+
+        Quick tests come first: most mutants are noticed by one.
+        """
+        word = self._examined_by(QUICK, mutation)
+        return self._examined_by(SLOW, mutation) if word == "survived" else word
+
+    def _examined_by(self, marks: str, mutation: Mutation) -> str:
         tests, left_out = mirrors(mutation.file), set[str]()
         # One path for all copies: code that is compiled is kept by it.
         self._copy([mutation.patch()])
         while True:
-            verdict = tested(self.folder, [*tests, *(f"--deselect={test}" for test in left_out)])
+            deselected = (f"--deselect={test}" for test in left_out)
+            verdict = tested(self.folder, [*tests, *deselected], marks)
             broken = {test for test in verdict.failed if "::" in test} - left_out
             if verdict.word != "killed" or not broken:
                 return verdict.word

@@ -309,6 +309,8 @@ class Crate:
                 # Its program is done; a task ends with the run alone.
                 block[Block.PID] = 0
                 return tick
+            # Odd while the loss is recorded: what the clock sees in between is not final.
+            words[System.LOSSES] += 1
             if block[Block.STATE] != TaskState.FAILED:
                 block[Block.STATE] = TaskState.ABSENT
             block[Block.LOST] = block[Block.LOST] or tick + 1

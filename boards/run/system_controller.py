@@ -100,8 +100,9 @@ class SystemController:
         emergency = words[System.EMERGENCY_STOP]
         peer = words[System.PEER_STOP]
         self._set_demand(lost, tick)
-        # So is a switch that lies ahead.
-        self._settled = (*seen, emergency, peer) if not lost and peer >> 1 <= tick else None
+        # The same holds for a switch that lies ahead, and for a loss that the crate is recording.
+        is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
+        self._settled = (*seen, emergency, peer) if is_settled else None
 
     def _handle_loss(self, task: ReleasedTask, tick: int) -> None:
         lockstep = self._wiring.lockstep

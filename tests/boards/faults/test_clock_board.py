@@ -193,7 +193,7 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
         def crate() -> None:
             wait_until(lambda: not is_alive(pid))
             block[Block.LOST] = 3
-            site.segment.words[System.LOSSES] += 1
+            site.segment.words[System.LOSSES] += 2
             done_semaphore(site.segment, "writer").release()
 
         entry = site.add("kill", tick=2)

@@ -69,10 +69,14 @@ class Controlled:
         self.controller = SystemController(segment, given, self.driver, self.end_of_run)
 
     def lose(self, name: str, tick: int) -> None:
-        """Lose a board, as the Rack notes it."""
+        """Lose a board, as the crate records it."""
+        self.words[System.LOSSES] += 1
+        self.set_lost(name, tick)
+        self.words[System.LOSSES] += 1
+
+    def set_lost(self, name: str, tick: int) -> None:
         block = self.blocks[name]
         block[Block.LOST], block[Block.STATE] = 1 + tick, TaskState.STARTING
-        self.words[System.LOSSES] += 1
 
     def demand(self, tick: int) -> Demand:
         """Return the demand on the arm after the clock's work at a tick."""
@@ -97,6 +101,23 @@ def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> Non
     # Rejoined after two ticks, and after six.
     values = rack.alarms.drain().rows["value"].tolist()
     assert values == [Demand.STOP, Demand.BRAKE, 2, Demand.STOP, 6, Demand.NONE]
+
+
+@pytest.mark.parametrize("is_lost_first", [False, True])
+def test_a_loss_counts_from_its_tick_however_slowly_the_crate_records_it(
+    make_bus: MakeBus, is_lost_first: bool
+) -> None:
+    rack = Controlled(make_bus(*BOARDS))
+    assert rack.demand(0) is Demand.NONE
+    rack.words[System.LOSSES] += 1
+    if not is_lost_first:
+        # Nothing is lost yet, but the controller must look again at every tick.
+        assert rack.demand(1) is Demand.NONE
+        assert rack.controller.rests_until(1) == 2
+    rack.set_lost("left", 2)
+    assert rack.demand(2) is Demand.STOP
+    rack.words[System.LOSSES] += 1
+    assert rack.demand(3) is Demand.STOP
 
 
 def test_the_clock_follows_the_network_adapter_at_its_tick(make_bus: MakeBus) -> None:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from ctypes import CDLL
 from pathlib import Path
 
@@ -167,8 +167,12 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
 
 def kill_thread(pid: int, number: int) -> None:
     """Send a signal to another thread than the first, as the kernel may do by itself."""
-    threads = Path(f"/proc/{pid}/task").iterdir()
-    others = (int(t.name) for t in threads if (t / "comm").read_text() == "python\n")
+    others = []
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        # A thread may end while they are listed.
+        with suppress(FileNotFoundError):
+            if (thread / "comm").read_text() == "python\n":
+                others.append(int(thread.name))
     assert CDLL(None).tgkill(pid, max(others), number) == 0
 
 
