@@ -238,7 +238,6 @@ class Reader:
         self.slots = slots = Slots(segment, self.spec)
         self._box = slots.box
         self._heads = slots.heads
-        self._places = slots.places
         self._mask = slots.mask
         self._depth = slots.depth
         # The last good message has its own buffer: a corrupt copy never reaches it.
@@ -291,7 +290,7 @@ class Reader:
         """Keep a message as the last good one; False when it is not good."""
         self.transfers += 1
         record = self._record
-        record[:] = self._places[serial & self._mask]
+        self.slots.load(serial)
         _, epoch, chain, check, basis, found, tick, visible = _HEAD(record)
         if found != serial or check != xxh3(self._covered, chain):
             return False

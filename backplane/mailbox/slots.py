@@ -7,9 +7,11 @@ a message.
 
 Memory order: the one writer fills a slot, then stores the head's serial with release; a reader
 loads the serial with acquire before it copies the slot, so it sees all of it. A copy may still be
-torn by a writer that laps the reader: the checksum shows that. Before a reader concludes from a
-head that a slot has not been reused (`keeps`), its copy is complete; in turn the writer fills no
-slot before the previous head is stored. Words are aligned to 8 bytes, so they are never torn.
+torn by a writer that laps the reader: the checksum shows that. It does not cover the signature,
+which is stored after the message and loaded before it: the writer's own is never taken for that of
+a forged message which it overwrites. Before a reader concludes from a head that a slot has not been
+reused (`keeps`), its copy is complete; in turn the writer fills no slot before the previous head is
+stored. Words are aligned to 8 bytes, so they are never torn.
 
 On x86-64 plain loads and stores of aligned words have this order, and Python's are such. Boards
 have it from machine code (`rack.boards.run.compiled_mailbox`), which also gives the rare paths in
@@ -40,6 +42,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
 CHECKED_FROM = Slot.BASIS * 8
+SIGNED_FROM = Slot.CHAIN * 8
+"""Where a message begins in its slot, after its time stamp and its writer's signature, bytes."""
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole
@@ -168,13 +172,15 @@ class Slots:
         words[_CHAIN] = chain = words[_CHECK]
         words[_CHECK] = xxh3(self.covered, chain)
         words[_STAMP] = monotonic_ns()
-        # The previous head is stored before the slot is filled, the slot before this head.
+        # In this order: the previous head, the message, its signature, this head.
         self.fence()
-        self.places[at][:] = self.record
+        self.places[at][SIGNED_FROM:] = self.record[SIGNED_FROM:]
         if damage:
             message = self.places[at][SLOT_HEAD_SIZE:]
             for bit in damage:
                 message[bit >> 3] ^= 1 << (bit & 7)
+        self.fence()
+        self.places[at][:SIGNED_FROM] = self.record[:SIGNED_FROM]
         self.fence()
         box[0] = serial
         return intruder
@@ -199,9 +205,17 @@ class Slots:
         """Return the tick from which the message in that serial's slot may be read."""
         return self.heads[serial & self.mask][_VISIBLE]
 
+    def load(self, serial: int) -> None:
+        """Copy that serial's slot, without any check, into the local record."""
+        place = self.places[serial & self.mask]
+        # If this is the signature of the message sought, all of that is in the slot.
+        self.record[:SIGNED_FROM] = place[:SIGNED_FROM]
+        self.fence()
+        self.record[SIGNED_FROM:] = place[SIGNED_FROM:]
+
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
-        self.record[:] = self.places[serial & self.mask]
+        self.load(serial)
         return self.serial == serial and self.is_sound
 
     def between(self, before: int, newest: int) -> Iterator[AnyMessage]:
@@ -211,9 +225,8 @@ class Slots:
                 yield copied(self.message)
 
     def copy(self, serial: int) -> bool:
-        """Copy that serial's slot, without any check, into the local record; False when it was
-        reused meanwhile."""
-        self.record[:] = self.places[serial & self.mask]
+        """Copy that serial's slot as `load` does; False when it was reused meanwhile."""
+        self.load(serial)
         return self.keeps(serial)
 
     @property

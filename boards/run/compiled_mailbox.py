@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, Slots
+from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, SIGNED_FROM, Slots
 from rack.boards.run.instructions import (
     MONOTONIC,
     clock_gettime,
@@ -134,7 +134,10 @@ def find_visible(port: Any, last: int, head: int, tick: int) -> int:
 @compiled
 def take(port: Any, serial: int) -> bool:
     """Take a good message of the writer of the last one; leave any other: see `Reader._obtain`."""
-    copy(port.record, slot_of(port, serial), port.size)
+    slot = slot_of(port, serial)
+    copy(port.record, slot, SIGNED_FROM)
+    fence()
+    copy(port.record + SIGNED_FROM, slot + SIGNED_FROM, port.size - SIGNED_FROM)
     found = slot_at(port.record)
     state = state_at(port.state)
     if (
@@ -287,9 +290,11 @@ def publish(address: int, tick: int, visible: int, basis: int) -> int:
     record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain)
     clock_gettime(MONOTONIC, address + _TIME)
     record.stamp = port.time_s * 1_000_000_000 + port.time_ns
-    # The previous head is stored before this slot is filled.
+    # In this order: the previous head, the message, its signature, this head.
     fence()
-    copy(slot, port.record, port.size)
+    copy(slot + SIGNED_FROM, port.record + SIGNED_FROM, port.size - SIGNED_FROM)
+    fence()
+    copy(slot, port.record, SIGNED_FROM)
     store_release(port.head, before + 1)
     return intruder
 
