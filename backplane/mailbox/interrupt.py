@@ -58,12 +58,12 @@ class InterruptWriter(Writer):
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
-        self.due = how_sent(self.spec).due
+        self._due = how_sent(self.spec).due
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the earliest tick at which the message is visible; a late one is sent in the tick
         that writes it."""
-        released = tick if now is None else max(tick, now - self.due + 1)
+        released = tick if now is None else max(tick, now - self._due + 1)
         return released + self._delay
 
 

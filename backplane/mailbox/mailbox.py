@@ -17,11 +17,8 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from struct import Struct
 from typing import Generic, NamedTuple, TypeVar
 from weakref import WeakSet
-
-from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
@@ -30,8 +27,6 @@ from rack.backplane.message import AnyMessage, Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
-# Stamp, signature, chain, check, basis, serial, tick, visible: see `words.Slot`.
-_HEAD = Struct("@2q2Q4q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -84,7 +79,7 @@ class Writer:
         self.spec = spec = segment.layout.mailbox(name)
         self.slots = Slots(segment, spec)
         self._delay = spec.delay
-        self.due = spec.delay  # ticks from a release until its message must be written
+        self._due = spec.delay  # ticks from a release until its message must be written
         self.message = self.slots.message
         self.bus_errors = 0
         self.held_up = 0
@@ -130,7 +125,7 @@ class Writer:
     def is_in_time(self, tick: int, now: int | None) -> bool:
         """Say whether a message released at `tick` and written now comes in time; `now` as in
         `write`."""
-        return now is None or now < tick + self.due
+        return now is None or now < tick + self._due
 
     def visible_at(self, tick: int, now: int | None) -> int:
         """Return the tick from which a message released at `tick` and written now is visible."""
@@ -242,8 +237,6 @@ class Reader:
         self._depth = slots.depth
         # The last good message has its own buffer: a corrupt copy never reaches it.
         good = Slots(segment, self.spec)
-        self._record = slots.record
-        self._covered = slots.covered
         self.good = good.record
         """The last good message, with the head of its slot."""
         self.message = good.message
@@ -289,21 +282,19 @@ class Reader:
     def _obtain(self, serial: int) -> bool:
         """Keep a message as the last good one; False when it is not good."""
         self.transfers += 1
-        record = self._record
-        self.slots.load(serial)
-        _, epoch, chain, check, basis, found, tick, visible = _HEAD(record)
-        if found != serial or check != xxh3(self._covered, chain):
+        slots = self.slots
+        if not slots.fetch(serial):
             return False
-        if epoch != self._signature:
-            if not self.slots.is_lawful(self._signature):
+        if slots.signature != self._signature:
+            if not slots.is_lawful(self._signature):
                 return False
-            self._signature = epoch
+            self._signature = slots.signature
             self._unchanged = self._readings[Verdict.OLD]
-        self.good[:] = record
+        self.good[:] = slots.record
         self.serial = serial
-        self.newest = tick
-        self.visible = visible
-        self.basis = basis
+        self.newest = slots.tick
+        self.visible = slots.visible
+        self.basis = slots.basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:

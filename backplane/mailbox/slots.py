@@ -104,6 +104,7 @@ class Slots:
     stamp_ns = Word(Slot.STAMP_NS)
     signature = Word(Slot.EPOCH)
     chain = Word(Slot.CHECK)
+    basis = Word(Slot.BASIS)
     serial = Word(Slot.SERIAL)
     tick = Word(Slot.TICK)
     visible = Word(Slot.VISIBLE_AT)

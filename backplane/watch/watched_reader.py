@@ -93,42 +93,27 @@ class WatchedReader(Watched):
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
         reader = self.reader
-        messages = self._messages
         reading = reader.read(tick)
-        if self._has_trouble():
-            messages.judge(tick)
-        elif reader.found != messages.seen:
-            found = reader.found
-            newest = reader.newest
-            # The usual case of `judge`: the next message, good and in time.
-            if (
-                0 < found == messages.seen + 1
-                and messages.newest < newest > reader.visible - self.late_from
-            ):
-                messages.seen = found
-                messages.newest = newest
-            else:
-                messages.judge(tick)
-        if (
-            tick - reader.newest >= self.quiet or self.writer[Block.LOST]
-        ) and self._silence.is_lost(tick):
-            return self._lost[reading.verdict]
-        return reading
+        return self.conclude(
+            tick,
+            reading,
+            is_odd=self._has_trouble() or reader.found != self._messages.seen,
+            is_silent=tick - reader.newest >= self.quiet or self.writer[Block.LOST] > 0,
+        )
 
     def conclude(
-        self, tick: int, *, is_new: bool, is_odd: bool, is_silent: bool
+        self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
     ) -> Reading[AnyMessage]:
-        """Return the reading of a good read that machine code has made.
+        """Return a reading as this read gives it.
 
         Args:
             tick: Release tick of the reading cycle.
-            is_new: Whether it has taken a message.
+            reading: What the reader itself gives.
             is_odd: Whether messages are to be judged.
             is_silent: Whether the writer's silence is.
         """
         if is_odd:
             self._messages.judge(tick)
-        reading = self.reader.reading(is_new)
         if is_silent and self._silence.is_lost(tick):
             return self._lost[reading.verdict]
         return reading

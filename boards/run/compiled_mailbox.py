@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, SIGNED_FROM, Slots
+from rack.backplane.words import Slot
 from rack.boards.run.instructions import (
-    MONOTONIC,
-    clock_gettime,
     copy,
     fence,
     load,
-    load_acquire,
     record_at,
     store_release,
     xxh3,
@@ -42,7 +40,7 @@ READ_PORT = _words(
     *("stride", "depth", "size"),  # of slots; bytes from one to the next, and bytes in use
     "is_sliced",  # whether messages are visible by ticks
     "is_watched",  # whether messages are taken and judged here, or Python takes them
-    *("every", "late_from", "quiet"),  # ticks
+    *("late_from", "quiet"),  # ticks
     "result",  # of the last read
 )
 """A mailbox to read."""
@@ -51,11 +49,8 @@ WRITE_PORT = _words(
     # the states of the readers that its message rests on.
     *("head", "slots", "record", "sources"),
     *("source_count", "stride", "depth", "size"),
-    *("every", "ahead", "phase", "delay", "due"),  # ticks
-    "visibility",  # SLICED, AT_ONCE or SENT
-    "is_enabled",
+    *("every", "ahead", "delay"),  # ticks; the last until a message is visible
     "intruder",  # process that has published since this writer's last message; 0: none
-    *("time_s", "time_ns"),
 )
 """A mailbox to write."""
 STATE = _words(
@@ -65,30 +60,14 @@ STATE = _words(
 """The words of a reader: see `ReaderState`."""
 SLOT = _words("stamp", "signature", "chain", "check", "basis", "serial", "tick", "visible")
 """The words of a slot's head: see `rack.backplane.words.Slot`."""
-
-
-def place_of(name: str, dtype: np.dtype) -> int:
-    """Return the place of a word in a record, bytes."""
-    assert dtype.names is not None
-    return 8 * dtype.names.index(name)
-
-
-_SIGNATURE, _SERIAL, _TICK, _VISIBLE = (
-    place_of(name, SLOT) for name in ("signature", "serial", "tick", "visible")
-)
-_TIME = place_of("time_s", WRITE_PORT)
+_SIGNATURE = 8 * Slot.EPOCH
+_VISIBLE = 8 * Slot.VISIBLE_AT
 _READ_SIZE = READ_PORT.itemsize
 _WRITE_SIZE = WRITE_PORT.itemsize
 OLD, NEW, ODD, SILENT, SLOW = 0, 1, 2, 4, 8
 """Results of a read. ODD, SILENT: Python judges messages, silence. SLOW: Python reads."""
-SLICED, AT_ONCE, SENT = 0, 1, 2
-"""A message is visible at the end of its cycle, as soon as it is whole, or once it is sent."""
 MOST_PORTS = 60
 """Most ports of a table: each has a bit in the answer of a call."""
-LATE = 1 << MOST_PORTS
-"""Bit in the answer of `write_ports`: a message was too late."""
-IN_TIME = -1
-"""The clock's tick for `write_ports` while the end of the cycle has not come."""
 
 
 read_port_at = record_at(READ_PORT)
@@ -105,27 +84,10 @@ def slot_of(port: Any, serial: int) -> int:
 
 
 @compiled
-def is_kept(port: Any, serial: int) -> bool:
-    """Whether that serial's slot has not been reused by now: see `Slots.keeps`."""
-    fence()
-    oldest: int = load(port.head) + 2 - port.depth
-    return serial >= oldest
-
-
-@compiled
-def is_whole(address: int, size: int) -> bool:
-    """Whether the message after the head at an address passes its check."""
-    head = slot_at(address)
-    check: int = head.check
-    found: int = xxh3(address + CHECKED_FROM, size - CHECKED_FROM, head.chain)
-    return check == found
-
-
-@compiled
 def find_visible(port: Any, last: int, head: int, tick: int) -> int:
     """Return the serial of the newest message visible at `tick`, not before `last`."""
     serial = head
-    oldest = max(last, head - port.depth) if head > last else last
+    oldest = max(last, head - port.depth)
     while serial > oldest and load(slot_of(port, serial) + _VISIBLE) > tick:
         serial -= 1
     return serial
@@ -140,11 +102,10 @@ def take(port: Any, serial: int) -> bool:
     copy(port.record + SIGNED_FROM, slot + SIGNED_FROM, port.size - SIGNED_FROM)
     found = slot_at(port.record)
     state = state_at(port.state)
-    if (
-        found.serial != serial
-        or found.signature != state.signature
-        or not is_whole(port.record, port.size)
-    ):
+    if found.serial != serial or found.signature != state.signature:
+        return False
+    check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, found.chain)
+    if check != found.check:
         return False
     copy(port.good, port.record, port.size)
     state.serial = serial
@@ -156,53 +117,12 @@ def take(port: Any, serial: int) -> bool:
 
 
 @compiled
-def is_usual(port: Any, serial: int, before: int) -> bool:
-    """Whether a message is in its slot, in time, and released after tick `before`; whole, unless
-    it was taken. See `MessageWatch._walk`."""
-    slot = slot_of(port, serial)
-    return (
-        load(slot + _SERIAL) == serial
-        and before < load(slot + _TICK) > load(slot + _VISIBLE) - port.late_from
-        and (serial == state_at(port.state).serial or is_whole(slot, port.size))
-        and is_kept(port, serial)
-    )
-
-
-@compiled
-def judge(port: Any, found: int) -> bool:
-    """Judge the messages up to the newest found; change nothing and return False if one is odd. See
-    `MessageWatch.judge`."""
-    state = state_at(port.state)
-    seen = state.judged
-    judged_tick = state.judged_tick
-    if seen < 0 or found <= seen:
-        return False
-    if found == seen + 1:
-        if not judged_tick < state.newest > state.visible - port.late_from:
-            return False
-    else:
-        # More messages than releases are a babble.
-        releases = (state.newest - judged_tick) // port.every
-        if not is_kept(port, found) or found - seen > releases + 1:
-            return False
-        for serial in range(max(seen + 1, load(port.head) + 2 - port.depth), found):
-            if not is_usual(port, serial, judged_tick):
-                return False
-            judged_tick = load(slot_of(port, serial) + _TICK)
-        if not is_usual(port, found, judged_tick):
-            return False
-    state.judged = found
-    state.judged_tick = state.newest
-    return True
-
-
-@compiled
 def read_port(address: int, tick: int) -> int:
     """Read one mailbox as `WatchedReader.read` does; return the result."""
     port = read_port_at(address)
     state = state_at(port.state)
-    serial = load_acquire(port.head)
-    if port.is_sliced and serial != state.serial:
+    serial = load(port.head)
+    if port.is_sliced:
         serial = find_visible(port, state.serial, serial, tick)
     result = OLD
     if serial != state.serial:
@@ -212,7 +132,13 @@ def read_port(address: int, tick: int) -> int:
     state.accesses += 1
     state.found = serial
     if port.is_watched:
-        if serial != state.judged and not judge(port, serial):
+        # Usually nothing is new, or the next message is there, released later, in time.
+        if 0 <= state.judged == serial - 1 and (
+            state.judged_tick < state.newest > state.visible - port.late_from
+        ):
+            state.judged = serial
+            state.judged_tick = state.newest
+        elif serial != state.judged:
             result |= ODD
         if tick - state.newest >= port.quiet or load(port.lost):
             result |= SILENT
@@ -257,39 +183,22 @@ def basis_of(port: Any, tick: int) -> int:
 
 
 @compiled
-def visible_at(port: Any, tick: int, now: int) -> int:
-    """Return the tick from which a message is visible: see `Writer.visible_at` and those of other
-    protocols."""
-    visible: int = tick + port.delay
-    if port.visibility == AT_ONCE:
-        visible = tick if now == IN_TIME else now
-    elif now != IN_TIME and port.visibility == SENT:
-        visible = port.delay + max(tick, now - port.due + 1)
-    elif now >= visible:
-        cycle = min(port.every, port.delay)
-        visible = now + cycle - (now - port.phase) % cycle
-    return visible
-
-
-@compiled
-def publish(address: int, tick: int, visible: int, basis: int) -> int:
+def publish(port: Any, tick: int, stamp: int) -> int:
     """Publish the message of a port's record; return the process of an intruder, 0: none. See
     `Slots.publish`."""
-    port = write_port_at(address)
     record = slot_at(port.record)
     before = record.serial
     slot = slot_of(port, before + 1)
     intruder = 0
     if load(port.head) != before:
         intruder = load(slot + _SIGNATURE) >> EPOCH_BITS
-    record.basis = basis
+    record.stamp = stamp
+    record.basis = basis_of(port, tick)
     record.serial = before + 1
     record.tick = tick
-    record.visible = visible
+    record.visible = tick + port.delay
     record.chain = record.check
     record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain)
-    clock_gettime(MONOTONIC, address + _TIME)
-    record.stamp = port.time_s * 1_000_000_000 + port.time_ns
     # In this order: the previous head, the message, its signature, this head.
     fence()
     copy(slot + SIGNED_FROM, port.record + SIGNED_FROM, port.size - SIGNED_FROM)
@@ -300,31 +209,27 @@ def publish(address: int, tick: int, visible: int, basis: int) -> int:
 
 
 @compiled_for("i8, i8, i8, i8")
-def write_ports(table: int, count: int, tick: int, now: int) -> int:
+def write_ports(table: int, count: int, tick: int, stamp: int) -> bool:
     """Write the messages that are due.
 
     Args:
         table: Address of the ports, of type `WRITE_PORT`.
         count: Number of them.
-        tick: Release tick of the cycle.
-        now: The clock's tick if the cycle's end may have passed, otherwise IN_TIME.
+        tick: Release tick of the cycle, whose end has not come.
+        stamp: CLOCK_MONOTONIC, ns.
 
     Returns:
-        A bit for each port with an intruder, and LATE if a message was too late.
+        Whether a port has an intruder.
     """
-    answer = 0
+    is_intruded = False
     for at in range(count):
-        address = table + at * _WRITE_SIZE
-        port = write_port_at(address)
-        if not port.is_enabled or (tick + port.ahead) % port.every:
+        port = write_port_at(table + at * _WRITE_SIZE)
+        if (tick + port.ahead) % port.every:
+            port.intruder = 0
             continue
-        basis = basis_of(port, tick)
-        port.intruder = publish(address, tick, visible_at(port, tick, now), basis)
-        if port.intruder:
-            answer |= 1 << at
-        if now != IN_TIME and now >= tick + port.due:
-            answer |= LATE
-    return answer
+        port.intruder = publish(port, tick, stamp)
+        is_intruded |= port.intruder > 0
+    return is_intruded
 
 
 @compiled

@@ -17,8 +17,6 @@ from xxhash import _xxhash  # type: ignore[attr-defined]  # the module with the 
 
 from rack.levels.compiled import compiled
 
-MONOTONIC = 1
-"""CLOCK_MONOTONIC of the C library."""
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -67,22 +65,16 @@ def _instruction(emit: Callable[..., Any], count: int, result: Any = None) -> An
     return intrinsic(instruction)
 
 
-def _pointer(builder: Any, address: Any, bits: int = 64) -> Any:
+def _pointer(builder: Any, address: Any) -> Any:
     from llvmlite import ir
 
-    return builder.inttoptr(address, ir.IntType(bits).as_pointer())
-
-
-@linked
-def load_acquire(*_: int) -> Any:
-    """Load the word at an address; no later access comes before."""
-    return _instruction(lambda b, at: b.load_atomic(_pointer(b, at), "acquire", 8), 1)
+    return builder.inttoptr(address, ir.IntType(64).as_pointer())
 
 
 @linked
 def load(*_: int) -> Any:
-    """Load the word at an address, whole, in no order with other accesses."""
-    return _instruction(lambda b, at: b.load_atomic(_pointer(b, at), "monotonic", 8), 1)
+    """Load the word at an address, whole; no later access comes before."""
+    return _instruction(lambda b, at: b.load_atomic(_pointer(b, at), "acquire", 8), 1)
 
 
 @linked
@@ -112,7 +104,7 @@ def copy(*_: int) -> Any:
     def emit(builder: Any, to: Any, source: Any, size: Any) -> None:
         from numba.core.cgutils import raw_memcpy
 
-        ends = _pointer(builder, to, 8), _pointer(builder, source, 8)
+        ends = _pointer(builder, to), _pointer(builder, source)
         raw_memcpy(builder, *ends, size, 1)  # type: ignore[no-untyped-call]
 
     return _instruction(emit, 3)
@@ -141,11 +133,3 @@ def xxh3(*_: int) -> Any:
     binding.load_library_permanently(_xxhash.__file__)
     word = types.int64
     return types.ExternalFunction("XXH3_64bits_withSeed", word(word, word, word))
-
-
-@linked
-def clock_gettime(*_: int) -> Any:
-    """Store the time of a clock, s and ns, at an address."""
-    from numba import types
-
-    return types.ExternalFunction("clock_gettime", types.int32(types.int32, types.int64))

@@ -8,6 +8,7 @@ protocols itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from time import monotonic_ns
 from typing import NamedTuple
 
 import numpy as np
@@ -21,16 +22,11 @@ from rack.backplane.message import AnyMessage
 from rack.backplane.watch.watched_reader import SporadicReader, Watched, WatchedReader
 from rack.backplane.words import Block
 from rack.boards.run.compiled_mailbox import (
-    AT_ONCE,
-    IN_TIME,
-    LATE,
     MOST_PORTS,
     NEW,
     ODD,
     READ_PORT,
-    SENT,
     SILENT,
-    SLICED,
     SLOW,
     WRITE_PORT,
     read_ports,
@@ -38,8 +34,6 @@ from rack.boards.run.compiled_mailbox import (
 )
 from rack.levels.level import Reading
 
-VISIBILITIES = {Writer: SLICED, DoubleBufferWriter: AT_ONCE, InterruptWriter: SENT}
-"""When messages are visible, by writers whose messages machine code can write."""
 WORD = 8
 """Bytes of a word, and the alignment of all memory that is accessed by address."""
 
@@ -55,36 +49,30 @@ class Line(NamedTuple):
 
 
 class ReadTable:
-    """The reads of one step. With `is_compiled`, machine code makes those that it can."""
+    """The reads of one step. Machine code makes those that it can."""
 
-    def __init__(self, lines: Sequence[Line], is_compiled: bool) -> None:
-        self._lines = lines
-        compiled = [line for line in lines if is_compiled and _is_simple(line)][:MOST_PORTS]
-        # The bit of each line in the answer; lines that Python reads have none.
-        self._bits = [1 << compiled.index(line) if line in compiled else 0 for line in lines]
-        self._is_mixed = len(compiled) < len(lines)
-        self._count = len(compiled)
-        self._ports = np.zeros(len(compiled), READ_PORT)
-        self._results = self._ports["result"]
-        for port, line in zip(self._ports, compiled, strict=True):
+    def __init__(self, lines: Sequence[Line]) -> None:
+        self._lines = [line for line in lines if can_read(line)][:MOST_PORTS]
+        self._others = [line for line in lines if line not in self._lines]
+        self._ports = np.zeros(len(self._lines), READ_PORT)
+        for port, line in zip(self._ports, self._lines, strict=True):
             _fill_read_port(port, line.watched)
-        self._address = address_of(self._ports.data)
-        self._read_ports = read_ports.load() if compiled else lambda *_: 0
+        self._read_ports = read_ports.load() if self._lines else lambda *_: 0
+        self._table = self._ports.ctypes.data, len(self._lines)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
-        touched = self._read_ports(self._address, self._count, tick)
-        if not touched and not self._is_mixed:
-            return
-        for line, bit in zip(self._lines, self._bits, strict=True):
-            if not bit:
-                line.values[line.key] = line.read(tick)
-            elif touched & bit:
-                result = int(self._results[bit.bit_length() - 1])
-                line.values[line.key] = _conclude(line, result, tick)
+        touched = self._read_ports(*self._table, tick)
+        if touched:
+            for at, line in enumerate(self._lines):
+                if touched >> at & 1:
+                    result = int(self._ports["result"][at])
+                    line.values[line.key] = _conclude(line, result, tick)
+        for line in self._others:
+            line.values[line.key] = line.read(tick)
 
 
-def _is_simple(line: Line) -> bool:
+def can_read(line: Line) -> bool:
     """Whether machine code can read a mailbox: at every tick, without a lock."""
     watched = line.watched
     return (
@@ -98,14 +86,11 @@ def _conclude(line: Line, result: int, tick: int) -> Reading[AnyMessage]:
     watched = line.watched
     if result & SLOW:
         return line.read(tick)
+    reading = watched.reader.reading(bool(result & NEW))
     if not isinstance(watched, WatchedReader):
-        return watched.reader.reading(False)
-    return watched.conclude(
-        tick,
-        is_new=bool(result & NEW),
-        is_odd=bool(result & ODD),
-        is_silent=bool(result & SILENT),
-    )
+        return reading
+    is_odd, is_silent = bool(result & ODD), bool(result & SILENT)
+    return watched.conclude(tick, reading, is_odd=is_odd, is_silent=is_silent)
 
 
 def _fill_read_port(port: np.void, watched: Watched) -> None:
@@ -114,7 +99,6 @@ def _fill_read_port(port: np.void, watched: Watched) -> None:
     port["state"] = address_of(reader.words)
     port["good"] = address_of(reader.good)
     port["is_sliced"] = type(reader) is Reader
-    port["every"] = reader.spec.every
     port["result"] = -1
     if isinstance(watched, WatchedReader):
         port["is_watched"] = True
@@ -149,50 +133,37 @@ class WriteTable:
         """Fill the table.
 
         Args:
-            writers: The writers, whose types `can_write` permits, each with the readers that its
+            writers: The writers, for which `can_write` is true, each with the readers that its
                 message rests on.
         """
+        self._writers = [writer for writer, _ in writers]
         self._ports = np.zeros(len(writers), WRITE_PORT)
         self._sources = [
             np.array([address_of(reader.words) for reader in sources], np.int64)
             for _, sources in writers
         ]
         for port, (writer, _), sources in zip(self._ports, writers, self._sources, strict=True):
-            _fill_write_port(port, writer)
+            spec = writer.spec
+            _fill_slots(port, writer.slots)
             port["sources"] = sources.ctypes.data
             port["source_count"] = len(sources)
-        self._address = self._ports.ctypes.data
-        self._write_ports = write_ports.load() if writers else lambda *_: 0
+            port["every"] = spec.every
+            port["ahead"] = spec.ahead - spec.phase
+            port["delay"] = writer.visible_at(0, None)
+        self._write_ports = write_ports.load() if writers else lambda *_: False
+        self._table = self._ports.ctypes.data, len(writers)
 
-    def write(self, tick: int, now: int | None) -> tuple[bool, int]:
-        """Write the messages that are due, `now` as in `Writer.write`; return whether none was too
-        late, and a bit for each port with an intruder."""
-        answer = self._write_ports(
-            self._address, len(self._ports), tick, IN_TIME if now is None else now
-        )
-        return answer < LATE, answer & (LATE - 1)
-
-    def enable(self, at: int, is_enabled: bool) -> None:
-        """Let machine code write a port, or leave that to Python."""
-        self._ports[at]["is_enabled"] = is_enabled
-
-    def intruder(self, at: int) -> int:
-        """Return the process of the intruder that the last write has found; 0: none."""
-        return int(self._ports[at]["intruder"])
+    def write(self, tick: int) -> bool:
+        """Write the messages that are due, in a cycle whose end has not come; say whether a writer
+        has an intruder."""
+        is_intruded: bool = self._write_ports(*self._table, tick, monotonic_ns())
+        if is_intruded:
+            for writer, port in zip(self._writers, self._ports, strict=True):
+                writer.intruder = int(port["intruder"])
+        return is_intruded
 
 
 def can_write(writer: Writer) -> bool:
     """Whether machine code can write a mailbox: once in each of its cycles, without a lock."""
-    return type(writer) in VISIBILITIES and not writer.spec.max_age
-
-
-def _fill_write_port(port: np.void, writer: Writer) -> None:
-    spec = writer.spec
-    _fill_slots(port, writer.slots)
-    port["every"] = spec.every
-    port["ahead"] = spec.ahead - spec.phase
-    port["phase"] = spec.phase
-    port["delay"] = spec.delay
-    port["due"] = writer.due
-    port["visibility"] = VISIBILITIES[type(writer)]
-    port["is_enabled"] = True
+    kinds = Writer, DoubleBufferWriter, InterruptWriter
+    return type(writer) in kinds and not writer.spec.max_age

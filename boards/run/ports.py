@@ -41,7 +41,6 @@ class InputPorts:
         *,
         exchange: Mapping[str, ExchangeSpec] | None = None,
         inbox: BoardInbox | None = None,
-        is_compiled: bool = True,
     ) -> None:
         """Open the mailboxes.
 
@@ -53,8 +52,6 @@ class InputPorts:
             plan: The mailbox that holds the task's own plan.
             exchange: The ports that are not simply read in every cycle.
             inbox: The inbox of the task's board.
-            is_compiled: Whether machine code makes the accesses that it can; otherwise Python
-                makes all.
         """
         self.task = ReadingTask(inbox)
         self.taken: list[Taken] = []
@@ -63,7 +60,6 @@ class InputPorts:
         # mailboxes.
         plans: list[Line] = []
         self._rest: list[Line] = []
-        self._is_compiled = is_compiled
         for port, source in sources.items():
             boxes = {port: source} if isinstance(source, str) else source
             values = level.input_table(port)
@@ -84,8 +80,8 @@ class InputPorts:
                 self.taken.append(Taken(values, key, found.reader))
                 self.readers[mailbox] = found.reader
         self.reads_plan = bool(plans)
-        self._plan_table = ReadTable(plans, is_compiled)
-        self._table = ReadTable(self._rest, is_compiled)
+        self._plan_table = ReadTable(plans)
+        self._table = ReadTable(self._rest)
         self._readers = [entry.reader for entry in self.taken]
 
     def follow(self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter) -> None:
@@ -99,7 +95,7 @@ class InputPorts:
             return reading
 
         self._rest.append(Line({}, "", read_and_note, found))
-        self._table = ReadTable(self._rest, self._is_compiled)
+        self._table = ReadTable(self._rest)
         self._readers.append(found.reader)
 
     def read(self, tick: int) -> None:
@@ -198,11 +194,6 @@ class OutputPort:
         """Whether faults act on it, or have delayed messages."""
         return self._faulty is not None
 
-    def note_intruder(self, tick: int, process: int) -> None:
-        """Report a process that has published in the writer's place."""
-        self.writer.intruder = process
-        self._report(tick)
-
     def write(self, tick: int, now: int | None) -> bool:
         """Write the message if that is due; return False if it was too late."""
         writer = self.writer
@@ -220,7 +211,7 @@ class OutputPort:
                 writer.send()
             in_time = (self._faulty or writer).write(tick, now, basis)
         if writer.intruder or writer.held_up or writer.refused:
-            self._report(tick)
+            self.report(tick)
         return in_time
 
     def flush(self, tick: int, now: int | None) -> None:
@@ -228,7 +219,7 @@ class OutputPort:
         if self._faulty is not None:
             self._faulty.flush(tick, now)
 
-    def _report(self, tick: int) -> None:
+    def report(self, tick: int) -> None:
         """Raise an alarm for the writer's findings in its own mailbox."""
         writer = self.writer
         if writer.refused != self._refused:
@@ -259,7 +250,6 @@ class OutputPorts:
         alarms: AlarmWriter,
         inputs: InputPorts,
         sent: Collection[str] = (),
-        is_compiled: bool = True,
     ) -> None:
         """Open the mailboxes.
 
@@ -270,7 +260,6 @@ class OutputPorts:
             alarms: Where faults of mailboxes are reported.
             inputs: What the task reads.
             sent: The ports whose messages the level sends itself.
-            is_compiled: As in `InputPorts`.
         """
         segment.message_classes |= {
             name: level.outputs[port].message
@@ -286,23 +275,16 @@ class OutputPorts:
             level.place_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.follow(segment, writer, alarms)
-        self._compiled = [port for port in self._ports if is_compiled and can_write(port.writer)]
+        self._compiled = [port for port in self._ports if can_write(port.writer)]
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
-        self._by_hand = [port for port in self._ports if port not in self._compiled]
+        self._others = [port for port in self._ports if port not in self._compiled]
+        self._is_faulty = False
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Apply these faults from now on."""
         for port in self._ports:
             port.apply(faults)
-        self._divide()
-
-    def _divide(self) -> None:
-        """Leave the ports on which faults act to Python, and no others that machine code writes."""
-        for at, port in enumerate(self._compiled):
-            self._table.enable(at, not port.is_faulty)
-        self._by_hand = [
-            port for port in self._ports if port.is_faulty or port not in self._compiled
-        ]
+        self._is_faulty = any(port.is_faulty for port in self._ports)
 
     @property
     def bus_errors(self) -> int:
@@ -314,24 +296,23 @@ class OutputPorts:
 
         `now`: the clock's tick, if the cycle's end may have passed.
         """
-        in_time, intruded = self._table.write(tick, now)
-        if intruded:
-            for at, port in enumerate(self._compiled):
-                if process := self._table.intruder(at):
-                    port.note_intruder(tick, process)
-        is_healed = False
-        for port in self._by_hand:
-            was_faulty = port.is_faulty
+        ports = self._ports
+        if now is None and not self._is_faulty:
+            ports = self._others
+            if self._table.write(tick):
+                for port in self._compiled:
+                    port.report(tick)
+        in_time = True
+        for port in ports:
             if not port.write(tick, now):
                 in_time = False
-            is_healed |= was_faulty and not port.is_faulty
-        if is_healed:
-            self._divide()
+        if self._is_faulty:
+            self._is_faulty = any(port.is_faulty for port in self._ports)
         return in_time
 
     def flush(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due, in a cycle that writes nothing."""
-        for port in self._by_hand:
+        for port in self._ports:
             port.flush(tick, now)
 
     @property

@@ -25,7 +25,7 @@ from rack.boards.run.ports import OutputPorts
 from tests.backplane.bus import NAME, SIZES, Point, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
 from tests.bare_level import BareLevel
-from tests.link import Link, ReadingTask, WritingTask
+from tests.link import Link, ReadingTask, WritingTask, accesses
 
 ANSWER = "reader.answer"
 DEPTH = 8
@@ -66,19 +66,19 @@ class End:
         inputs = self._link.reader.ports
         alarms = AlarmWriter(self.segment, "reader")
         level = BareLevel()
-        return OutputPorts(
-            self.segment, level, {"answer": ANSWER}, alarms, inputs, is_compiled=self._is_compiled
-        )
+        with accesses(self._is_compiled):
+            return OutputPorts(self.segment, level, {"answer": ANSWER}, alarms, inputs)
 
     def write(self, late: int) -> None:
         """Write in a cycle that ends `late` ticks after its release."""
-        self.results.append(self._link.writer.cycle(self._release("writer"), self.tick + late))
+        now = self.tick + late if late else None
+        self.results.append(self._link.writer.cycle(self._release("writer"), now))
 
     def read(self) -> None:
         """Read, and answer."""
         tick = self._release("reader")
         message = self._link.reader.cycle(tick).message
-        self.results.append((bytes(message.raw), self._answers.write(tick, tick)))
+        self.results.append((bytes(message.raw), self._answers.write(tick, None)))
 
     def cycle(self, count: int) -> None:
         """Let both ends cycle."""
@@ -243,10 +243,10 @@ def test_a_message_rests_on_the_oldest_of_its_sources_that_have_come(make_bus: M
     readers = [Reader(segment, name) for name in names]
     writer = Writer(segment, ANSWER)
     table = WriteTable([(writer, readers)])
-    assert table.write(0, None) == (True, 0)
+    assert not table.write(0)
     assert writer.slots.heads[1][Slot.BASIS] == 0
     for reader, serial, basis in zip(readers, (1, 1, 0), (30, 20, 10), strict=True):
         reader.serial = serial
         reader.basis = basis
-    table.write(40, None)
+    table.write(40)
     assert writer.slots.heads[2][Slot.BASIS] == 20
