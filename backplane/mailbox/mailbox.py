@@ -17,6 +17,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from struct import Struct
 from typing import Generic, NamedTuple, TypeVar
 from weakref import WeakSet
 
@@ -27,6 +28,8 @@ from rack.backplane.message import AnyMessage, Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
+# Signature, basis, tick and visibility: see `words.Slot`.
+_HEAD = Struct("@8xq16xq8x2q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -285,16 +288,17 @@ class Reader:
         slots = self.slots
         if not slots.fetch(serial):
             return False
-        if slots.signature != self._signature:
+        signature, basis, tick, visible = _HEAD(slots.record)
+        if signature != self._signature:
             if not slots.is_lawful(self._signature):
                 return False
-            self._signature = slots.signature
+            self._signature = signature
             self._unchanged = self._readings[Verdict.OLD]
         self.good[:] = slots.record
         self.serial = serial
-        self.newest = slots.tick
-        self.visible = slots.visible
-        self.basis = slots.basis
+        self.newest = tick
+        self.visible = visible
+        self.basis = basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:

@@ -104,7 +104,6 @@ class Slots:
     stamp_ns = Word(Slot.STAMP_NS)
     signature = Word(Slot.EPOCH)
     chain = Word(Slot.CHECK)
-    basis = Word(Slot.BASIS)
     serial = Word(Slot.SERIAL)
     tick = Word(Slot.TICK)
     visible = Word(Slot.VISIBLE_AT)
@@ -217,7 +216,8 @@ class Slots:
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
         self.load(serial)
-        return self.serial == serial and self.is_sound
+        words = self.words
+        return words[_SERIAL] == serial and words[_CHECK] == xxh3(self.covered, words[_CHAIN])
 
     def between(self, before: int, newest: int) -> Iterator[AnyMessage]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""

@@ -58,11 +58,12 @@ class ReadTable:
         for port, line in zip(self._ports, self._lines, strict=True):
             _fill_read_port(port, line.watched)
         self._read_ports = read_ports.load() if self._lines else lambda *_: 0
-        self._table = self._ports.ctypes.data, len(self._lines)
+        self._address = self._ports.ctypes.data
+        self._count = len(self._lines)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
-        touched = self._read_ports(*self._table, tick)
+        touched = self._read_ports(self._address, self._count, tick)
         if touched:
             for at, line in enumerate(self._lines):
                 if touched >> at & 1:
@@ -151,12 +152,13 @@ class WriteTable:
             port["ahead"] = spec.ahead - spec.phase
             port["delay"] = writer.visible_at(0, None)
         self._write_ports = write_ports.load() if writers else lambda *_: False
-        self._table = self._ports.ctypes.data, len(writers)
+        self._address = self._ports.ctypes.data
+        self._count = len(writers)
 
     def write(self, tick: int) -> bool:
         """Write the messages that are due, in a cycle whose end has not come; say whether a writer
         has an intruder."""
-        is_intruded: bool = self._write_ports(*self._table, tick, monotonic_ns())
+        is_intruded: bool = self._write_ports(self._address, self._count, tick, monotonic_ns())
         if is_intruded:
             for writer, port in zip(self._writers, self._ports, strict=True):
                 writer.intruder = int(port["intruder"])
