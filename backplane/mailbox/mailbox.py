@@ -295,10 +295,11 @@ class Reader:
             self._signature = signature
             self._unchanged = self._readings[Verdict.OLD]
         self.good[:] = slots.record
-        self.serial = serial
-        self.newest = tick
-        self.visible = visible
-        self.basis = basis
+        words = self.words
+        words[ReaderState.SERIAL] = serial
+        words[ReaderState.NEWEST] = tick
+        words[ReaderState.VISIBLE] = visible
+        words[ReaderState.BASIS] = basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:

@@ -14,13 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rack.backplane.address_map import MAILBOX_HEAD_SIZE, slot_stride
+from rack.backplane.errors import MailboxError
 from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.mailbox import Reader, ReadStatistics, Writer
 from rack.backplane.mailbox.slots import Slots, claim
 from rack.backplane.segment import Segment, unlink
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, Box, Slot
-from rack.boards.run.port_tables import WriteTable
+from rack.boards.run.port_tables import WriteTable, address_of
 from rack.boards.run.ports import OutputPorts
 from tests.backplane.bus import NAME, SIZES, Point, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
@@ -250,3 +251,10 @@ def test_a_message_rests_on_the_oldest_of_its_sources_that_have_come(make_bus: M
         reader.basis = basis
     table.write(40)
     assert writer.slots.heads[2][Slot.BASIS] == 20
+
+
+def test_memory_that_is_not_aligned_to_words_is_refused() -> None:
+    memory = memoryview(bytearray(64))
+    assert address_of(memory[8:]) == address_of(memory) + 8
+    with pytest.raises(MailboxError, match=r"^memory at 0x[0-9a-f]+ is not aligned to 8 bytes"):
+        address_of(memory[4:])
