@@ -205,15 +205,15 @@ def test_a_mistake_in_python_shows_in_the_order(
 # Machine code
 
 PATTERNS = (
+    (r"^$", ("branch",)),
     (r"fence acq_rel", ("fence",)),
-    (r"load atomic .* acquire", ("load word", "fence")),
+    (r"load atomic .* acquire", ("load head", "fence")),
     (r"store atomic .* release", ("fence", "store head")),
     (r"@llvm\.memcpy.* dereferenceable\(16\)", ("copy signature",)),
     (r"@llvm\.memcpy", ("copy message",)),
     (r"@XXH3", ("check",)),
 )
-"""Instructions, and what they do by the model's names; a single word is that of a head or none that
-decides."""
+"""Instructions, and what they do by the model's names."""
 
 
 def instructions(function: str, program: str) -> list[str]:
@@ -235,13 +235,13 @@ def instructions(function: str, program: str) -> list[str]:
 def of_machine_code() -> dict[str, tuple[str, ...]]:
     """Return the accesses of the machine code, by the model's name for what they do."""
     written = instructions("publish", "write_ports")
-    written = written[written.index("check") + 1 :]
+    written = [one for one in written[written.index("check") + 1 :] if one != "branch"]
     read = instructions("read_port", "read_ports")
-    # After the head it looks, from message to message, which is visible.
-    read = [*read[:2], *read[read.index("copy signature") : read.index("check")]]
+    # Before the first branch it loads the head, then looks, message by message, which is visible.
+    read = read[: read.index("branch")] + read[read.index("copy signature") : read.index("check")]
     return {
         "publish": tuple(one.replace("copy", "store") for one in written),
-        "read": tuple(one.replace("copy", "load").replace("word", "head") for one in read),
+        "read": tuple(one.replace("copy", "load") for one in read if one != "branch"),
     }
 
 
