@@ -48,7 +48,6 @@ lint: $(STAMP) ## check style and types
 dist: $(STAMP) ## build wheel and sdist of the version in pyproject.toml into dist/
 	rm -rf dist
 	$(BIN)/python -m build --no-isolation --outdir dist .
-	rm -rf *.egg-info
 
 lock: $(STAMP) ## pin the newest versions that pyproject.toml permits
 	$(BIN)/python -m pip install --quiet uv
@@ -56,7 +55,7 @@ lock: $(STAMP) ## pin the newest versions that pyproject.toml permits
 		--extra can --extra charts --extra dev --extra export --extra lab --extra lan --extra live --extra notebook pyproject.toml --output-file requirements.lock
 
 clean: ## remove the environment and what tools have left; runs/ stays
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) dist .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 $(STAMP): requirements.lock pyproject.toml
@@ -69,9 +68,8 @@ $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --no-index --editable .
-	@# `rack` as a package: type checkers and editors read no import hook, and a folder called rack in front of it, as a
-	@# clone is in the folder that holds it, is none. They follow the links; Python finds the files themselves.
+	@# The editable install puts this folder on Python's path: links give type checkers and editors the package `rack`, too.
 	@mkdir -p $(VENV)/src/rack && for floor in $(FLOORS); do ln -sfn ../../../$$floor $(VENV)/src/rack/$$floor; done
-	@ln -sfn ../../../tools/front/__init__.py $(VENV)/src/rack/__init__.py
-	@for packages in $(VENV)/lib/python3*/site-packages; do echo ../../../src > $$packages/rack.pth; done
+	@for file in __init__.py __main__.py py.typed; do ln -sfn ../../../tools/front/rack/$$file $(VENV)/src/rack/$$file; done
+	@ln -sfn ../../tools/front/nasrem_rack.py $(VENV)/src/nasrem_rack.py
 	@touch $(STAMP)

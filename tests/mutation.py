@@ -291,7 +291,7 @@ class Verdict:
     failed: tuple[str, ...] = ()
 
 
-def tested(folder: Path, options: Sequence[str], marks: str = "not alone") -> Verdict:
+def tested(folder: Path, options: Sequence[str], marks: str) -> Verdict:
     """Run tests on the copy in a folder, in a session of their own; nothing of it stays."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n0", "-p", "no:cacheprovider"]
     command += ["-m", marks, f"--timeout={TEST_BOUND_S}"]
@@ -394,9 +394,9 @@ class Bench:
     def _is_sound(self, test: str) -> bool:
         """Say whether a test passes on the copy. A mutant may have changed a parameter in its
         name: then all parameters count."""
-        verdict = tested(self.folder, [test])
+        verdict = tested(self.folder, [test], "not alone")
         if verdict.word == "not found":
-            verdict = tested(self.folder, [test.partition("[")[0]])
+            verdict = tested(self.folder, [test.partition("[")[0]], "not alone")
         return verdict.word == "survived"
 
     def _copy(self, patches: Sequence[tuple[str, str, str]]) -> None:

@@ -129,7 +129,7 @@ def test_wheel_and_source_archive_are_of_one_version(installed: Path, tmp_path: 
     version = project["version"]
     with ZipFile(next(installed.parents[1].glob("*.whl"))) as wheel:
         tops = {name.partition("/")[0] for name in wheel.namelist()}
-    assert {name for name in tops if not name.endswith(".dist-info")} == {"rack"}
+    assert {name for name in tops if not name.endswith(".dist-info")} == {"rack", "nasrem_rack.py"}
     names = sorted(path.name for path in installed.parents[1].glob("nasrem_rack-*"))
     assert names == [f"nasrem_rack-{version}-py3-none-any.whl", f"nasrem_rack-{version}.tar.gz"]
     assert run(tmp_path, installed / "rack", "--version") == f"rack {version}\n"
@@ -143,3 +143,46 @@ def test_a_folder_called_rack_is_not_taken_for_the_project(tmp_path: Path) -> No
         (tmp_path / "rack" / floor).mkdir(parents=True)
     found = run(tmp_path, sys.executable, "-c", "import rack.tools.cli as cli; print(cli.__file__)")
     assert found.strip() == str(ROOT / "tools" / "cli.py")
+
+
+def answer(program: Path, **environment: str) -> tuple[int, str]:
+    done = subprocess.run(
+        (program, "list"),
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+        env={**os.environ, **environment},
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_a_package_rack_of_others_that_is_found_first_is_named(tmp_path: Path) -> None:
+    (tmp_path / "rack").mkdir()
+    (tmp_path / "rack" / "__init__.py").write_text("stand = 19")
+    status, text = answer(Path(sys.executable).with_name("rack"), PYTHONPATH=str(tmp_path))
+    place = tmp_path / "rack" / "__init__.py"
+    assert (status, text) == (
+        1,
+        f"rack: {place} is not nasrem-rack's package `rack`: remove it from PYTHONPATH\n",
+    )
+
+
+@pytest.mark.slow
+def test_a_distribution_rack_that_was_installed_over_ours_is_named(installed: Path) -> None:
+    place = next(installed.parent.glob("lib/python3*/site-packages/rack/__init__.py"))
+    other = place.parents[1] / "rack-0.1.4.dist-info"
+    ours = place.read_text()
+    try:
+        place.write_text("from .dict import dict_rack")
+        place.with_name("dict.py").touch()
+        other.mkdir()
+        (other / "METADATA").write_text("Metadata-Version: 2.1\nName: rack\nVersion: 0.1.4\n")
+        status, text = answer(installed / "rack")
+    finally:
+        place.write_text(ours)
+        place.with_name("dict.py").unlink()
+        shutil.rmtree(other)
+    assert status == 1
+    assert text.startswith(f"rack: {place} is not nasrem-rack's package `rack`: uninstall the")
+    assert text.count("\n") == 1

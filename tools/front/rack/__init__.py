@@ -1,4 +1,4 @@
-"""A rack from a Python program or a notebook.
+"""The package of nasrem-rack: a rack from a Python program or a notebook.
 
     import rack
 
