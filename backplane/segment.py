@@ -11,6 +11,7 @@ import json
 import mmap
 import os
 import stat
+import sys
 import time
 from dataclasses import asdict
 from functools import cache
@@ -43,9 +44,11 @@ LOOK_S = 0.02
 _LIFE = 8 * Head.LAUNCHER_PID
 """Bus address on which the launcher holds a lock for as long as it lives."""
 PROCESSOR = "x86_64"
-"""Stores become visible to other cores in program order: mailboxes, rings and control blocks need
-that (see `rack.backplane.mailbox.slots`). On arm64 they would need barriers, which nobody has
-argued or tested."""
+"""Stores become visible to other cores in program order: rings and control blocks need that, and
+mailboxes where Python accesses them (see `rack.backplane.mailbox.slots`). Nobody has run a rack
+elsewhere."""
+TRY = "RACK_TRY_PROCESSOR"
+"""Environment variable that has a rack tried on other processors with 64 bits."""
 
 
 class Launch(NamedTuple):
@@ -113,8 +116,13 @@ class Segment:
             SegmentError: The name is in use, memory is short, or the processor is another.
         """
         if (machine := os.uname().machine) != PROCESSOR:
+            here = f"rack '{layout.rack}': the processor here is {machine}"
+            if sys.maxsize < 1 << 32:
+                raise SegmentError(f"{here}, without atomic access to 64 bits")
             why = f"the backplane's memory order is argued for {PROCESSOR} alone"
-            raise SegmentError(f"rack '{layout.rack}': the processor here is {machine}; {why}")
+            if not os.environ.get(TRY):
+                raise SegmentError(f"{here}; {why}; {TRY}=1 tries it all the same")
+            sys.stderr.write(f"{here}; {why}: nobody has tested this\n")
         texts = [encode_json(asdict(layout)).encode(), config.encode(), published.encode()]
         places = AddressMap(layout)
         size = pages(places.size + sum(len(t) for t in texts))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic_ns
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
 from rack.backplane.layout import Protocol
@@ -18,6 +19,7 @@ from rack.backplane.trace import FIELDS, Flag, TraceWriter
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
 from rack.backplane.words import Block
 from rack.boards.faults.kind import KINDS
+from rack.boards.run import port_tables, ports
 from rack.boards.run.ports import InputPorts, OutputPorts
 from rack.levels.level import Reading
 from tests.backplane.bus import NAME, layout, mailbox, task
@@ -37,23 +39,39 @@ class Seen(NamedTuple):
     is_lost: bool
 
 
+@contextmanager
+def accesses(are_compiled: bool) -> Iterator[None]:
+    """Let ports that are opened here be accessed by machine code, where it can, or all by the
+    Python classes."""
+    if are_compiled:
+        yield
+        return
+    with (
+        patch.object(ports, "can_write", lambda writer: False),
+        patch.object(port_tables, "can_read", lambda line: False),
+    ):
+        yield
+
+
 class WritingTask:
     """The task `writer`: each of its messages holds its release tick in every place."""
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, is_compiled: bool = True) -> None:
         self.every = segment.layout.task("writer").every
         alarms = AlarmWriter(segment, "writer")
         self.level = BareLevel()
         inputs = InputPorts(segment, self.level, {}, alarms)
-        self.ports = OutputPorts(segment, self.level, {"point": NAME}, alarms, inputs)
+        with accesses(is_compiled):
+            self.ports = OutputPorts(segment, self.level, {"point": NAME}, alarms, inputs)
         self._block, self._trace = segment.block("writer"), TraceWriter(segment, "writer")
 
     def cycle(self, tick: int, now: int | None = None) -> bool:
-        """Write, trace the cycle, say that it is done; the clock stands at `now`, or at `tick`."""
+        """Write, trace the cycle, say that it is done; the clock stands at `now`, or its end has
+        not come."""
         message = self.level.ports["point"]
         message.id, message.row = tick, tick
         cut_off = self.ports.bus_errors
-        in_time = self.ports.write(tick, tick if now is None else now)
+        in_time = self.ports.write(tick, now)
         self.end(tick, int(Flag.BUS_ERROR) if self.ports.bus_errors > cut_off else 0)
         return in_time
 
@@ -72,16 +90,17 @@ class WritingTask:
 class ReadingTask:
     """The task `reader`; `seen` is what its reads gave."""
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, is_compiled: bool = True) -> None:
         self.every = segment.layout.task("reader").every
         self.level = BareLevel()
-        self.ports = InputPorts(
-            segment,
-            self.level,
-            {"point": NAME},
-            AlarmWriter(segment, "reader"),
-            inbox=open_inbox(segment, "reader"),
-        )
+        with accesses(is_compiled):
+            self.ports = InputPorts(
+                segment,
+                self.level,
+                {"point": NAME},
+                AlarmWriter(segment, "reader"),
+                inbox=open_inbox(segment, "reader"),
+            )
         self.seen: list[Seen] = []
 
     def cycle(self, tick: int) -> Reading:
@@ -99,9 +118,12 @@ class Link:
     """Both tasks. When both are due the reader comes first, or the writer, as their processors have
     it."""
 
-    def __init__(self, segment: Segment, reader_first: bool = False) -> None:
+    def __init__(
+        self, segment: Segment, reader_first: bool = False, is_compiled: bool = True
+    ) -> None:
         self.segment = segment
-        self.writer, self.reader = WritingTask(segment), ReadingTask(segment)
+        self.writer = WritingTask(segment, is_compiled)
+        self.reader = ReadingTask(segment, is_compiled)
         self.active: list[FaultEntry] = []
         self._reader_first = reader_first
         self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
@@ -211,11 +233,12 @@ def links(rack: str) -> Iterator[MakeLink]:
         reader_first: bool = False,
         depth: int = 1024,
         cycles: int = 1,
+        is_compiled: bool = True,
     ) -> Link:
         box = mailbox(protocol, every=cycles * rates[0], delay=rates[0], depth=depth)
         tasks = task("writer", every=rates[0], depth=64), task("reader", every=rates[1], slot=3)
         segment = Segment.create(layout(f"{rack}-{len(made)}", [box], tasks), "")
-        made.append(Link(segment, reader_first))
+        made.append(Link(segment, reader_first, is_compiled))
         return made[-1]
 
     yield make

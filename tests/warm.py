@@ -35,7 +35,7 @@ from rack.boards.crate.line import environment
 from tests.processes import children_of
 
 LIBRARIES = {
-    "rack.boards.crate": ("rack.boards.crate.crate",),
+    "rack.boards.crate": ("rack.boards.crate.crate", "numba"),
     "rack.tools.recording.recorder": (
         "rack.boards.config.commands",
         "rack.levels.systems.joint_boards.messages",

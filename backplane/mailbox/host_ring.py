@@ -29,7 +29,7 @@ class HostWriter(DoubleBufferWriter):
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
-        self._box = self._slots.box
+        self._box = self.slots.box
 
     def send(self, tick: int) -> bool:
         """Publish `message`, written at `tick`; return False, and count it, when the ring is

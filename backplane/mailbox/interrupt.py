@@ -102,6 +102,7 @@ class InterruptLine:
         self._suspect = 0
         if serial > head:
             return
+        self._slots.fence()
         serial = max(serial, oldest_kept(head, self._slots.depth))
         while serial <= head:
             words = heads[serial & mask]

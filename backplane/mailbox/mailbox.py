@@ -21,17 +21,15 @@ from struct import Struct
 from typing import Generic, NamedTuple, TypeVar
 from weakref import WeakSet
 
-from xxhash import xxh3_64_intdigest as xxh3
-
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.slots import Slots, claim, epoch_of, pid_of
 from rack.backplane.message import AnyMessage, Message
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, Slot
+from rack.backplane.words import Box, Slot, Word
 
-# Plain integers for the hot path.
-_HEAD = Struct("@8Q").unpack_from
+# Signature, basis, tick and visibility: see `words.Slot`.
+_HEAD = Struct("@8xq16xq8x2q").unpack_from
 NOT_YET = 1 << 62
 """Tick of the newest message before there is one: its age is negative, so it is never too old."""
 MAX_STEP_BACK = 4
@@ -82,10 +80,10 @@ class Writer:
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.mailbox(name)
-        self._slots = Slots(segment, spec)
+        self.slots = Slots(segment, spec)
         self._delay = spec.delay
         self._due = spec.delay  # ticks from a release until its message must be written
-        self.message = self._slots.message
+        self.message = self.slots.message
         self.bus_errors = 0
         self.held_up = 0
         """Accesses so far that timed out because a dead or stopped process held the lock."""
@@ -99,7 +97,8 @@ class Writer:
         self._claimed = segment.box(name)
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
         self.claim()
-        self._slots.resume(self._slots.signature)
+        self.slots.clear_unpublished()
+        self.slots.resume(self.slots.signature)
         _WRITERS.add(self)
 
     def claim(self) -> None:
@@ -114,7 +113,7 @@ class Writer:
         box[Box.WRITER_PID] = os.getpid()
         box[Box.EPOCH] = epoch = epoch_of(box[Box.EPOCH] + 1)
         # One store: no reader sees half a claim.
-        box[Box.CLAIMANT] = self._slots.signature = claim(epoch, os.getpid())
+        box[Box.CLAIMANT] = self.slots.signature = claim(epoch, os.getpid())
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`, released at `tick`; return False when it is too late.
@@ -144,12 +143,12 @@ class Writer:
 
         `damage`: see `Slots.publish`.
         """
-        self.intruder = self._slots.publish(tick, visible_at, basis, damage)
+        self.intruder = self.slots.publish(tick, visible_at, basis, damage)
         return True
 
     def lose(self) -> None:
         """Publish a serial without its message, as an injected loss does."""
-        self._slots.lose()
+        self.slots.lose()
 
     def outgoing(self) -> Iterator[None]:
         """Put each message of the cycle into `message` in turn: here the one that is there."""
@@ -161,7 +160,7 @@ class Writer:
     @property
     def serial(self) -> int:
         """Serial of the newest message written."""
-        return self._slots.serial
+        return self.slots.serial
 
     def close(self) -> None:
         """Release the claim."""
@@ -192,43 +191,69 @@ class ReadStatistics:
     lost: int = 0  # of a queue: serials without a message
 
 
+class ReaderState:
+    """Words of a reader's state: private memory, which compiled reads share with the reader."""
+
+    SERIAL = 0
+    FOUND = 1
+    NEWEST = 2
+    VISIBLE = 3
+    BASIS = 4
+    ACCESSES = 5
+    TRANSFERS = 6
+    SIGNATURE = 7  # of the writer of the last good message
+    JUDGED = 8  # of the reader's `MessageWatch`: serial of the newest message judged
+    JUDGED_TICK = 9  # and its release tick
+    COUNT = 10
+
+
 class Reader:
     """A reader of a mailbox, under protocol time-slice. The work of a read is bounded by the
-    mailbox's depth."""
+    mailbox's depth.
+
+    Attributes:
+        serial: Serial of the last good message; 0: none.
+        found: Serial of the newest message found by the last read, good or not.
+        newest: Release tick of the last good message.
+        visible: Tick from which the last good message may be read.
+        basis: Tick of the oldest information that the last good message rests on.
+        accesses: Reads so far.
+        transfers: Messages copied so far.
+        words: The state of the reader, with all of these: see `ReaderState`.
+    """
+
+    serial = Word(ReaderState.SERIAL)
+    found = Word(ReaderState.FOUND)
+    newest = Word(ReaderState.NEWEST)
+    visible = Word(ReaderState.VISIBLE)
+    basis = Word(ReaderState.BASIS)
+    accesses = Word(ReaderState.ACCESSES)
+    transfers = Word(ReaderState.TRANSFERS)
+    _signature = Word(ReaderState.SIGNATURE)
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.mailbox(name)
         self.slots = slots = Slots(segment, self.spec)
         self._box = slots.box
         self._heads = slots.heads
-        self._places = slots.places
         self._mask = slots.mask
         self._depth = slots.depth
         # The last good message has its own buffer: a corrupt copy never reaches it.
         good = Slots(segment, self.spec)
-        self._record = slots.record
-        self._covered = slots.covered
-        self._good = good.record
+        self.good = good.record
+        """The last good message, with the head of its slot."""
         self.message = good.message
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
         self._new = self._readings[Verdict.NEW]
         self._unchanged = self._readings[Verdict.NONE]
-        self._signature = 0
-        self.serial = 0
-        """Serial of the last good message; 0: none."""
-        self.found = 0
-        """Serial of the newest message found by the last read, good or not."""
+        self.words = memoryview(bytearray(8 * ReaderState.COUNT)).cast("q")
         self.newest = NOT_YET
-        """Release tick of the last good message."""
-        self.visible = 0
-        """Tick from which the last good message may be read."""
-        self.basis = 0
-        """Tick of the oldest information that the last good message rests on."""
-        self.accesses = 0
-        """Reads so far."""
-        self.transfers = 0
-        """Messages copied so far."""
         self.statistics = ReadStatistics()
+
+    def reading(self, is_new: bool) -> Reading[AnyMessage]:
+        """Return the last good message as that of a read, with the verdict NEW or, unless there is
+        none yet, OLD."""
+        return self._new if is_new else self._unchanged
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict."""
@@ -236,6 +261,7 @@ class Reader:
         serial = self._box[0]
         last = self.serial
         if serial != last:
+            self.slots.fence()
             # Older messages are overwritten: a serial beyond the slots fails when it is taken.
             oldest = last if serial - last < self._depth else serial - self._depth
             heads = self._heads
@@ -259,21 +285,21 @@ class Reader:
     def _obtain(self, serial: int) -> bool:
         """Keep a message as the last good one; False when it is not good."""
         self.transfers += 1
-        record = self._record
-        record[:] = self._places[serial & self._mask]
-        _, epoch, chain, check, basis, found, tick, visible = _HEAD(record)
-        if found != serial or check != xxh3(self._covered, chain):
+        slots = self.slots
+        if not slots.fetch(serial):
             return False
-        if epoch != self._signature:
-            if not self.slots.is_lawful(self._signature):
+        signature, basis, tick, visible = _HEAD(slots.record)
+        if signature != self._signature:
+            if not slots.is_lawful(self._signature):
                 return False
-            self._signature = epoch
+            self._signature = signature
             self._unchanged = self._readings[Verdict.OLD]
-        self._good[:] = record
-        self.serial = serial
-        self.newest = tick
-        self.visible = visible
-        self.basis = basis
+        self.good[:] = slots.record
+        words = self.words
+        words[ReaderState.SERIAL] = serial
+        words[ReaderState.NEWEST] = tick
+        words[ReaderState.VISIBLE] = visible
+        words[ReaderState.BASIS] = basis
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
@@ -322,6 +348,7 @@ class Reader:
     def peek(self) -> Reading[AnyMessage]:
         """Return the newest whole message at once, under any protocol: for the host side."""
         self.found = head = self._box[0]
+        self.slots.fence()
         if head == self.serial:
             return self._unchanged
         return self._new if self._obtain(head) else self._take_older(head, NOT_YET)

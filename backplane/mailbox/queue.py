@@ -83,7 +83,7 @@ class QueueWriter(Writer):
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
-        slots = self._slots
+        slots = self.slots
         # Messages are published to a copy of the mailbox's head, then shown together.
         self._shared = slots.box
         slots.box = memoryview(bytearray(slots.box)).cast("q")
@@ -116,7 +116,7 @@ class QueueWriter(Writer):
             basis = tick
         visible_at = self.visible_at(tick, now)
         for _ in self.outgoing():
-            self._slots.publish(tick, visible_at, basis)
+            self.slots.publish(tick, visible_at, basis)
         self.show()
         return self.is_in_time(tick, now)
 
@@ -129,7 +129,7 @@ class QueueWriter(Writer):
     def outgoing(self) -> Iterator[None]:
         """Put each message of the cycle into `message` in turn; the level finds its own content
         there again."""
-        slots = self._slots
+        slots = self.slots
         present = bytes(self.message.raw)
         if self._shared[Box.HEAD] != slots.box[Box.HEAD]:
             self.intruder = pid_of(slots.heads[(self.serial + 1) & slots.mask][Slot.EPOCH])
@@ -142,13 +142,13 @@ class QueueWriter(Writer):
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
         """Publish `message`, to be shown by `show`. `damage`: see `Slots.publish`."""
-        self._slots.publish(tick, visible_at, basis, damage)
+        self.slots.publish(tick, visible_at, basis, damage)
         return True
 
     def lose(self) -> None:
         """Publish a serial without its message, as an injected loss does: the reader finds the gap
         at its tick."""
-        slots = self._slots
+        slots = self.slots
         slots.heads[(self.serial + 1) & slots.mask][Slot.VISIBLE_AT] = self._shown_at
         slots.lose()
 
@@ -193,6 +193,7 @@ class QueueReader(Reader):
         earlier = list[AnyMessage]()
         head = box[Box.HEAD]
         last = min(box[Box.SENT], self.taken + self._depth)
+        self.slots.fence()
         if head > last and self.slots.fetch(head) and not self.slots.is_lawful(self._signature):
             # Count a message that is not the writer's, and that its next one will replace: it is
             # not taken.

@@ -5,10 +5,17 @@ one store of its serial in the mailbox's head. A writer killed at any instructio
 published message intact. A reader checks serial and checksum of its copy, so it never returns half
 a message.
 
-Memory order: the one writer fills the slot before it stores the head's serial. On x86-64 other
-cores see stores in that order. On weaker machines a reader may see the serial first: its copy then
-fails the check, or holds another serial, and the read steps back to the message before. Words are
-aligned to 8 bytes, so they are never torn.
+Memory order: the one writer fills a slot, then stores the head's serial with release; a reader
+loads the serial with acquire before it copies the slot, so it sees all of it. A copy may still be
+torn by a writer that laps the reader: the checksum shows that. It does not cover the signature,
+which is stored after the message and loaded before it: the writer's own is never taken for that of
+a forged message which it overwrites. Before a reader concludes from a head that a slot has not been
+reused (`keeps`), its copy is complete; in turn the writer fills no slot before the previous head is
+stored. Words are aligned to 8 bytes, so they are never torn.
+
+On x86-64 plain loads and stores of aligned words have this order, and Python's are such. Boards
+have it from machine code (`rack.boards.run.compiled_mailbox`), which also gives the rare paths in
+this folder a `fence`. tests/backplane/mailbox/model.py checks the protocol exhaustively.
 
 The checksum is XXH3, 64 bits, seeded with the checksum of the message before. So one pass over a
 message tells a reader whether its copy is whole and undamaged; and the newest checksum stands for
@@ -35,6 +42,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
 CHECKED_FROM = Slot.BASIS * 8
+SIGNED_FROM = Slot.CHAIN * 8
+"""Where a message begins in its slot, after its time stamp and its writer's signature, bytes."""
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole
@@ -119,6 +128,11 @@ class Slots:
         self.words = self.record[:SLOT_HEAD_SIZE].cast("Q")
         self.covered = self.record[CHECKED_FROM:]
 
+    @staticmethod
+    def fence() -> None:
+        """Keep accesses to memory before and after it apart: nothing on x86-64, where a board puts
+        an instruction in its place all the same."""
+
     def resume(self, signature: int) -> None:
         """Continue after the newest published message, as a writer."""
         # Without the sign: a flipped one is no reason to fail.
@@ -132,6 +146,14 @@ class Slots:
         self.chain = (
             self.heads[whole & self.mask][_CHECK] & UNSIGNED if whole and self.holds(whole) else 0
         )
+
+    def clear_unpublished(self) -> None:
+        """Empty the slots that a dead writer has filled and not published: no reader may take
+        them for messages of this writer's that are lost."""
+        head = self.box[Box.HEAD] & (UNSIGNED >> 1)
+        for words in self.heads:
+            if words[_SERIAL] > head:
+                words[_SERIAL] = 0
 
     def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
         """Copy the local message into the next slot, then publish it; return the process of an
@@ -150,17 +172,23 @@ class Slots:
         words[_CHAIN] = chain = words[_CHECK]
         words[_CHECK] = xxh3(self.covered, chain)
         words[_STAMP] = monotonic_ns()
-        self.places[at][:] = self.record
+        # In this order: the previous head, the message, its signature, this head.
+        self.fence()
+        self.places[at][SIGNED_FROM:] = self.record[SIGNED_FROM:]
         if damage:
             message = self.places[at][SLOT_HEAD_SIZE:]
             for bit in damage:
                 message[bit >> 3] ^= 1 << (bit & 7)
+        self.fence()
+        self.places[at][:SIGNED_FROM] = self.record[:SIGNED_FROM]
+        self.fence()
         box[0] = serial
         return intruder
 
     def lose(self) -> None:
         """Publish a serial without filling its slot."""
         self.serial += 1
+        self.fence()
         self.box[0] = self.serial
 
     def holds(self, serial: int) -> bool:
@@ -170,16 +198,26 @@ class Slots:
     def keeps(self, serial: int) -> bool:
         """Say whether that serial's slot has not been reused: a copy made before this call is then
         of that message."""
+        self.fence()
         return serial >= oldest_kept(self.box[0], self.depth)
 
     def visible_at(self, serial: int) -> int:
         """Return the tick from which the message in that serial's slot may be read."""
         return self.heads[serial & self.mask][_VISIBLE]
 
+    def load(self, serial: int) -> None:
+        """Copy that serial's slot, without any check, into the local record."""
+        place = self.places[serial & self.mask]
+        # If this is the signature of the message sought, all of that is in the slot.
+        self.record[:SIGNED_FROM] = place[:SIGNED_FROM]
+        self.fence()
+        self.record[SIGNED_FROM:] = place[SIGNED_FROM:]
+
     def fetch(self, serial: int) -> bool:
         """Copy a message into the local record; False when it is not whole, or another one."""
-        self.record[:] = self.places[serial & self.mask]
-        return self.serial == serial and self.is_sound
+        self.load(serial)
+        words = self.words
+        return words[_SERIAL] == serial and words[_CHECK] == xxh3(self.covered, words[_CHAIN])
 
     def between(self, before: int, newest: int) -> Iterator[AnyMessage]:
         """Yield a copy of each good message between two serials, as far as the slots reach back."""
@@ -188,9 +226,8 @@ class Slots:
                 yield copied(self.message)
 
     def copy(self, serial: int) -> bool:
-        """Copy that serial's slot, without any check, into the local record; False when it was
-        reused meanwhile."""
-        self.record[:] = self.places[serial & self.mask]
+        """Copy that serial's slot as `load` does; False when it was reused meanwhile."""
+        self.load(serial)
         return self.keeps(serial)
 
     @property

@@ -12,13 +12,13 @@ from __future__ import annotations
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.backplane.address_map import oldest_kept
-from rack.backplane.mailbox.mailbox import Reader
+from rack.backplane.mailbox.mailbox import Reader, ReaderState
 from rack.backplane.mailbox.queue import QueueReader
 from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED
 from rack.backplane.segment import Segment
 from rack.backplane.trace import CycleRecord
 from rack.backplane.watch.alarms import Alarm, Episodes
-from rack.backplane.words import Slot
+from rack.backplane.words import Slot, Word
 
 LONG_AGO = -(1 << 62)
 """Tick of the message before the first."""
@@ -29,12 +29,16 @@ class MessageWatch:
     judged.
 
     `seen` is the serial of the newest message judged, -1 before the first read; `newest` is its
-    release tick.
+    release tick. Both are words of the reader's state.
     """
+
+    seen = Word(ReaderState.JUDGED)
+    newest = Word(ReaderState.JUDGED_TICK)
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         self._reader = reader
         self._episodes = episodes
+        self.words = reader.words
         self.seen = -1
         self._spec = reader.spec
         self._slots = reader.slots

@@ -90,35 +90,40 @@ class WatchedReader(Watched):
     ) -> None:
         super().__init__(segment, reader, alarms, task)
         self._watch = SilenceWatch(segment, reader, self._episodes, task)
-        self._late_from = self._watch.late_from
-        self._quiet = self._watch.quiet
-        self._writer = segment.block(reader.spec.writer)
+        self.late_from = self._watch.late_from
+        self.quiet = self._watch.quiet
+        self.writer = segment.block(reader.spec.writer)
+        """Control block of the mailbox's writer."""
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict, and whether its writer is
         lost."""
         reader = self.reader
-        watch = self._watch
         reading = reader.read(tick)
+        return self.conclude(
+            tick,
+            reading,
+            is_odd=self._has_trouble or reader.found != self._watch.seen,
+            is_silent=tick - reader.newest >= self.quiet or self.writer[Block.LOST] > 0,
+        )
+
+    def conclude(
+        self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
+    ) -> Reading[AnyMessage]:
+        """Return a reading as this read gives it.
+
+        Args:
+            tick: Release tick of the reading cycle.
+            reading: What the reader itself gives.
+            is_odd: Whether messages are to be judged.
+            is_silent: Whether the writer's silence is.
+        """
+        if is_odd:
+            self._watch.judge(tick)
         if self._has_trouble:
-            watch.judge(tick)
             self._report(tick)
-        elif reader.found != watch.seen:
-            found = reader.found
-            newest = reader.newest
-            # The usual case of `judge`: the next message, good and in time.
-            if (
-                0 < found == watch.seen + 1
-                and watch.newest < newest > reader.visible - self._late_from
-            ):
-                watch.seen = found
-                watch.newest = newest
-            else:
-                watch.judge(tick)
-        if (
-            tick - reader.newest >= self._quiet or self._writer[Block.LOST]
-        ) and self._watch.is_lost(tick):
+        if is_silent and self._watch.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
 

@@ -53,6 +53,7 @@ from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
 from rack.boards.errors import LONGEST_REASON, one_line
 from rack.boards.faults.tasks import act_on_core
 from rack.boards.run.board import enter, run_clock_board, run_task_board
+from rack.boards.run.compiled_mailbox import load_machine_code
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
 from rack.levels.errors import RobotError
@@ -200,6 +201,7 @@ class Crate:
         report."""
         sys.path[:] = wanted.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
+        load_machine_code()
         for reference in wanted.classes:
             if reference in self._preloaded:
                 continue

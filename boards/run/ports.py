@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
 from rack.backplane.fault_table import FaultEntry
@@ -19,12 +19,10 @@ from rack.backplane.watch.watched_reader import GridReader, watched
 from rack.boards.exchange import Taken
 from rack.boards.faults.kind import kind_of
 from rack.boards.faults.message_steps import FaultyWriter
+from rack.boards.run.port_tables import Line, ReadTable, WriteTable, can_write
 from rack.boards.wiring import Source
 from rack.levels.level import LevelSection, Reading, Verdict
 from rack.levels.ports import Sender
-
-Line = tuple[dict[str, Reading[AnyMessage]], str, Callable[[int], Reading[AnyMessage]]]
-"""One mailbox to read: where its reading goes, and the function that reads it as of a tick."""
 
 
 class InputPorts:
@@ -60,7 +58,7 @@ class InputPorts:
         self.readers: dict[str, Reader] = {}
         # Where each reading goes: the ports themselves, or the dict of a port that reads many
         # mailboxes.
-        self._plan: list[Line] = []
+        plans: list[Line] = []
         self._rest: list[Line] = []
         for port, source in sources.items():
             boxes = {port: source} if isinstance(source, str) else source
@@ -77,10 +75,13 @@ class InputPorts:
                 found = open_port(mailbox, asynchronous=how is not None and how.asynchronous)
                 read = found.read if how is None else GridReader(found, how.grid).read
                 values[key] = Reading(found.reader.message, Verdict.NONE)
-                (self._plan if mailbox == plan else self._rest).append((values, key, read))
+                line = Line(values, key, read, found)
+                (plans if mailbox == plan else self._rest).append(line)
                 self.taken.append(Taken(values, key, found.reader))
                 self.readers[mailbox] = found.reader
-        self.reads_plan = bool(self._plan)
+        self.reads_plan = bool(plans)
+        self._plan_table = ReadTable(plans)
+        self._table = ReadTable(self._rest)
         self._readers = [entry.reader for entry in self.taken]
 
     def follow(self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter) -> None:
@@ -93,7 +94,8 @@ class InputPorts:
             queue.taken = reading.message.taken
             return reading
 
-        self._rest.append(({}, "", read_and_note))
+        self._rest.append(Line({}, "", read_and_note, found))
+        self._table = ReadTable(self._rest)
         self._readers.append(found.reader)
 
     def read(self, tick: int) -> None:
@@ -104,13 +106,11 @@ class InputPorts:
 
     def exchange(self, tick: int) -> None:
         """Transfer the plan over the bus, as of `tick`."""
-        for values, key, read in self._plan:
-            values[key] = read(tick)
+        self._plan_table.read(tick)
 
     def read_command_and_status(self, tick: int) -> None:
         """Read every other mailbox as of `tick`: commands, statuses, world model."""
-        for values, key, read in self._rest:
-            values[key] = read(tick)
+        self._table.read(tick)
 
     @property
     def bus_errors(self) -> int:
@@ -149,7 +149,7 @@ class OutputPort:
     ) -> None:
         spec = writer.spec
         self.writer = writer
-        self._sources = sources
+        self.sources = sources
         self._is_on_demand = spec.max_age > 0
         self._is_sent = not self._is_on_demand
         self._basis: int | None = None
@@ -189,6 +189,11 @@ class OutputPort:
         if self._faulty is not None:
             self._faulty.apply(chosen)
 
+    @property
+    def is_faulty(self) -> bool:
+        """Whether faults act on it, or have delayed messages."""
+        return self._faulty is not None
+
     def write(self, tick: int, now: int | None) -> bool:
         """Write the message if that is due; return False if it was too late."""
         writer = self.writer
@@ -198,7 +203,7 @@ class OutputPort:
         if (tick + self._ahead) % self._every or not self._is_sent:
             self.flush(tick, now)
         else:
-            basis = min([source.basis for source in self._sources if source.serial], default=tick)
+            basis = min([source.basis for source in self.sources if source.serial], default=tick)
             if self._is_on_demand:
                 self._is_sent = False
                 basis = basis if self._basis is None else self._basis
@@ -206,7 +211,7 @@ class OutputPort:
                 writer.send()
             in_time = (self._faulty or writer).write(tick, now, basis)
         if writer.intruder or writer.held_up or writer.refused:
-            self._report(tick)
+            self.report(tick)
         return in_time
 
     def flush(self, tick: int, now: int | None) -> None:
@@ -214,7 +219,7 @@ class OutputPort:
         if self._faulty is not None:
             self._faulty.flush(tick, now)
 
-    def _report(self, tick: int) -> None:
+    def report(self, tick: int) -> None:
         """Raise an alarm for the writer's findings in its own mailbox."""
         writer = self.writer
         if writer.refused != self._refused:
@@ -270,11 +275,16 @@ class OutputPorts:
             level.place_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.follow(segment, writer, alarms)
+        self._compiled = [port for port in self._ports if can_write(port.writer)]
+        self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
+        self._others = [port for port in self._ports if port not in self._compiled]
+        self._is_faulty = False
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
         """Apply these faults from now on."""
         for port in self._ports:
             port.apply(faults)
+        self._is_faulty = any(port.is_faulty for port in self._ports)
 
     @property
     def bus_errors(self) -> int:
@@ -286,10 +296,18 @@ class OutputPorts:
 
         `now`: the clock's tick, if the cycle's end may have passed.
         """
+        ports = self._ports
+        if now is None and not self._is_faulty:
+            ports = self._others
+            if self._table.write(tick):
+                for port in self._compiled:
+                    port.report(tick)
         in_time = True
-        for port in self._ports:
+        for port in ports:
             if not port.write(tick, now):
                 in_time = False
+        if self._is_faulty:
+            self._is_faulty = any(port.is_faulty for port in self._ports)
         return in_time
 
     def flush(self, tick: int, now: int | None) -> None:

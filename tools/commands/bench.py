@@ -86,10 +86,10 @@ def mailbox(
     rounds: int = option("--rounds N", "turns of every contestant", 200, min=1),
     as_json: Json = False,
 ) -> None:
-    """What does a message cost, next to iceoryx2 and pipes?
+    """What does a message cost, next to iceoryx2, HORUS and pipes?
 
-    Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2 and
-    pipes of multiprocessing. The ratio is to the best of these peers.
+    Messages of 64 B to 16 kB, one reader and four, by every protocol, by turns with iceoryx2,
+    HORUS and pipes of multiprocessing. The ratio is to the best of these peers.
     """
     from rack.tools.lab.benches.mailbox import CASES, measure
 

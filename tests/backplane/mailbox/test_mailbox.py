@@ -164,7 +164,7 @@ def test_a_forged_message_is_counted_with_the_process_that_it_names(make_bus: Ma
     write(writer, 0)
     assert seen(reader, 1) == (1, NEW)
     forger = Slots(segment, writer.spec)
-    forger.resume(claim(epoch_of(writer._slots.signature), 4321))
+    forger.resume(claim(epoch_of(writer.slots.signature), 4321))
     forger.publish(1, 2, 1)
     assert seen(reader, 2) == (1, OLD)
     statistics = reader.statistics

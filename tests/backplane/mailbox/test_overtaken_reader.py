@@ -120,7 +120,7 @@ class Overtaken:
 def test_a_reader_overtaken_at_any_instruction_reports_nothing_false(
     link: MakeLink, protocol: Protocol, kind: str
 ) -> None:
-    rack = link(protocol, rates=(1, READ_EVERY), depth=DEPTH)
+    rack = link(protocol, rates=(1, READ_EVERY), depth=DEPTH, is_compiled=False)
     reader, rung, at = Overtaken(rack), set(), 0
     reader.write(DEPTH)
     reader.read()

@@ -77,7 +77,7 @@ def test_a_forged_message_is_rejected_and_reported(segment: Segment, writer: Wri
     writer.write(10)
     assert reader.read(11).message.id == 1
     # A process without the claim signs as another process.
-    writer._slots.words[Slot.EPOCH] = claim(1, os.getpid() + 1)
+    writer.slots.words[Slot.EPOCH] = claim(1, os.getpid() + 1)
     writer.message.id = 2
     writer.write(20)
     assert reader.read(21).message.id == 1

@@ -19,12 +19,15 @@ import numpy as np
 
 from rack.backplane.layout import PROTOCOLS, InterruptSpec, Layout, MailboxSpec, Protocol, TaskSpec
 from rack.backplane.mailbox.interrupt import open_inbox
-from rack.backplane.mailbox.mailbox import Reader
-from rack.backplane.mailbox.protocols import open_reader, open_writer
+from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import AnyMessage, Command, field
 from rack.backplane.segment import Segment, unlink
+from rack.backplane.watch.alarms import AlarmWriter
+from rack.backplane.watch.silence_watch import ReadingTask
+from rack.backplane.watch.watched_reader import watched
 from rack.boards.config.layout import field_specs
 from rack.boards.faults.bounds import counting
+from rack.boards.run.port_tables import Line, ReadTable, WriteTable, can_read, can_write
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import (
@@ -156,17 +159,29 @@ def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
         segment = Segment.create(layout, "")
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
-        readers = [
-            _reading(open_reader(segment, box.name, inbox=open_inbox(segment, task)))
-            for task in box.readers
-        ]
+        readers = [_reading(segment, box, task) for task in box.readers]
     # Open, it needs no name: nothing is left even if this process is killed.
-    yield Transport(writer.message, writer.write, readers)
+    send = WriteTable([(writer, ())]).write if can_write(writer) else writer.write
+    yield Transport(writer.message, send, readers)
 
 
-def _reading(reader: Reader) -> Callable[[int], AnyMessage]:
-    read = reader.read
-    delay = reader.spec.delay
+def _reading(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], AnyMessage]:
+    """Return a function that reads as a board does; without its checks on the writer, where no
+    machine code makes them."""
+    inbox = open_inbox(segment, task)
+    found = watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
+    read = found.reader.read
+    delay = box.delay
+    message = found.reader.message
+    line = Line({}, box.name, found.read, found)
+    if can_read(line):
+        read_table = ReadTable([line]).read
+
+        def take_from_table(tick: int) -> AnyMessage:
+            read_table(tick + delay)
+            return message
+
+        return take_from_table
 
     def take(tick: int) -> AnyMessage:
         return read(tick + delay).message

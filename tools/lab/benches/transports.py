@@ -14,6 +14,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from shutil import rmtree
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
@@ -90,8 +91,38 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
             end.close()
 
 
+@contextmanager
+def horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
+    """Send a grey image of one row through a HORUS topic: no other message of it takes any number
+    of bytes."""
+    message = AnyMessage(dtype)
+    namespace = f"rack_bench_{os.getpid()}"
+    os.environ["HORUS_NAMESPACE"] = namespace
+    import horus
+
+    try:
+        image = horus.Image(1, dtype.itemsize, "mono8")
+        topic = horus.Topic(horus.Image)
+        topics = [horus.Topic(horus.Image) for _ in range(readers)]
+    finally:
+        rmtree(SHM_FOLDER / f"horus_{namespace}", ignore_errors=True)
+
+    def send(tick: int) -> None:
+        image.copy_from(bytes(message.raw))
+        topic.send(image)
+
+    def fetcher(receive: Callable[[], Any]) -> Callable[[memoryview], None]:
+        def fetch(raw: memoryview) -> None:
+            raw[:] = np.asarray(receive()).reshape(-1).data
+
+        return fetch
+
+    yield Transport(message, send, [_into(dtype, fetcher(one.recv)) for one in topics])
+
+
 PEERS = (
     Peer("iceoryx2 blackboard", "iceoryx2", iceoryx2_blackboard),
+    Peer("HORUS image", "horus", horus_image),
     Peer("multiprocessing pipe", "multiprocessing", multiprocessing_pipe),
 )
 

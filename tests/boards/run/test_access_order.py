@@ -1,0 +1,311 @@
+"""The accesses that the code makes to a mailbox are those of the model, in its order: Python's as
+they are recorded, and the machine code's as they stand in LLVM's instructions."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from rack.backplane.mailbox.mailbox import Reader, Writer
+from rack.backplane.mailbox.slots import SIGNED_FROM, Slots
+from rack.backplane.segment import Segment
+from rack.backplane.words import Box, Slot
+from rack.boards.run import compiled_mailbox
+from rack.levels import compiled as compilation
+from rack.levels.compiled import compiled
+from tests.backplane.bus import NAME, mailbox
+from tests.backplane.conftest import MakeBus
+from tests.backplane.mailbox.model import CLAIM, JUDGE, LOSE, PUBLISH, READ
+
+WORDS = {Box.HEAD: "head", Box.CLAIMANT: "claim"}
+
+
+class RecordedBox:
+    """The head of a mailbox, which notes the accesses to its words."""
+
+    def __init__(self, words: memoryview, accesses: list[str]) -> None:
+        self._words, self._accesses = words, accesses
+
+    def __getitem__(self, at: int) -> int:
+        self._note("load", at)
+        return self._words[at]
+
+    def __setitem__(self, at: int, value: int) -> None:
+        self._note("store", at)
+        self._words[at] = value
+
+    def _note(self, what: str, at: int) -> None:
+        if at in WORDS:
+            self._accesses.append(f"{what} {WORDS[Box.HEAD if at == 0 else at]}")
+
+
+class RecordedSlot:
+    """A slot, which notes copies to and from it."""
+
+    def __init__(self, place: memoryview, accesses: list[str]) -> None:
+        self._place, self._accesses = place, accesses
+
+    def __getitem__(self, part: slice) -> memoryview:
+        self._note("load", part)
+        return self._place[part]
+
+    def __setitem__(self, part: slice, content: memoryview) -> None:
+        self._note("store", part)
+        self._place[part] = content
+
+    def _note(self, what: str, part: slice) -> None:
+        name = {(None, SIGNED_FROM): "signature", (SIGNED_FROM, None): "message"}
+        self._accesses.append(f"{what} {name[part.start, part.stop]}")
+
+
+class RecordedWords:
+    """The words at the head of a slot: notes that it is emptied. Loads of single words decide
+    nothing."""
+
+    def __init__(self, words: memoryview, accesses: list[str]) -> None:
+        self._words, self._accesses = words, accesses
+
+    def __getitem__(self, at: int) -> int:
+        return self._words[at]
+
+    def __setitem__(self, at: int, value: int) -> None:
+        assert (at, value) == (Slot.SERIAL, 0)
+        self._accesses.append("clear slot")
+        self._words[at] = value
+
+
+@pytest.fixture
+def accesses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """All accesses to mailboxes that are opened from here on."""
+    made: list[str] = []
+    box_of, begin = Segment.box, Slots.__init__
+
+    def opened(slots: Any, *arguments: Any) -> None:
+        begin(slots, *arguments)
+        slots.places = [RecordedSlot(place, made) for place in slots.places]
+        slots.heads = [RecordedWords(words, made) for words in slots.heads]
+
+    monkeypatch.setattr(
+        Segment, "box", lambda segment, name: RecordedBox(box_of(segment, name), made)
+    )
+    monkeypatch.setattr(Slots, "__init__", opened)
+    monkeypatch.setattr(Slots, "fence", staticmethod(lambda: made.append("fence")))
+    return made
+
+
+def of_python(segment: Segment, accesses: list[str]) -> dict[str, tuple[str, ...]]:
+    """Return the accesses of the Python classes, by the model's name for what they do."""
+
+    def made(action: Callable[[], object], without: str = "") -> tuple[str, ...]:
+        accesses.clear()
+        action()
+        return tuple(access for access in accesses if access != without)
+
+    writer = Writer(segment, NAME)
+    reader = Reader(segment, NAME)
+    # The writer looks whether another process has published; it publishes all the same.
+    found = {
+        "publish": made(lambda: writer.write(0), "load head"),
+        "first read": made(lambda: reader.read(1)),
+    }
+    writer.write(1)
+    found |= {
+        "read": made(lambda: reader.read(2)),
+        "judge": made(lambda: reader.slots.keeps(2)),
+        "lose": made(writer.lose),
+    }
+    # A writer that dies before it publishes what it has filled.
+    writer.slots.serial += 1
+    writer.slots.heads[writer.slots.serial & writer.slots.mask]._words[Slot.SERIAL] = 4
+    writer.close()
+    found["claim"] = made(lambda: Writer(segment, NAME).close(), "load head")
+    return found
+
+
+EXPECTED = {
+    "publish": PUBLISH,
+    "lose": LOSE,
+    "first read": (*READ, "load claim"),
+    "read": READ,
+    "judge": JUDGE,
+    "claim": CLAIM,
+}
+
+
+def test_python_makes_the_accesses_of_the_model_in_its_order(
+    make_bus: MakeBus, accesses: list[str]
+) -> None:
+    assert of_python(make_bus(mailbox(depth=4)), accesses) == EXPECTED
+
+
+def changed(function: Any, before: str, after: str) -> Any:
+    """Return a function with another text."""
+    source = textwrap.dedent(inspect.getsource(function))
+    assert before in source
+    text = re.sub(r"^@.*\n", "", source.replace(before, after))
+    found: dict[str, Any] = {}
+    exec(text, dict(function.__globals__), found)
+    return found[function.__name__]
+
+
+FENCE = "self.fence()\n"
+PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
+    "head before slot": (
+        Slots,
+        "publish",
+        f"{FENCE}    self.places[at][SIGNED_FROM:]",
+        f"{FENCE}    box[0] = serial\n    self.places[at][SIGNED_FROM:]",
+    ),
+    "relaxed store of the head": (
+        Slots,
+        "publish",
+        f"{FENCE}    box[0] = serial",
+        "box[0] = serial",
+    ),
+    "no fence before a slot is filled": (
+        Slots,
+        "publish",
+        f"{FENCE}    self.places[at][SIGNED_FROM:]",
+        "self.places[at][SIGNED_FROM:]",
+    ),
+    "signature before message": (Slots, "publish", "[SIGNED_FROM:]", "[:SIGNED_FROM]"),
+    "relaxed load of the head": (Reader, "read", "self.slots.fence()\n", "pass\n"),
+    "signature loaded after the message": (Slots, "load", FENCE, "pass\n"),
+    "no fence before a copy is judged": (Slots, "keeps", FENCE, "pass\n"),
+    "slots of a dead writer left filled": (
+        Slots,
+        "clear_unpublished",
+        "words[_SERIAL] = 0",
+        "pass",
+    ),
+    "claim after publication": (
+        Writer,
+        "claim",
+        "box[Box.CLAIMANT] = self",
+        "self",
+    ),
+}
+"""Mistakes in the code, as the model knows them: class, method, its text and another one."""
+
+
+@pytest.mark.parametrize("mistake", PYTHON_MUTANTS)
+def test_a_mistake_in_python_shows_in_the_order(
+    make_bus: MakeBus, accesses: list[str], monkeypatch: pytest.MonkeyPatch, mistake: str
+) -> None:
+    owner, method, before, after = PYTHON_MUTANTS[mistake]
+    monkeypatch.setattr(owner, method, changed(getattr(owner, method), before, after))
+    assert of_python(make_bus(mailbox(depth=4)), accesses) != EXPECTED
+
+
+# Machine code
+
+PATTERNS = (
+    (r"^$", ("branch",)),
+    (r"fence acq_rel", ("fence",)),
+    (r"load atomic .* acquire", ("load head", "fence")),
+    (r"store atomic .* release", ("fence", "store head")),
+    (r"@llvm\.memcpy.* dereferenceable\(16\)", ("copy signature",)),
+    (r"@llvm\.memcpy", ("copy message",)),
+    (r"@XXH3", ("check",)),
+)
+"""Instructions, and what they do by the model's names."""
+
+
+def instructions(function: str, program: str) -> list[str]:
+    """Return the accesses in the machine code of a function, in their order."""
+    machine: Any = getattr(compiled_mailbox, program).load()
+    (text,) = machine.inspect_llvm().values()
+    name = rf"compiled_mailbox\d+{function}B\w*"
+    body = re.search(rf"^define linkonce_odr [^\n]*{name}\(.*?^}}", text, re.MULTILINE | re.DOTALL)
+    assert body
+    found: list[str] = []
+    for line in body[0].splitlines():
+        for pattern, accesses in PATTERNS:
+            if re.search(pattern, line):
+                found += accesses
+                break
+    return found
+
+
+def of_machine_code() -> dict[str, tuple[str, ...]]:
+    """Return the accesses of the machine code, by the model's name for what they do."""
+    written = instructions("publish", "write_ports")
+    written = [one for one in written[written.index("check") + 1 :] if one != "branch"]
+    read = instructions("read_port", "read_ports")
+    # Before the first branch it loads the head, then looks, message by message, which is visible.
+    read = read[: read.index("branch")] + read[read.index("copy signature") : read.index("check")]
+    return {
+        "publish": tuple(one.replace("copy", "store") for one in written),
+        "read": tuple(one.replace("copy", "load") for one in read if one != "branch"),
+    }
+
+
+@pytest.fixture
+def compile_all(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """Compile all functions of mailboxes, without the cache: what comes from there has no text."""
+    monkeypatch.setattr(compilation._Kept, "load_overload", lambda *_: None)
+    monkeypatch.setattr(compilation._Kept, "save_overload", lambda *_: None)
+    functions = [one for one in vars(compiled_mailbox).values() if isinstance(one, compiled)]
+    before = [one._machine for one in functions]
+
+    def load() -> None:
+        for function in vars(compiled_mailbox).values():
+            if isinstance(function, compiled):
+                function._machine = None
+        compiled_mailbox.read_ports.preload()
+        compiled_mailbox.write_ports.preload()
+
+    yield load
+    for function, machine in zip(functions, before, strict=True):
+        function._machine = machine
+
+
+MACHINE_CODE = {name: EXPECTED[name] for name in ("publish", "read")}
+
+
+@pytest.mark.slow
+def test_machine_code_makes_the_accesses_of_the_model_in_its_order(
+    compile_all: Callable[[], None],
+) -> None:
+    compile_all()
+    assert of_machine_code() == MACHINE_CODE
+
+
+MACHINE_MUTANTS: dict[str, tuple[str, str, str]] = {
+    "head before slot": (
+        "publish",
+        "    fence()\n    copy(slot + SIGNED",
+        "    fence()\n    store_release(port.head, before + 1)\n    copy(slot + SIGNED",
+    ),
+    "relaxed store of the head": (
+        "publish",
+        "store_release(port.head, before + 1)",
+        "copy(port.head, port.record, 8)",
+    ),
+    "no fence before a slot is filled": (
+        "publish",
+        "    fence()\n    copy(slot + SIGNED",
+        "    copy(slot + SIGNED",
+    ),
+    "signature before message": ("publish", "    fence()\n    copy(slot, ", "    copy(slot, "),
+    "relaxed load of the head": ("read_port", "load(port.head)", "slot_at(port.head).stamp"),
+    "signature loaded after the message": ("take", "    fence()\n", ""),
+}
+"""Mistakes in the compiled functions: function, its text and another one."""
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("mistake", MACHINE_MUTANTS)
+def test_a_mistake_in_machine_code_shows_in_the_order(
+    compile_all: Callable[[], None], monkeypatch: pytest.MonkeyPatch, mistake: str
+) -> None:
+    name, before, after = MACHINE_MUTANTS[mistake]
+    function = changed(getattr(compiled_mailbox, name)._function, before, after)
+    monkeypatch.setattr(compiled_mailbox, name, compiled(function))
+    compile_all()
+    assert of_machine_code() != MACHINE_CODE
