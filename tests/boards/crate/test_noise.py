@@ -43,6 +43,8 @@ from tests.processes import RACK, named, wait_until
 from tests.tools.command_line import BOUND_S
 
 SEEDS = 6
+ALARM_NUMBERS = 8 * 6
+"""Bytes of an alarm before its text."""
 NOISE = 8 * 32
 """Address behind the head, whose words are checked when a program attaches."""
 
@@ -68,9 +70,14 @@ REGIONS = (
     "messages",
     "all",
 )
-REFUSED = {*REGIONS} - {"trace", "messages", "all"}
+REFUSED = {*REGIONS} - {"trace", "messages", "alarms", "all"}
 """Regions in which some noise is refused. A record of a trace may hold any number, and a damaged
-message counts as lost. Noise anywhere hits mostly such."""
+message counts as lost. Noise in all alarms, or anywhere, hits mostly unused memory."""
+
+
+def first_of(alarms: int) -> int:
+    """Return the address of the first record that a ring of alarms gets."""
+    return alarms + LINE + ALARM_RECORD_SIZE
 
 
 def regions(segment: Segment) -> dict[str, tuple[int, int]]:
@@ -78,14 +85,14 @@ def regions(segment: Segment) -> dict[str, tuple[int, int]]:
     places = segment.map
     task = segment.layout.tasks[0].name
     box = segment.layout.mailboxes[0].name
-    alarms = places.alarms[task]
+    alarms, clock_alarms = places.alarms[task], places.alarms["clock"]
     found = (
         (NOISE, 8 * 96),
         (places.faults, places.faults + 2 * FAULT_ENTRY_SIZE),
         (places.operator, places.operator + 2 * operator_entry_size(segment.layout)),
         (alarms, alarms + ALARM_SIZE),
-        (alarms + LINE, alarms + 4 * LINE),
-        (places.alarms["clock"] + LINE, places.alarms["clock"] + 4 * LINE),
+        (first_of(alarms), first_of(alarms) + ALARM_NUMBERS),
+        (first_of(clock_alarms), first_of(clock_alarms) + ALARM_NUMBERS),
         (alarms, alarms + LINE),
         (places.blocks[task], places.blocks[task] + BLOCK_SIZE),
         (places.traces[task], alarms),
