@@ -38,7 +38,7 @@ from rack.levels.tables import read_params
 
 PLANNED = "planned"
 """Name of the posture that a plan defines."""
-NO_WORLD = "no world model: waiting for the position of the object"
+NO_WORLD = "no world model: waiting for where the object is"
 NO_PLAN = "no plan of the grasp yet: waiting for one from '{}'"
 
 

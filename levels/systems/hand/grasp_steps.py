@@ -199,7 +199,7 @@ class PreshapeWork(StepWork):
                 f"joint '{grasp.joints[joint]}' is {away[joint]:.2g} rad from posture"
                 f" '{self.step.posture}'"
             )
-            raise Refused(Error.FOLLOWING, f"{far}: it is blocked, or too weak")
+            raise Refused(Error.FOLLOWING, f"{far}: it is in the way of something, or too weak")
         return False
 
 
@@ -300,7 +300,8 @@ class GrippingWork(StepWork):
             )
         if grasp.moved > params.tolerance:
             far = (
-                f"{1e3 * grasp.moved:.1f} mm from its place (at most {1e3 * params.tolerance:g} mm)"
+                f"{1e3 * grasp.moved:.1f} mm from its place; permitted:"
+                f" {1e3 * params.tolerance:g} mm"
             )
             raise Refused(Error.OBJECT_LOST, f"lost '{close.object}': {far}")
 

@@ -47,7 +47,7 @@ from rack.levels.systems.hand.messages import (
 from rack.levels.tables import read_params
 
 NO_HAND_YET = "no status of the hand yet: waiting for its board"
-HAND_LOST = "no status of the hand: the last command stays in force"
+HAND_LOST = "no status of the hand: what was commanded last is kept"
 
 
 class HandLoop(Executor):
@@ -193,7 +193,7 @@ class HandLoop(Executor):
         status.echo = self.followed.id
         note = kept or self._rejected
         if lost and not note:
-            note = f"no command from '{self._above}': the last one stays in force"
+            note = f"no command from '{self._above}': its last one is kept"
         status.driven = self.driven
         status.stopped = bool(kept)
         status.holding = lost or not self.commanded

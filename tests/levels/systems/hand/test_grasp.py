@@ -87,7 +87,7 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
     "short": (
         {"posture": {"fist": {"thumb": [1.0]}}},
         "posture.fist.thumb",
-        "1 values; permitted: 4, one per joint",
+        "1 values; it needs 4, one per joint",
     ),
 }
 

@@ -54,6 +54,14 @@ def test_four_boards_move_the_hand_as_one_does() -> None:
     )
 
 
+def test_a_broken_simulation_is_an_error_with_its_reason() -> None:
+    rig = swinging()
+    rig.executor.hand.fault = "it diverged"
+    rig.cycles(2)
+    found = rig.status.state, rig.status.error, rig.status.reason
+    assert found == (State.ERROR, Error.SIMULATION, "it diverged")
+
+
 def test_hand_is_idle_until_every_board_sends_tensions() -> None:
     rig = HandRig(FINGERS)
     rig.tasks["thumb"].due = 25 * EVERY
