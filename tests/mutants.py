@@ -68,7 +68,8 @@ MUTANTS = (
         "corrupt",
         (
             (SLOTS, "self.chain == xxh3(self.covered, self.words[_CHAIN])", "True"),
-            (MAILBOX, "check != xxh3(self._covered, chain)", "False"),
+            (SLOTS, "words[_CHECK] == xxh3(self.covered, words[_CHAIN])", "True"),
+            ("boards/run/compiled_mailbox.py", "if check != found.check:", "if False:"),
             (f"{WATCH}/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
             (f"{WATCH}/watched_reader.py", DAMAGED, "pass"),
         ),
@@ -77,7 +78,7 @@ MUTANTS = (
         "claim",
         "masquerade",
         (
-            (MAILBOX, "self.slots.is_lawful(self._signature)", "True"),
+            (MAILBOX, "if not slots.is_lawful(self._signature):", "if False:"),
             ("boards/run/ports.py", "if writer.intruder:", "if False:"),
         ),
     ),
