@@ -65,7 +65,7 @@ class AddressMap:
                 self.traces[task.name] = self._take(trace_size(task))
                 self.alarms[task.name] = self._take(ALARM_SIZE)
             self._end_window(board, {task.name for task in tasks}, layout)
-        # Semaphores follow all windows, each in a cache line of its own.
+        # Semaphores follow the windows, each in a separate cache line.
         self.wake = {task.name: self._take(LINE) for task in layout.processes}
         self.done = {task.name: self._take(LINE) for task in layout.processes}
         locked = [box.name for box in layout.mailboxes if box.protocol == "lock"]
@@ -73,7 +73,7 @@ class AddressMap:
         self.size = pages(self._end)
 
     def _take(self, size: int) -> int:
-        """Place `size` bytes in cache lines of their own; return their address."""
+        """Reserve `size` bytes in separate cache lines and return their address."""
         address = self._end
         self._end = _up(address + size, LINE)
         return address

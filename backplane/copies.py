@@ -92,8 +92,8 @@ def leave(segment: Segment) -> None:
 
 
 def enter(segment: Segment, rack: str) -> None:
-    """Let the views of `segment` be of that of another rack, of the same layout. No lock is taken
-    there, and no mailbox claimed."""
+    """Redirect the views of `segment` to the segment of another rack with the same layout. Takes no
+    lock and claims no mailbox."""
     fd = os.open(shm_path(rack), os.O_RDWR)
     segment.rack = rack
     os.dup2(fd, segment.fd)

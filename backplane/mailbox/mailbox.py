@@ -212,11 +212,11 @@ class Reader:
     mailbox's depth.
 
     Attributes:
-        serial: Serial of the last good message; 0: none.
+        serial: Serial of the last good message, 0 without one.
         found: Serial of the newest message found by the last read, good or not.
         newest: Release tick of the last good message.
-        visible: Tick from which the last good message may be read.
-        basis: Tick of the oldest information that the last good message rests on.
+        visible: Tick at which the last good message became visible.
+        basis: Tick of the oldest information on which the last good message depends.
         accesses: Reads so far.
         transfers: Messages copied so far.
         words: The state of the reader, with all of these: see `ReaderState`.
@@ -251,8 +251,8 @@ class Reader:
         self.statistics = ReadStatistics()
 
     def reading(self, is_new: bool) -> Reading[AnyMessage]:
-        """Return the last good message as that of a read, with the verdict NEW or, unless there is
-        none yet, OLD."""
+        """Return the last good message with verdict NEW, or else OLD; NONE before the first
+        message."""
         return self._new if is_new else self._unchanged
 
     def read(self, tick: int) -> Reading[AnyMessage]:

@@ -7,11 +7,11 @@ a message.
 
 Memory order: the one writer fills a slot, then stores the head's serial with release; a reader
 loads the serial with acquire before it copies the slot, so it sees all of it. A copy may still be
-torn by a writer that laps the reader: the checksum shows that. It does not cover the signature,
-which is stored after the message and loaded before it: the writer's own is never taken for that of
-a forged message which it overwrites. Before a reader concludes from a head that a slot has not been
-reused (`keeps`), its copy is complete; in turn the writer fills no slot before the previous head is
-stored. Words are aligned to 8 bytes, so they are never torn.
+torn by a writer that laps the reader; the checksum detects that. It does not cover the signature,
+which is stored after the message and loaded before it, so that a forged message being overwritten
+never carries the signature of the true writer. Before a reader concludes from a head that a slot
+has not been reused (`keeps`), its copy is complete; in turn the writer fills no slot before the
+previous head is stored. Words are aligned to 8 bytes, so they are never torn.
 
 On x86-64 plain loads and stores of aligned words have this order, and Python's are such. Boards
 have it from machine code (`rack.boards.run.compiled_mailbox`), which also gives the rare paths in
@@ -43,7 +43,7 @@ from rack.backplane.words import Box, Slot, Word
 
 CHECKED_FROM = Slot.BASIS * 8
 SIGNED_FROM = Slot.CHAIN * 8
-"""Where a message begins in its slot, after its time stamp and its writer's signature, bytes."""
+"""Offset of the message in a slot, after its time stamp and signature, bytes."""
 # Plain integers: an IntEnum member costs a conversion at every use as an index.
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole

@@ -39,9 +39,8 @@ class BrakedArm(Plant, DrivableArm):
         self.state = DriveState.DISABLED  # of the drives, as of the last `step`
         # Reason (see `Alarm.BRAKES_CLOSED`) and first tick of braking. None while released.
         self._brakes: tuple[int, int] | None = (AT_START, self.tick)
-        self.dynamics = Dynamics(
-            cell
-        )  # for the level that drives the arm; one that senses exactly shares it with it
+        # Used by the level that drives the arm, and by an arm that senses exactly.
+        self.dynamics = Dynamics(cell)
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
 
     @abstractmethod

@@ -74,9 +74,8 @@ class ServoLaw(ArmDriver):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         cell = self.cell
-        self.reference = Reference(
-            cell.bounds, cell.limits, context.tick_s
-        )  # set points, interpolated
+        # Interpolates the set points.
+        self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self.reference.part = self.part
         self._limits = cell.bounds.torque
         self._torque: Array = np.zeros(len(cell.home))  # (joints,), N m: of the law, limited
