@@ -53,7 +53,14 @@ def test_what_a_crate_has_preloaded_it_does_not_preload_again(line: CrateLine) -
     line.send(wanted)
     line.send(wanted)
     line.send(Preload(("wave_levels:Wave",), PATH))
-    assert [line.receive() for _ in range(2)] == [
+    # Where the numba cache is empty, the crate also reports each function that it compiles.
+    preloadings = []
+    for answer in iter(line.receive, None):
+        if isinstance(answer, Preloading):
+            preloadings.append(answer)
+        if answer == Preloading("wave_levels:Wave"):
+            break
+    assert preloadings == [
         Preloading("wave_levels:Preloaded"),
         Preloading("wave_levels:Wave"),
     ]
